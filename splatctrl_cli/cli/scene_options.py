@@ -93,6 +93,7 @@ def sdf_bake_options(add: Options, parser: Parser) -> None:
     add("--seen-by LOG", "the log or capture whose cameras saw the scene, for --truth", Path)
     add("--resume", "continue an interrupted bake, to the same bytes")
     add_config(add, parser)
+    add_device(parser)
     add_gates(add)
     more = add.group("field")
     more("--include NAME,...", "labels in the field beside object: robot, human, or none", str, "human")
@@ -137,6 +138,7 @@ def query_options(add: Options, parser: Parser) -> None:
     add("--config FILE.toml", "configuration, see docs/config.md", Path)
     add_settings(add, ", such as field.distance=hard")
     add_threads(parser)
+    add_device(parser)
 
 
 def score_options(add: Options, parser: Parser) -> None:

@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clustered_splats import Spheres
-from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
+from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, SeField, SphereField
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, RESOLUTION, GridLayout, observed_planes
+from splatctrl_cli.field.on_device import device_field
 from splatctrl_cli.field.probability import make_probability
 from splatctrl_cli.kernels import field as native
+from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.kernels.field import BLOCK, GridSpan
 from splatctrl_cli.records import Bool, Float32, SplatSet, UInt8
 from splatctrl_cli.voxels import OccupancyGrid
@@ -29,9 +31,9 @@ CHANNELS: Mapping[str, tuple[str, int]] = {  # dtype, and components of a cell
     "gpdf": ("<f4", 1),
 }
 DEFAULT_CHANNELS = ("sdf", "gradient", "bound", "observed")
-KERNEL_OF = {"safe": "se", "safe_gpdf": "gpdf", "se": "se", "gpdf": "gpdf", "hard": None}
 
 Planes = dict[str, NDArray[np.generic]]
+_Made = tuple[Planes, NDArray[np.int32] | None]
 T = TypeVar("T", bound=np.generic)
 
 
@@ -53,8 +55,12 @@ class Baker:
         occupancy: OccupancyGrid | None = None,
         thresholds: OccupancyConfig | None = None,
         threads: int = 0,
+        device: Memory | None = None,
     ) -> None:
-        """splats: those of the field. Raises as `Spheres.of`; UsageError for unknown channels, or without sdf."""
+        """splats: those of the field; device: a card that computes instead of the processor, without masks.
+
+        Raises as `Spheres.of`; UsageError for unknown channels, or without sdf.
+        """
         unknown = [name for name in channels if name not in CHANNELS]
         if unknown or "sdf" not in channels:
             raise UsageError(f"channels: expected sdf and some of {', '.join(CHANNELS)}, got {', '.join(channels)}")
@@ -72,6 +78,13 @@ class Baker:
         self.kernels: tuple[str, ...] = tuple(name for name in ("se", "gpdf") if name in names)
         self.counts = {f"{name}_{what}": 0 for name in self.kernels for what in ("without_value", "over_estimates")}
         self._occupancy, self._thresholds = occupancy, thresholds or OccupancyConfig()
+        fields = {name: field for name, field in (("se", self.se), ("gpdf", self.gpdf)) if field is not None}
+        self.on_device = None if device is None else device_field(self.spheres, fields, config, device)
+
+    def close(self) -> None:
+        """Give a card's memory back."""
+        if self.on_device is not None:
+            self.on_device.close()
 
     @property
     def bound_margin(self) -> float:
@@ -106,15 +119,15 @@ class Baker:
             part = {name: values[begin - first : end - first] for name, values in out.items()}
             self._bake_planes(begin, end, part, mask)
 
-    def _bake_planes(self, first: int, last: int, out: Planes, mask: UInt8 | None) -> None:
-        span = GridSpan(
-            origin=self.layout.origin - self.spheres.points.anchor,
-            voxel=self.layout.voxel,
-            shape=self.layout.shape,
-            first=first,
-            last=last,
-            mask=mask,
+    def span(self, first: int, last: int, mask: UInt8 | None = None) -> GridSpan:
+        """The cells of the x-planes [first, last), in the frame of the spheres."""
+        origin = self.layout.origin - self.spheres.points.anchor
+        return GridSpan(
+            origin=origin, voxel=self.layout.voxel, shape=self.layout.shape, first=first, last=last, mask=mask
         )
+
+    def _bake_planes(self, first: int, last: int, out: Planes, mask: UInt8 | None) -> None:
+        span = self.span(first, last, mask)
         where = None if mask is None else _cells(mask, span)
         if where is not None and not where.any():
             return
@@ -125,36 +138,50 @@ class Baker:
     def _made(self, span: GridSpan, where: Bool | None) -> dict[str, NDArray[np.generic]]:
         """The channels of the span's cells, those `where` alone (then in one row)."""
         cells = None if where is None else np.flatnonzero(where)
+        made, entry = self._by_processor(span, cells) if self.on_device is None else self._by_device(span)
+        if self.probability is not None:
+            whole = np.zeros(span.shape_of_channel, np.float32)
+            whole[... if where is None else where] = made["sdf"]
+            made["probability"] = _picked(self.probability.baked(span, whole, threads=self.threads), cells)
+        if entry is not None:
+            made["label"] = self.labels[self.spheres.points.source[entry]]
+        if "observed" in self.channels:
+            observed = observed_planes(self._occupancy, self.layout, self._thresholds, span.first, span.last)
+            made["observed"] = _picked(observed, cells)
+        return made
 
-        def picked(values: NDArray[T]) -> NDArray[T]:
-            return values if cells is None else values.reshape(-1, *values.shape[3:])[cells]
-
+    def _by_processor(self, span: GridSpan, cells: NDArray[np.int64] | None) -> _Made:
+        """The distances of the span's cells, or of some, and the entry of the nearest sphere where it is wanted."""
         exact, exact_gradient, entry = self._hard(span)
-        hard, gradient = picked(exact), None if exact_gradient is None else picked(exact_gradient)
+        hard = _picked(exact, cells)
+        gradient = None if exact_gradient is None else _picked(exact_gradient, cells)
         kernels: dict[str, tuple[Float32, Float32 | None]] = {}
         for name in self.kernels:
             distance, slope = self._kernel(name, span)
-            kernels[name] = (picked(distance), None if slope is None else picked(slope))
+            kernels[name] = (_picked(distance, cells), None if slope is None else _picked(slope, cells))
             self.counts[f"{name}_without_value"] += int(np.count_nonzero(np.isnan(kernels[name][0])))
             self.counts[f"{name}_over_estimates"] += int(np.count_nonzero(kernels[name][0] > hard + RESOLUTION))
         sdf, gradient = self._chosen(hard, gradient, kernels)
-        made: dict[str, NDArray[np.generic]] = {"sdf": sdf, "hard": hard}
+        made: Planes = {"sdf": sdf, "hard": hard}
         if gradient is not None:
             made["gradient"] = gradient
         if "bound" in self.channels:
             made["bound"] = (hard.astype(np.float64) - self.bound_margin).astype(np.float32)
-        if self.probability is not None:
-            whole = np.zeros_like(exact)
-            whole[... if where is None else where] = sdf
-            made["probability"] = picked(self.probability.baked(span, whole, threads=self.threads))
-        if entry is not None:
-            made["label"] = self.labels[self.spheres.points.source[picked(entry)]]
-        if "observed" in self.channels:
-            observed = observed_planes(self._occupancy, self.layout, self._thresholds, span.first, span.last)
-            made["observed"] = picked(observed)
         for name, (distance, _) in kernels.items():
             made[name] = np.where(np.isnan(distance), hard, distance)
-        return made
+        return made, None if entry is None else _picked(entry, cells)
+
+    def _by_device(self, span: GridSpan) -> _Made:
+        """As `_by_processor`, of whole spans."""
+        assert self.on_device is not None
+        wanted = {*self.channels, "entry"} if "label" in self.channels else set(self.channels)
+        found = self.on_device.bake(span, wanted, margin=self.bound_margin)
+        for name, (without_value, over_estimates) in found.counts.items():
+            self.counts[f"{name}_without_value"] += without_value
+            self.counts[f"{name}_over_estimates"] += over_estimates
+        channels = {"sdf": found.distance, "hard": found.hard, "gradient": found.gradient, "bound": found.bound}
+        made: Planes = {name: values for name, values in channels.items() if values is not None}
+        return {**made, **found.kernels}, found.entry
 
     def _hard(self, span: GridSpan) -> tuple[Float32, Float32 | None, NDArray[np.int32] | None]:
         hard = np.zeros(span.shape_of_channel, np.float32)
@@ -186,6 +213,11 @@ class Baker:
         if gradient is None or smooth_gradient is None:
             return sdf, None
         return sdf, np.where(is_smooth[..., None], smooth_gradient, gradient)
+
+
+def _picked(values: NDArray[T], cells: NDArray[np.int64] | None) -> NDArray[T]:
+    """Values (X, Y, Z) or (X, Y, Z, 3) of all cells, or of some in one row."""
+    return values if cells is None else values.reshape(-1, *values.shape[3:])[cells]
 
 
 def _cells(mask: UInt8, span: GridSpan) -> Bool:

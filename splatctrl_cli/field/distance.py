@@ -276,6 +276,7 @@ def normalised(gradient: Float64) -> Float64:
     return np.asarray(np.divide(gradient, length, out=np.zeros_like(gradient), where=length > 0))
 
 
+KERNEL_OF = {"safe": "se", "safe_gpdf": "gpdf", "se": "se", "gpdf": "gpdf", "hard": None}
 _Make = Callable[[Spheres, FieldConfig, int], DistanceField]
 
 

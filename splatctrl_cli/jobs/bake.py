@@ -15,11 +15,12 @@ from splatctrl_cli.evaluate.field_truth import FIELDS
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS, LENGTH
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
-from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, KERNEL_OF, Baker
-from splatctrl_cli.field.grid_cells import LOSS, GridLayout, bounding_box, check_loss
+from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker
+from splatctrl_cli.field.distance import KERNEL_OF
+from splatctrl_cli.field.grid_cells import LOSS, GridLayout, check_loss
 from splatctrl_cli.field.header import field_header
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
-from splatctrl_cli.field.obstacles import ObstacleSpheres, field_splats, obstacle_spheres
+from splatctrl_cli.field.obstacles import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.field.report import GridStatistics, grid_statistics
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, slabs
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_json, write_run
@@ -30,16 +31,19 @@ from splatctrl_cli.jobs.bake_request import (
     BakeSource,
     Previous,
     check_same,
+    covered,
+    device_for,
     read_bake_source,
     read_previous,
 )
 from splatctrl_cli.jobs.bake_slabs import CHECKPOINT, FOLDER, BakeTask, bake_to_disk, clear_leftovers
+from splatctrl_cli.jobs.device import Device, named
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.resume import deciding_versions, told_how_to_go_on
-from splatctrl_cli.records import Box, DistanceGrid
+from splatctrl_cli.kernels.cuda.memory import DeviceError
+from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
 from splatctrl_cli.report.reliability import reliability_picture
-from splatctrl_cli.robot.model import RobotModel
 
 SUMMARY_METRICS = {
     **dict.fromkeys(("num_splats", "num_splats_left_out", "num_cells"), DESCRIBES),
@@ -79,10 +83,15 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
             out, force=request.force, is_folder=True, checkpoint=CHECKPOINT, resume=request.resume
         ) as partial,
     ):
-        job = _read(request, stopwatch)
+        job = _read(request, stopwatch, progress)
         clear_leftovers(partial)
         with stopwatch.stage("bake"):
-            grid, changes = _baked(job, partial, progress)
+            try:
+                grid, changes = _baked(job, partial, progress)
+            except DeviceError as error:
+                raise named(error, job.device, checkpoint) from error
+            finally:
+                job.baker.close()
         with stopwatch.stage("report"):
             report = FieldReport(grid=grid, statistics=grid_statistics(grid), changes=changes)
         with stopwatch.stage("write"):
@@ -103,7 +112,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
             command="sdf-bake",
             config=request.config.as_dict(),
             inputs=job.digests,
-            metrics=metrics,
+            metrics={**metrics, "devices": [job.device.as_dict()]},
             stopwatch=stopwatch,
             seed=request.seed,
             verdict=verdict.as_dict(),
@@ -140,6 +149,7 @@ class _Job:
     source: BakeSource
     previous: Previous | None
     obstacles: ObstacleSpheres
+    device: Device
     baker: Baker
 
     @property
@@ -148,7 +158,7 @@ class _Job:
         return self.source.digests | ({} if self.previous is None else self.previous.digests)
 
 
-def _read(request: BakeRequest, stopwatch: Stopwatch) -> _Job:
+def _read(request: BakeRequest, stopwatch: Stopwatch, progress: Progress) -> _Job:
     """Read the splats, and check that the field can be made of them and written."""
     config, previous = request.config, None
     with stopwatch.stage("read"):
@@ -159,10 +169,11 @@ def _read(request: BakeRequest, stopwatch: Stopwatch) -> _Job:
     channels = _channels(request, previous)
     check_references(request, source)
     check_formats(request.formats, channels, unknown=config.field.unknown)
-    layout = GridLayout.over(_box(request, source, previous), config.field.voxel)
+    layout = GridLayout.over(covered(request, source, previous), config.field.voxel)
     if previous is not None:
         check_same(previous, layout, config.field, channels, request.label_names)
     with stopwatch.stage("bake"):
+        device = device_for(request, layout, len(obstacles.splats.radii), progress)
         baker = Baker(
             obstacles.splats,
             layout,
@@ -171,8 +182,9 @@ def _read(request: BakeRequest, stopwatch: Stopwatch) -> _Job:
             occupancy=source.occupancy,
             thresholds=config.occupancy,
             threads=request.threads,
+            device=device.memory,
         )
-    return _Job(request=request, source=source, previous=previous, obstacles=obstacles, baker=baker)
+    return _Job(request=request, source=source, previous=previous, obstacles=obstacles, device=device, baker=baker)
 
 
 def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...]:
@@ -194,18 +206,6 @@ def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...
             remedy="bake the channel observed as well",
         )
     return chosen
-
-
-def _box(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:
-    """What the grid covers: the box, the reach of the robot, the field before, or the splats and a margin."""
-    if request.box is not None:
-        return request.box
-    if request.urdf is not None:
-        robot = RobotModel.from_urdf(request.urdf, request.spheres)
-        return Box(lower=robot.base_position - robot.reach(), upper=robot.base_position + robot.reach())
-    if previous is not None:
-        return previous.box
-    return bounding_box(field_splats(source.splats, request.labels), request.config.field.padding)
 
 
 def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, Changes | None]:
@@ -253,6 +253,7 @@ def _settings(job: _Job) -> dict[str, Any]:
         **{f"occupancy.{name}": value for name, value in asdict(config.occupancy).items()},
         **{f"sha256 of {name}": value for name, value in job.digests.items()},
         "labels": ",".join(job.request.label_names),
+        **({} if job.device.card is None else {"card": job.device.card.name}),
     }
 
 

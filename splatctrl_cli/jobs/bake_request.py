@@ -11,13 +11,18 @@ import numpy as np
 
 from splatctrl_cli import __version__
 from splatctrl_cli.config import Config, FieldConfig
+from splatctrl_cli.config.fixed import CARD_LEAST_BAKE, CARD_SPLATS
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.field.grid_cells import GridLayout, check_room
-from splatctrl_cli.field.obstacles import DEFAULT_LABELS
+from splatctrl_cli.field.distance import KERNEL_OF
+from splatctrl_cli.field.grid_cells import GridLayout, bounding_box, check_room
+from splatctrl_cli.field.obstacles import DEFAULT_LABELS, field_splats
 from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.grid_files.npz_grid import read_npz
+from splatctrl_cli.jobs.device import CUDA, TO_CPU, Device, chosen
+from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
+from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, Snapshot, open_scene
 from splatctrl_cli.splat_files.splat_formats import read_spheres
 from splatctrl_cli.voxels import Balls, OccupancyGrid
@@ -35,6 +40,7 @@ class BakeRequest:
     the cameras of `seen_by` looked, with `reference_mesh`, and with the depth in the log `held_out` of the cameras
     `held_out_cameras`, none for all that did not train. update: a field baked from `previous_scene` (None: `scene`),
     of which only what changed is baked anew. resume: go on with what an interrupted bake left. require: gates.
+    device: where to compute, as of --device.
     """
 
     scene: Path
@@ -61,6 +67,7 @@ class BakeRequest:
     force: bool = False
     seed: int = 0
     threads: int = 0
+    device: str = "auto"
 
     @property
     def label_names(self) -> list[str]:
@@ -226,3 +233,27 @@ def _workspace(occupancy: OccupancyGrid) -> Box:
     num_voxels = np.array(occupancy.log_odds.shape)
     lower = occupancy.origin + 0.5 * occupancy.voxel
     return Box(lower=lower, upper=lower + occupancy.voxel * (num_voxels - 2))
+
+
+def covered(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:
+    """What the grid covers: the box, the reach of the robot, the field before, or the splats and a margin."""
+    if request.box is not None:
+        return request.box
+    if request.urdf is not None:
+        robot = RobotModel.from_urdf(request.urdf, request.spheres)
+        return Box(lower=robot.base_position - robot.reach(), upper=robot.base_position + robot.reach())
+    if previous is not None:
+        return previous.box
+    return bounding_box(field_splats(source.splats, request.labels), request.config.field.padding)
+
+
+def device_for(request: BakeRequest, layout: GridLayout, num_splats: int, progress: Progress) -> Device:
+    """Where to bake; an update always on the processor. Raises UsageError for a card that cannot be used."""
+    if request.update is not None:
+        if request.device.startswith(CUDA):
+            raise UsageError(f"--device {request.device}: --update bakes on the processor", remedy=TO_CPU)
+        return Device()
+    is_matern = KERNEL_OF[request.config.field.distance] == "gpdf"
+    is_enough = layout.num_cells * (num_splats if is_matern else CARD_SPLATS) >= CARD_LEAST_BAKE
+    cells = f"{layout.num_cells} cells of {num_splats} splats"
+    return chosen(request.device, "" if is_enough else f"{cells} are too little work for a card", progress)

@@ -1,4 +1,4 @@
-"""Where a fit computes: on the processor, or on a CUDA card that is there, usable and worth its start."""
+"""Where a fit or a bake computes: on the processor, or on a CUDA card that is there, usable and worth its start."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -11,13 +11,14 @@ from splatctrl_cli.errors import DeviceFault, DeviceFull, UsageError
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.kernels.cuda.driver import Card, usable_card
 from splatctrl_cli.kernels.cuda.fit import DeviceFit, bytes_needed
-from splatctrl_cli.kernels.cuda.memory import DeviceError, Memory, OutOfMemory
+from splatctrl_cli.kernels.cuda.memory import FIELD, FIT, DeviceError, Memory, OutOfMemory
 from splatctrl_cli.libraries import is_installed
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
 
 AUTO, CPU, CUDA = "auto", "cpu", "cuda"
 EXTRA = ("cuda.core", "cuda.bindings")
+TO_CPU = "give --device cpu"
 INSTALL = "pip install 'splatctrl-cli[cuda]'"
 
 
@@ -35,8 +36,8 @@ class Device:
         return {"device": self.name, **known}
 
 
-def opened(name: str) -> Device:
-    """That of ``cuda`` or ``cuda:N``. Raises DeviceError, with a remedy, where it cannot be used."""
+def opened(name: str, source: str = FIT) -> Device:
+    """That of ``cuda`` or ``cuda:N``, for the kernels of a source. Raises DeviceError, with a remedy, if it fails."""
     if missing := [module for module in EXTRA if not is_installed(module)]:
         raise DeviceError(f"the extra [cuda] is not installed ({missing[0]})", remedy=INSTALL)
     index = int(name.partition(":")[2] or 0)
@@ -44,23 +45,45 @@ def opened(name: str) -> Device:
     try:
         from splatctrl_cli.kernels.cuda.card import CudaDevice
 
-        memory = CudaDevice(card)
+        memory = CudaDevice(card, source=source)
     except ImportError as error:
         raise DeviceError(f"the extra [cuda] cannot be used: {error}", remedy=INSTALL) from error
     return Device(name=f"{CUDA}:{index}", card=card, memory=memory)
 
 
-def demanded(name: str) -> Device | None:
+def demanded(name: str, source: str = FIT) -> Device | None:
     """The device of a --device; None for auto. Raises UsageError where that one cannot be used."""
     if name in (AUTO, CPU):
         return None if name == AUTO else Device()
     try:
-        return opened(name)
+        return opened(name, source)
     except DeviceError as error:
-        remedy = "give --device cpu"
-        raise UsageError(
-            f"--device {name}: {error}", remedy=f"{error.remedy}, or {remedy}" if error.remedy else remedy
-        ) from error
+        remedy = f"{error.remedy}, or {TO_CPU}" if error.remedy else TO_CPU
+        raise UsageError(f"--device {name}: {error}", remedy=remedy) from error
+
+
+def automatic(
+    progress: Progress, too_little: str = "", *, name: str = CUDA, source: str = FIT, needed: int = 0
+) -> Device:
+    """Where auto computes, and why is said: a card that is usable and has `needed` bytes, if the work is enough."""
+    try:
+        if too_little:
+            raise DeviceError(too_little)
+        device = opened(name, source)
+        assert device.memory is not None
+        if needed > device.memory.available():
+            raise DeviceError("too little memory is free on the card")
+    except DeviceError as error:
+        progress.log(f"computes on cpu: {error}")
+        return Device()
+    progress.log(f"computes on {shown(device.as_dict())}")
+    return device
+
+
+def chosen(name: str, too_little: str, progress: Progress) -> Device:
+    """The device of a --device that fields are computed on. Raises UsageError where it cannot be used."""
+    device = demanded(name, FIELD)
+    return automatic(progress, too_little, source=FIELD) if device is None else device
 
 
 class FitDevice:
@@ -99,22 +122,10 @@ class FitDevice:
         last = self.history[-1]["device"] if self.history else ""
         if last == CPU:
             return Device()
-        num_pixels = max(height * width for height, width in sizes)
+        num_pixels, too_little = max(height * width for height, width in sizes), ""
         if not last and num_splats * num_pixels < CARD_LEAST_WORK:
-            progress.log(
-                f"computes on cpu: {num_splats} splats on {num_pixels} pixels are too little work for a card"
-            )
-            return Device()
-        try:
-            device = opened(last or CUDA)
-            assert device.memory is not None
-            if bytes_needed(num_splats, sizes) > device.memory.available():
-                raise DeviceError("too little memory is free on the card")
-        except DeviceError as error:
-            progress.log(f"computes on cpu: {error}")
-            return Device()
-        progress.log(f"computes on {shown(device.as_dict())}")
-        return device
+            too_little = f"{num_splats} splats on {num_pixels} pixels are too little work for a card"
+        return automatic(progress, too_little, name=last or CUDA, needed=bytes_needed(num_splats, sizes))
 
     def close(self) -> None:
         """Give the card's memory back."""
@@ -128,15 +139,19 @@ class FitDevice:
         try:
             yield
         except DeviceError as error:
-            kind = DeviceFull if isinstance(error, OutOfMemory) else DeviceFault
-            name = "device" if self._device is None else shown(self._device.as_dict())
-            remedies = [error.remedy] if error.remedy else []
-            if checkpoint.is_file():
-                kept = checkpoint.parent.parent
-                remedies.append(f"{kept} is kept: go on with --resume, and --device cpu if it fails again")
-            else:
-                remedies.append("start over, with --device cpu if it fails again")
-            raise kind(f"{name}: {error}", remedy="; ".join(remedies)) from error
+            raise named(error, self._device, checkpoint) from error
+
+
+def named(error: DeviceError, device: Device | None, checkpoint: Path | None = None) -> DeviceFault:
+    """What failed on a device, and how to go on, from `checkpoint` where it is there."""
+    kind = DeviceFull if isinstance(error, OutOfMemory) else DeviceFault
+    remedies = [error.remedy] if error.remedy else []
+    if checkpoint is not None and checkpoint.is_file():
+        kept = checkpoint.parent.parent
+        remedies.append(f"{kept} is kept: go on with --resume, and --device cpu if it fails again")
+    else:
+        remedies.append("start over, with --device cpu if it fails again")
+    return kind(f"{'device' if device is None else shown(device.as_dict())}: {error}", remedy="; ".join(remedies))
 
 
 def shown(device: dict[str, Any]) -> str:

@@ -13,9 +13,11 @@ from splatctrl_cli.field.clustered_splats import Spheres
 from splatctrl_cli.field.distance import SphereField, field_over, march
 from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.obstacles import ObstacleSpheres
+from splatctrl_cli.field.on_device import OnDevice
 from splatctrl_cli.field.probability import make_probability
 from splatctrl_cli.jobs.bake_request import BakeSource
-from splatctrl_cli.records import Bool, DistanceGrid, Float64, Label
+from splatctrl_cli.kernels.cuda.memory import Memory
+from splatctrl_cli.records import Bool, DistanceField, DistanceGrid, Float64, Label
 from splatctrl_cli.voxels import VoxelState
 
 ROUNDING = 1e-6  # [m] and of the lengths in it: what float32 may lose of an exact distance, as in a baked bound
@@ -54,8 +56,17 @@ class Answers:
 class SceneAnswers:
     """The splats of a scene, and the balls around its occupied voxels without one, as a field by `config`."""
 
-    def __init__(self, source: BakeSource, obstacles: ObstacleSpheres, config: Config, threads: int) -> None:
-        """Raises UsageError where unknown space is to count as something: that is a matter of grids."""
+    def __init__(
+        self,
+        source: BakeSource,
+        obstacles: ObstacleSpheres,
+        config: Config,
+        threads: int,
+        device: Memory | None = None,
+    ) -> None:
+        """device: a card that computes the distances. Raises UsageError where unknown space is to count as something:
+        that is a matter of grids.
+        """
         if config.field.unknown != "free":
             raise UsageError(
                 f"field.unknown = {config.field.unknown}: only a baked field has it",
@@ -63,8 +74,14 @@ class SceneAnswers:
             )
         splats = obstacles.splats
         self._spheres = Spheres.of(splats.centers, splats.radii)
-        self._exact = SphereField.over(self._spheres, threads=threads)
-        self._field = field_over(self._spheres, config.field, threads=threads)
+        self._exact: SphereField | OnDevice
+        self._field: DistanceField
+        if device is None:
+            self._exact = SphereField.over(self._spheres, threads=threads)
+            self._field = field_over(self._spheres, config.field, threads=threads)
+        else:
+            self._exact = OnDevice(self._spheres, replace(config.field, distance="hard"), device)
+            self._field = OnDevice(self._spheres, config.field, device, threads=threads)
         self._probability = make_probability(self._spheres, config.field, threads=threads)
         self._labels, self._index = splats.labels, obstacles.index
         self._workspace, known, limits = source.workspace, source.occupancy, config.occupancy

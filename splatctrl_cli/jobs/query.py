@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import CARD_LEAST_TABLE
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.field.grid_cells import check_room
 from splatctrl_cli.field.obstacles import DEFAULT_LABELS, obstacle_spheres
@@ -20,8 +21,10 @@ from splatctrl_cli.files.output import Stopwatch, output_path
 from splatctrl_cli.files.point_table import point_blocks
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.bake_request import BakeSource, read_bake_source, source_of_grid
+from splatctrl_cli.jobs.device import CUDA, TO_CPU, Device, chosen, named
 from splatctrl_cli.jobs.point_answers import TITLES, Answers, GridAnswers, SceneAnswers, rows_of
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
+from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Label
 from splatctrl_cli.scene_files.scene_folder import run_value
 from splatctrl_cli.voxels import VoxelState
@@ -43,7 +46,7 @@ class QueryRequest:
     points: a CSV file with columns x, y, z [m], world, or an open text. out: the CSV of the answers, None for the
     figures alone. scene: of a field, the scene that it was baked from, which knows what the grid does not. at: the
     scene as known that long after its start [s], None for its end. labels: of the splats that count; of a field those
-    that it was baked of.
+    that it was baked of. device: where a scene's distances are computed, as of --device.
     """
 
     source: Path
@@ -55,6 +58,7 @@ class QueryRequest:
     labels: frozenset[Label] = DEFAULT_LABELS
     force: bool = False
     threads: int = 0
+    device: str = "auto"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,10 +88,13 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
             out = stack.enter_context(partial.open("w", encoding="utf-8", newline=""))
             out.write(",".join(TITLES) + "\n")
         with stopwatch.stage("read"):
-            asked = _asked(request)
+            asked = _asked(request, progress)
         with stopwatch.stage("answer"):
             for points in _blocks(request.points, progress):
-                answers = asked.at(points)
+                try:
+                    answers = asked.at(points)
+                except DeviceError as error:
+                    raise named(error, asked.device) from error
                 figures.add(answers)
                 if out is not None:
                     out.write(rows_of(points, answers))
@@ -102,15 +109,18 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
 
 @dataclass(frozen=True, kw_only=True)
 class _Asked:
-    """What answers: its kind, its box where it has one, and whether it is a grid, which has no distance outside."""
+    """What answers: its kind, its box where it has one, whether it is a grid, which has no distance outside, and the
+    device of a scene.
+    """
 
     kind: str
     at: Callable[[Float64], Answers]
     box: Box | None
     is_grid: bool = False
+    device: Device | None = None
 
 
-def _asked(request: QueryRequest) -> _Asked:
+def _asked(request: QueryRequest, progress: Progress) -> _Asked:
     file = _grid_file(request.source)
     if file is None:
         if request.scene is not None:
@@ -118,20 +128,33 @@ def _asked(request: QueryRequest) -> _Asked:
                 f"--scene: belongs to a field, and {request.source} is a scene", remedy="leave --scene out"
             )
         source = read_bake_source(request.source, request.at)
-        scene = _scene(source, request.labels, request.config, request.threads)
-        return _Asked(kind="scene", at=scene.at, box=source.workspace)
+        device = chosen(request.device, _too_little(request.points), progress)
+        scene = _scene(source, request, request.labels, request.config, device)
+        return _Asked(kind="scene", at=scene.at, box=source.workspace, device=device)
     if request.at is not None:
         raise UsageError(f"--at: {request.source} is a field of one time", remedy="give the scene, or leave --at out")
     check_room(str(file), file.stat().st_size, "bake a smaller --box or a larger --voxel")
     grid = read_npz(Parts.beside(file).checked(file))
     of_grid = GridAnswers(grid, str(file))
     if request.scene is None:
+        if request.device.startswith(CUDA):
+            raise UsageError(f"--device {request.device}: a baked field is read on the processor", remedy=TO_CPU)
         return _Asked(kind="field", at=of_grid.at, box=of_grid.box, is_grid=True)
     where = str(request.source)
     labels, config = _labels_of(grid, where), _config_of(grid, request.config, where)
-    both = _scene(source_of_grid(where, grid, request.scene), labels, config, request.threads)
-    kind = "field and scene"
-    return _Asked(kind=kind, at=lambda points: both.beside(points, of_grid.at(points)), box=of_grid.box, is_grid=True)
+    device = chosen(request.device, _too_little(request.points), progress)
+    both = _scene(source_of_grid(where, grid, request.scene), request, labels, config, device)
+
+    def at(points: Float64) -> Answers:
+        return both.beside(points, of_grid.at(points))
+
+    return _Asked(kind="field and scene", at=at, box=of_grid.box, is_grid=True, device=device)
+
+
+def _too_little(points: Path | TextIO) -> str:
+    """Why a card would not pay, if it would not."""
+    size = points.stat().st_size if isinstance(points, Path) and points.is_file() else 0
+    return "" if size >= CARD_LEAST_TABLE else "too few points are known of for a card"
 
 
 def _grid_file(source: Path) -> Path | None:
@@ -146,8 +169,11 @@ def _grid_file(source: Path) -> Path | None:
     return None
 
 
-def _scene(source: BakeSource, labels: frozenset[Label], config: Config, threads: int) -> SceneAnswers:
-    return SceneAnswers(source, obstacle_spheres(source.splats, source.unrepresented, labels), config, threads)
+def _scene(
+    source: BakeSource, request: QueryRequest, labels: frozenset[Label], config: Config, device: Device
+) -> SceneAnswers:
+    obstacles = obstacle_spheres(source.splats, source.unrepresented, labels)
+    return SceneAnswers(source, obstacles, config, request.threads, device.memory)
 
 
 def _labels_of(grid: DistanceGrid, where: str) -> frozenset[Label]:

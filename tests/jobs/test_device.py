@@ -37,7 +37,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cards(patch: pytest.MonkeyPatch, memory: Memory, name: str = "Card") -> None:
     """Let every card be this one."""
     card = Card(index=0, name=name, capability=(9, 0), driver="580.1")
-    patch.setattr(device, "opened", lambda _: Device(name="cuda:0", card=card, memory=memory))
+    patch.setattr(device, "opened", lambda *_: Device(name="cuda:0", card=card, memory=memory))
 
 
 @pytest.fixture
@@ -191,7 +191,7 @@ def test_auto_goes_on_where_the_run_was(
 ) -> None:
     monkeypatch.setattr(device, "CARD_LEAST_WORK", 0)
 
-    def no_card(name: str) -> Device:
+    def no_card(*_: str) -> Device:
         raise DeviceError("no NVIDIA driver")
 
     for name, begins, has_card, ends in (

@@ -9,8 +9,8 @@ from cuda.bindings import driver
 from cuda.core import Device, LaunchConfig, launch
 
 from splatctrl_cli.kernels.cuda.driver import Card, usable_card
-from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Graph, Launch, OutOfMemory
-from splatctrl_cli.kernels.cuda.program import FIT, compiled
+from splatctrl_cli.kernels.cuda.memory import FIT, Array, DeviceError, Graph, Launch, OutOfMemory
+from splatctrl_cli.kernels.cuda.program import compiled
 
 MANY = 20  # replays in a graph: to launch one costs the host as much as a small map's iteration takes
 
@@ -46,14 +46,14 @@ class CudaDevice:
     """
 
     def __init__(self, card: Card | None = None, *, source: str = FIT) -> None:
-        """source: the kernels that are launched."""
+        """source: the kernels that are launched, of which others are compiled when they are."""
         card = card or usable_card()
         self.name, self.capability = card.name, card.capability
         with _named_faults():
             self._device: Any = Device(card.index)
             self._device.set_current()
             self._stream: Any = self._device.create_stream()
-            self._code: Any = compiled(self.capability, source=source)
+            self._codes: dict[str, Any] = {source: compiled(self.capability, source=source)}
         self._handle = int(self._stream.handle)
 
     def available(self) -> int:
@@ -109,7 +109,9 @@ class CudaDevice:
     def _queue(self, target: Any, launches: Sequence[Launch]) -> None:
         for one in launches:
             config = LaunchConfig(grid=one.grid, block=one.block)
-            launch(target, config, self._code.get_kernel(one.kernel), *one.arguments)
+            if one.source not in self._codes:
+                self._codes[one.source] = compiled(self.capability, source=one.source)
+            launch(target, config, self._codes[one.source].get_kernel(one.kernel), *one.arguments)
 
     def seconds(self, graph: Graph, num_times: int) -> float:
         """Mean time of a replay, measured on the device."""

@@ -3,12 +3,12 @@
 Shapes: N spheres laid out as C clusters (kernels/field.py), Q points, (X, Y, Z) cells.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.kernels.cuda.memory import Array, Launch, Memory
+from splatctrl_cli.kernels.cuda.memory import FIELD, Array, Launch, Memory
 from splatctrl_cli.kernels.field import LANES, Clusters, Float32, GridSpan, Int32, LogSumExp, Offsets
 
 # As field.h and field_query.cuh lay them out.
@@ -16,7 +16,7 @@ CLUSTERS = np.dtype([("counts", "i4", 2), ("centers", "u8", 3), ("boxes", "u8", 
 GRID = np.dtype(
     [("place", "f8", 4), ("size", "i4", 3), ("planes", "i4", 2), ("mask", "u8"), ("num_threads", "i4")], align=True
 )
-FIELD = np.dtype(
+TASK = np.dtype(
     [("spheres", CLUSTERS), ("offsets", "u8", 2), ("exact", "u8"), ("radius", "u8"), ("sign", "u8"),
      ("numbers", "f4", 4), ("grid", GRID), ("points", "u8"), ("num_points", "i4"), ("out", "u8", 3)],
     align=True,
@@ -35,7 +35,7 @@ HARD = "hard"
 @dataclass(frozen=True, kw_only=True)
 class Choice:
     """Which distance is taken: the exact one, or where a kernel is named the smaller of both, or (is_single) the
-    kernel's where it has one. resolution [m]: by more than this a kernel is to exceed the exact distance to be counted.
+    kernel's where it has one. resolution [m]: a kernel that exceeds the exact distance by more is counted.
     """
 
     kernel: str | None
@@ -45,14 +45,15 @@ class Choice:
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Of (X, Y, Z) cells or (Q,) points: the exact distance, the chosen one and its gradient, bound (the exact one less
-    the margin), the entry of the nearest sphere, by kernel its distance (the exact one where it has none), each [m].
+    """Of (X, Y, Z) cells or (Q,) points, what was wanted: the exact distance `hard`, the chosen one and its gradient,
+    `bound` (the exact one less the margin), the entry of the nearest sphere, and the kernels' distances (the exact
+    one where they have none), each [m].
 
     counts: of a kernel the cells without a distance, and those where it exceeds the exact one.
     """
 
-    hard: Float32
     distance: Float32
+    hard: Float32 | None
     gradient: Float32 | None
     bound: Float32 | None
     entry: Int32 | None
@@ -70,7 +71,7 @@ class DeviceField:
         self.device, self.choice, self._kernels = device, choice, kernels
         self._rooms: dict[str, tuple[int, int]] = {}  # address and bytes
         self.launches: list[Launch] = []  # of the last answer
-        base = np.zeros((), FIELD)
+        base = np.zeros((), TASK)
         base["spheres"]["counts"] = (spheres.centers.shape[1] // LANES, 0)
         base["numbers"] = (0.0, 0.0, FAR, np.log(spheres.centers.shape[1]))
         for name, values in {"centers": spheres.centers, "boxes": spheres.boxes}.items():
@@ -93,31 +94,29 @@ class DeviceField:
             self.device.free(address)
         self._rooms = {}
 
-    def bake(
-        self, span: GridSpan, *, with_gradient: bool = True, with_entry: bool = False, margin: float | None = None
-    ) -> Answers:
-        """At the cells of a span, whose mask does not count; margin: what `bound` stands below the exact distance."""
+    def bake(self, span: GridSpan, wanted: Collection[str], *, margin: float = 0.0) -> Answers:
+        """At the cells of a span, whose mask does not count. wanted: fields of `Answers`, and kernels; margin [m]."""
         grid = np.zeros((), GRID)
         grid["place"], grid["size"], grid["planes"] = (*span.origin, span.voxel), span.shape, (span.first, span.last)
         shape = span.shape_of_channel
         num_warps = int(np.prod([-(-n // SUB_BLOCK) for n in shape]))
-        return self._answered("bake", {"grid": grid}, shape, num_warps, with_gradient, with_entry, margin)
+        return self._answered("bake", {"grid": grid}, shape, num_warps, wanted, margin)
 
-    def query(self, points: Float32, *, with_entry: bool = False) -> Answers:
+    def query(self, points: Float32, wanted: Collection[str] = ("gradient",)) -> Answers:
         """At points (Q, 3) relative to the spheres' anchor, Q > 0."""
         asked = {"points": self._put("points", points), "num_points": len(points)}
-        return self._answered("query", asked, (len(points),), len(points), True, with_entry, None)
+        return self._answered("query", asked, (len(points),), len(points), wanted, 0.0)
 
     def _answered(
         self, what: str, asked: Mapping[str, Array | int], shape: tuple[int, ...], num_warps: int,
-        with_gradient: bool, with_entry: bool, margin: float | None,
+        wanted: Collection[str], margin: float,
     ) -> Answers:  # fmt: skip
         num, launches = int(np.prod(shape)), []
         places = {name: (self._room(f"{name}.distance", 4 * num), 0) for name in self._tasks}
-        if with_gradient:
+        if "gradient" in wanted:
             for name in {HARD, self.choice.kernel or HARD}:
                 places[name] = (places[name][0], self._room(f"{name}.gradient", 12 * num))
-        entry = self._room("entry", 4 * num) if with_entry else 0
+        entry = self._room("entry", 4 * num) if "entry" in wanted else 0
         for name, base in self._tasks.items():
             task = base.copy()
             for key, value in asked.items():
@@ -125,18 +124,24 @@ class DeviceField:
             task["out"] = (*places[name], entry if name == HARD else 0)
             kernel = HARD if name == HARD else "matern" if self._kernels[name].is_matern else "gaussian"
             launches.append(self._launch(f"{what}_{kernel}", f"{name}.task", task, num_warps, WARPS, WARP * WARPS))
-        launches += self._choices(num, places, margin)
-        self.launches = launches
-        self.device.record(launches).run()
-        gradient = self._read(f"{HARD}.gradient", (*shape, 3), np.float32) if with_gradient else None
+        self.launches = [*launches, *self._choices(num, places, margin if "bound" in wanted else None)]
+        self.device.record(self.launches).run()
         counts = {name: self._read(f"{name}.counts", (2,), np.int32).tolist() for name in self._kernels}
+
+        def read(
+            name: str, key: str, more: tuple[int, ...] = (), kind: type[np.generic] = np.float32
+        ) -> Array | None:
+            return self._read(name, (*shape, *more), kind) if key in wanted else None
+
         return Answers(
-            hard=self._read(f"{HARD}.distance", shape, np.float32),
             distance=self._read("distance", shape, np.float32),
-            gradient=gradient,
-            bound=None if margin is None else self._read("bound", shape, np.float32),
-            entry=self._read("entry", shape, np.int32) if with_entry else None,
-            kernels={name: self._read(f"{name}.distance", shape, np.float32) for name in self._kernels},
+            hard=read(f"{HARD}.distance", HARD),
+            gradient=read(f"{HARD}.gradient", "gradient", (3,)),
+            bound=read("bound", "bound"),
+            entry=read("entry", "entry", (), np.int32),
+            kernels={
+                name: self._read(f"{name}.distance", shape, np.float32) for name in self._kernels if name in wanted
+            },
             counts={name: (first, second) for name, (first, second) in counts.items()},
         )
 
@@ -150,7 +155,10 @@ class DeviceField:
         launches = []
         for name in self._kernels:
             of_kernel = task.copy()
-            of_kernel["kernel"], of_kernel["counts"] = places[name], self._put(f"{name}.counts", np.zeros(2, np.int32))
+            of_kernel["kernel"], of_kernel["counts"] = (
+                places[name],
+                self._put(f"{name}.counts", np.zeros(2, np.int32)),
+            )
             launches.append(self._launch("settle", f"{name}.settled", of_kernel, num, CHOOSE, CHOOSE))
         if self.choice.kernel is not None:
             task["kernel"] = places[self.choice.kernel]
@@ -159,7 +167,7 @@ class DeviceField:
     def _launch(self, kernel: str, name: str, task: Array, num: int, per_block: int, threads: int) -> Launch:
         """Of a kernel whose task is given to it by address, for `num` warps or cells."""
         grid = (-(-num // per_block), 1, 1)
-        return Launch(kernel=kernel, grid=grid, block=threads, arguments=(self._put(name, task),))
+        return Launch(kernel=kernel, grid=grid, block=threads, arguments=(self._put(name, task),), source=FIELD)
 
     def _with_offsets(self, base: Array, name: str, offsets: Offsets) -> Array:
         task = base.copy()

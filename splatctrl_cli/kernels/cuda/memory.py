@@ -7,6 +7,7 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+FIT, FIELD = "fit.cu", "field.cu"  # the sources of kernels
 
 
 class DeviceError(RuntimeError):
@@ -23,12 +24,15 @@ class OutOfMemory(DeviceError):  # noqa: N818  (as the driver names it)
 
 @dataclass(frozen=True, kw_only=True)
 class Launch:
-    """One kernel: blocks in the grid (x, y, z), threads in a block; addresses are int, other arguments np.int32."""
+    """One kernel of a source: blocks in the grid (x, y, z), threads in a block; addresses are int, other arguments
+    np.int32.
+    """
 
     kernel: str
     grid: tuple[int, int, int]
     block: int
     arguments: tuple[Any, ...]
+    source: str = FIT
 
 
 class Graph(Protocol):

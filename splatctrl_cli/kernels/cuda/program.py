@@ -9,10 +9,10 @@ from typing import Any
 from cuda.core import ObjectCode, Program, ProgramOptions
 from cuda.core.utils import FileStreamProgramCache, make_program_cache_key
 
+from splatctrl_cli.kernels.cuda.memory import FIT
+
 HERE = Path(__file__).parent
 FOLDERS = (HERE / "src", HERE / "include", HERE.parent / "src")  # as #include looks through them
-
-FIT, FIELD = "fit.cu", "field.cu"
 
 
 @cache
@@ -26,7 +26,7 @@ def source_digest() -> bytes:
 
 
 def compiled(capability: tuple[int, int], cache_folder: Path | None = None, *, source: str = FIT) -> Any:
-    """The kernels of a source for a compute capability, as machine code; `cache_folder` is that of cuda-core unless given.
+    """The kernels of a source for a compute capability, as machine code, kept in cuda-core's folder or the given one.
 
     A cache that cannot be written costs the compilation only.
     """

@@ -7,18 +7,22 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.clustered_splats import Spheres
-from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
-from splatctrl_cli.field.grid_cells import RESOLUTION
+from splatctrl_cli.field.distance import GpdfField, SeField, SphereField, make_field
+from splatctrl_cli.field.grid_cells import RESOLUTION, GridLayout
+from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.on_device import OnDevice
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.field import Choice, DeviceField
 from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.kernels.field import GridSpan
-from splatctrl_cli.records import Box, Float64
-from tests.field.scenes import cloud, queries
+from splatctrl_cli.records import Box, DistanceGrid, Float64
+from tests.field.scenes import cloud, queries, splat_set
 from tests.kernels.cuda.emulator import EmulatedDevice
 from tests.reference import field as reference
 
+ALL = ("hard", "gradient", "bound", "entry", "se", "gpdf")
 KINDS = {"se": SeField, "gpdf": GpdfField}
 NewDevice = Callable[[], Memory]
 EXACT = FieldConfig(truncation=1e-9)  # nothing that counts is left out: what is left is rounding
@@ -30,7 +34,11 @@ def spheres(num: int = NUM, seed: int = 0) -> Spheres:
 
 
 def device_field(
-    memory: Memory, of: Spheres, config: FieldConfig = EXACT, kernels: tuple[str, ...] = ("se", "gpdf"), **choice: object
+    memory: Memory,
+    of: Spheres,
+    config: FieldConfig = EXACT,
+    kernels: tuple[str, ...] = ("se", "gpdf"),
+    **choice: object,
 ) -> DeviceField:
     chosen: dict[str, object] = {"kernel": kernels[0] if kernels else None, "resolution": RESOLUTION, **choice}
     terms = {name: KINDS[name].over(of, config).terms() for name in kernels}
@@ -73,7 +81,7 @@ def away(gradient: np.ndarray, expected: np.ndarray, where: np.ndarray | None = 
 def test_exact_distances_of_a_grid_are_those_of_the_processor(where: str, device: Memory) -> None:
     of = spheres()
     span, points = span_of(of, *BOXES[where])
-    baked = device_field(device, of, kernels=()).bake(span, with_entry=True, margin=0.01)
+    baked = device_field(device, of, kernels=()).bake(span, ALL, margin=0.01)
     expected, gradient = by_processor(of, EXACT, span, "hard")
     np.testing.assert_allclose(baked.hard, expected, rtol=0, atol=1e-6)
     np.testing.assert_allclose(baked.hard.ravel(), reference.hard(points, *cloud(NUM)), rtol=0, atol=1e-6)
@@ -96,7 +104,7 @@ def test_kernel_distances_of_a_grid_are_those_of_the_references(
 ) -> None:
     of, config = spheres(), replace(EXACT, length_scale=length)
     span, points = span_of(of, *BOXES[where])
-    baked = device_field(device, of, config, (name,), is_single=True).bake(span)
+    baked = device_field(device, of, config, (name,), is_single=True).bake(span, ALL)
     if name == "se":
         expected, slope = reference.se(points, *cloud(NUM), length, config.noise)
     else:
@@ -116,10 +124,10 @@ def test_kernel_distances_of_a_grid_are_those_of_the_references(
 
 def test_a_truncation_raises_a_distance_by_no_more(device: Memory) -> None:
     of, config = spheres(), FieldConfig(truncation=1e-3)
-    span, points = span_of(of, NEAR, 0.013)
+    span, _ = span_of(of, NEAR, 0.013)
     for name in KINDS:
-        baked = device_field(device, of, config, (name,), is_single=True).bake(span, with_gradient=False)
-        exact = device_field(device, of, EXACT, (name,), is_single=True).bake(span, with_gradient=False)
+        baked = device_field(device, of, config, (name,), is_single=True).bake(span, ())
+        exact = device_field(device, of, EXACT, (name,), is_single=True).bake(span, ())
         error = baked.distance - exact.distance
         assert error.max() < config.truncation
         assert (error != 0.0).any()  # something is left out
@@ -129,7 +137,7 @@ def test_a_truncation_raises_a_distance_by_no_more(device: Memory) -> None:
 def test_the_smaller_distance_is_taken_with_its_gradient_and_what_was_asked_is_counted(device: Memory) -> None:
     of = spheres()
     span, _ = span_of(of, NEAR, 0.013)
-    baked = device_field(device, of).bake(span)
+    baked = device_field(device, of).bake(span, ALL)
     hard, slope = by_processor(of, EXACT, span, "hard")
     smooth, smooth_slope = by_processor(of, EXACT, span, "se")
     is_smooth = smooth < hard
@@ -151,14 +159,14 @@ def test_points_are_answered_as_by_the_processor(num: int, device: Memory) -> No
     of, config = spheres(num), replace(EXACT, truncation=1e-7)
     points = np.concatenate([queries(200), 3.0 * queries(40, seed=2), cloud(num)[0][:4]])
     field = device_field(device, of, config)
-    found = field.query(of.points.relative(points), with_entry=True)
-    hard, slope = SphereField.over(of).query(points)
+    found = field.query(of.points.relative(points), ALL)
+    hard, _ = SphereField.over(of).query(points)
     np.testing.assert_allclose(found.hard, hard, rtol=1e-5, atol=1e-6)
     nearest = SphereField.over(of).nearest(points)
     assert found.entry is not None
     assert np.mean(of.points.source[found.entry] == nearest) > 0.99
-    for name in KINDS:
-        raw, raw_slope = KINDS[name].over(of, config).query_raw(points)
+    for name, kind in KINDS.items():
+        raw, raw_slope = kind.over(of, config).query_raw(points)
         raw[np.isnan(raw)] = hard[np.isnan(raw)]
         np.testing.assert_allclose(found.kernels[name], raw, rtol=1e-5, atol=2e-6)
         single = device_field(device, of, config, (name,), is_single=True).query(of.points.relative(points))
@@ -171,7 +179,7 @@ def test_more_spheres_than_a_list_holds_are_worked_off(device: Memory) -> None:
     of = spheres(3000)
     span, points = span_of(of, Box(lower=np.array([-0.1, -0.1, 0.1]), upper=np.array([0.3, 0.2, 0.3])), 0.1)
     for name in KINDS:
-        baked = device_field(device, of, replace(EXACT, length_scale=0.1), (name,), is_single=True).bake(span)
+        baked = device_field(device, of, replace(EXACT, length_scale=0.1), (name,), is_single=True).bake(span, ALL)
         if name == "se":
             expected, _ = reference.se(points, *cloud(3000), 0.1, EXACT.noise)
         else:
@@ -184,8 +192,8 @@ def test_more_spheres_than_a_list_holds_are_worked_off(device: Memory) -> None:
 def test_planes_in_parts_have_the_bytes_of_the_whole(device: Memory) -> None:
     of = spheres()
     field = device_field(device, of)
-    whole = field.bake(span_of(of, NEAR, 0.02)[0])
-    parts = [field.bake(span_of(of, NEAR, 0.02, *planes)[0]) for planes in ((0, 8), (8, None))]
+    whole = field.bake(span_of(of, NEAR, 0.02)[0], ALL)
+    parts = [field.bake(span_of(of, NEAR, 0.02, *planes)[0], ALL) for planes in ((0, 8), (8, None))]
     for name in ("hard", "distance", "gradient"):
         joined = np.concatenate([getattr(part, name) for part in parts])
         np.testing.assert_array_equal(joined, getattr(whole, name))
@@ -197,7 +205,7 @@ def test_the_order_of_threads_changes_no_byte() -> None:
     answers = []
     for backwards in (False, True):
         field = device_field(EmulatedDevice(backwards=backwards), of)
-        answers += [(field.bake(span_of(of, NEAR, 0.03)[0]), field.query(points, with_entry=True))]
+        answers += [(field.bake(span_of(of, NEAR, 0.03)[0], ALL), field.query(points, ALL))]
     for one, other in zip(*answers, strict=True):
         for name in ("hard", "distance", "gradient", "entry"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -212,3 +220,53 @@ def test_memory_is_given_back() -> None:
     field.query(of.points.relative(queries(30)))
     field.close()
     assert not memory.held
+
+
+@pytest.mark.parametrize("distance", ["safe", "safe_gpdf", "se", "gpdf", "hard"])
+def test_a_baker_on_a_device_bakes_the_processors_channels(distance: str, device: Memory) -> None:
+    splats, config = splat_set(*cloud(NUM)), FieldConfig(voxel=0.02, distance=distance)
+    layout = GridLayout.over(NEAR, config.voxel)
+    channels = ("sdf", "gradient", "bound", "label", "hard", "se", "observed")
+    made = []
+    for memory in (device, None):
+        baker = Baker(splats, layout, config, channels=channels, device=memory)
+        planes = baker.allocate(layout.shape[0])
+        baker.bake(0, layout.shape[0], planes)
+        baker.close()
+        made.append((planes, baker.counts))
+    (mine, counts), (theirs, expected) = made
+    for name in ("sdf", "hard", "bound", "se"):
+        difference = np.abs(mine[name].astype(np.float64) - theirs[name].astype(np.float64))
+        assert difference.max() < (1e-6 if name in ("hard", "bound") else 2 * config.truncation), name
+    for name in ("label", "observed"):
+        np.testing.assert_array_equal(mine[name], theirs[name])
+    assert np.mean(np.abs(mine["gradient"].astype(float) - theirs["gradient"].astype(float)) < 2e-3) > 0.99
+    assert all(abs(counts[name] - expected[name]) <= 0.01 * mine["sdf"].size for name in expected)
+
+
+def test_a_certified_bound_never_exceeds_the_exact_distance_of_the_processor(device: Memory) -> None:
+    splats, config, rng = splat_set(*cloud(NUM)), FieldConfig(voxel=0.03), np.random.default_rng(4)
+    layout = GridLayout.over(NEAR, config.voxel)
+    baker = Baker(splats, layout, config, channels=("sdf", "bound"), device=device)
+    planes = baker.allocate(layout.shape[0])
+    baker.bake(0, layout.shape[0], planes)
+    field = GridField(DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=planes, header={}))
+    points = rng.uniform(layout.box.lower - 0.1, layout.box.upper + 0.1, (1_000_000, 3))
+    exact = SphereField(*cloud(NUM), threads=2).query(points)[0]
+    gap = exact - field.certified(points)
+    assert gap.min() >= 0.0
+    assert gap.min() < 0.01  # it comes near
+
+
+def test_a_field_on_a_device_answers_as_that_of_the_processor(device: Memory) -> None:
+    points, config = queries(100), FieldConfig()
+    for distance in ("safe", "hard", "gpdf"):
+        named = replace(config, distance=distance)
+        field = OnDevice.of(*cloud(NUM), named, device)
+        found, expected = field.distance(points), make_field(*cloud(NUM), named).query(points)[0]
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2 * config.truncation)
+        np.testing.assert_array_equal(field.nearest(points), SphereField(*cloud(NUM)).nearest(points))
+        np.testing.assert_array_equal(field.query(points)[0], found)
+        assert len(field.query(points[:0])[0]) == len(field.distance(points[:0])) == 0
+        assert len(field.nearest(points[:0])) == 0
+        field.close()

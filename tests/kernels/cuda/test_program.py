@@ -8,11 +8,15 @@ import pytest
 pytest.importorskip("cuda.core", reason="needs the extra [cuda]")
 
 from splatctrl_cli.kernels.cuda import program
+from splatctrl_cli.kernels.cuda.memory import FIELD, FIT
 
 
+@pytest.mark.parametrize("source", [FIT, FIELD])
 @pytest.mark.parametrize("capability", [(7, 5), (8, 0), (9, 0), (12, 0)])
-def test_kernels_compile_for_every_generation(capability: tuple[int, int], tmp_path: Path) -> None:
-    assert program.compiled(capability, tmp_path).code[:4] == b"\x7fELF"
+def test_kernels_compile_for_every_generation(capability: tuple[int, int], source: str, tmp_path: Path) -> None:
+    code = program.compiled(capability, tmp_path, source=source).code
+    assert code[:4] == b"\x7fELF"
+    assert b".text.bake_hard" in code or source == FIT  # by its name, as it is launched
 
 
 def test_a_second_start_does_not_compile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -82,7 +82,7 @@ __device__ void through_list(const From& from, int lane, const Put& put, const F
   flush(chosen.size);
 }
 
-__global__ __launch_bounds__(kWarp* kWarps) void bake_hard(const FieldTask* given) {
+extern "C" __global__ __launch_bounds__(kWarp* kWarps) void bake_hard(const FieldTask* given) {
   __shared__ float4 listed[kWarps][kRoom];
   __shared__ int entries[kWarps][kRoom];
   const FieldTask& task = *given;
@@ -162,14 +162,14 @@ __device__ void bake_terms(const FieldTask& task, float4* listed, float2* of) {
     if (const long cell = cells.at(task.grid, h, lane); cell >= 0) terms.finish(cells.place[h], shift[h], sums[h]).write(task, cell);
 }
 
-__global__ __launch_bounds__(kWarp* kWarps) void bake_gaussian(const FieldTask* task) {
+extern "C" __global__ __launch_bounds__(kWarp* kWarps) void bake_gaussian(const FieldTask* task) {
   __shared__ float4 listed[kWarps][kRoom];
   __shared__ float2 of[kWarps][kRoom];
   const int warp = static_cast<int>(threadIdx.x) / kWarp;
   bake_terms<GaussianTerms>(*task, listed[warp], of[warp]);
 }
 
-__global__ __launch_bounds__(kWarp* kWarps) void bake_matern(const FieldTask* task) {
+extern "C" __global__ __launch_bounds__(kWarp* kWarps) void bake_matern(const FieldTask* task) {
   __shared__ float4 listed[kWarps][kRoom];
   __shared__ float2 of[kWarps][kRoom];
   const int warp = static_cast<int>(threadIdx.x) / kWarp;

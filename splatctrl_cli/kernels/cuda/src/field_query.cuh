@@ -9,7 +9,7 @@ __device__ inline Point point_of(const FieldTask& task, int q) {
   return {task.points[3 * q], task.points[3 * q + 1], task.points[3 * q + 2]};
 }
 
-__global__ __launch_bounds__(kWarp* kWarps) void query_hard(const FieldTask* given) {
+extern "C" __global__ __launch_bounds__(kWarp* kWarps) void query_hard(const FieldTask* given) {
   const FieldTask& task = *given;
   const int q = warp_of_grid(), lane = lane_of_thread();
   if (q >= task.num_points) return;
@@ -38,9 +38,9 @@ __device__ void query_terms(const FieldTask& task) {
   if (lane == 0) terms.finish(here, 0.0f, sums).write(task, q);
 }
 
-__global__ __launch_bounds__(kWarp* kWarps) void query_gaussian(const FieldTask* task) { query_terms<GaussianTerms>(*task); }
+extern "C" __global__ __launch_bounds__(kWarp* kWarps) void query_gaussian(const FieldTask* task) { query_terms<GaussianTerms>(*task); }
 
-__global__ __launch_bounds__(kWarp* kWarps) void query_matern(const FieldTask* task) { query_terms<MaternTerms>(*task); }
+extern "C" __global__ __launch_bounds__(kWarp* kWarps) void query_matern(const FieldTask* task) { query_terms<MaternTerms>(*task); }
 
 // Of n cells or points: hard (n) and kernel (n), gradients (n, 3), the kernel's null where the exact one is taken.
 struct ChoiceTask {
@@ -60,7 +60,7 @@ __device__ inline std::int64_t cell_of_thread() {
 }
 
 // The field that the configuration names; the gradient may be in the place of either.
-__global__ void choose(const ChoiceTask* given) {
+extern "C" __global__ void choose(const ChoiceTask* given) {
   const ChoiceTask& task = *given;
   const std::int64_t at = cell_of_thread();
   if (at >= task.num) return;
@@ -74,7 +74,7 @@ __global__ void choose(const ChoiceTask* given) {
 }
 
 // Counts what there is to say of a kernel, and puts the exact distance where it has none.
-__global__ void settle(const ChoiceTask* given) {
+extern "C" __global__ void settle(const ChoiceTask* given) {
   const ChoiceTask& task = *given;
   const std::int64_t at = cell_of_thread();
   if (at >= task.num) return;

@@ -1,0 +1,70 @@
+"""Distance fields on a card: the kernels of `kernels.cuda.field` under the names of the configuration."""
+
+from collections.abc import Mapping
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.clustered_splats import Spheres, checked_points
+from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, LogSumExpField, SeField
+from splatctrl_cli.field.grid_cells import RESOLUTION
+from splatctrl_cli.kernels.cuda.field import Answers, Choice, DeviceField
+from splatctrl_cli.kernels.cuda.memory import Memory
+from splatctrl_cli.records import Float64
+
+KERNELS: Mapping[str, type[LogSumExpField]] = {"se": SeField, "gpdf": GpdfField}
+
+
+class OnDevice:
+    """The field that ``config.distance`` names, on a device: as `field_over`, for many points at a time."""
+
+    def __init__(self, spheres: Spheres, config: FieldConfig, device: Memory, *, threads: int = 1) -> None:
+        """The weights are made by the processor. Raises OutOfMemory."""
+        self.spheres, kernel = spheres, KERNEL_OF[config.distance]
+        kernels = {} if kernel is None else {kernel: KERNELS[kernel].over(spheres, config, threads=threads)}
+        self.field = device_field(spheres, kernels, config, device)
+
+    @classmethod
+    def of(cls, centers: ArrayLike, radii: ArrayLike, config: FieldConfig, device: Memory) -> Self:
+        """Over spheres (N, 3), (N,) [m]. Raises as `Spheres.of`."""
+        return cls(Spheres.of(centers, radii), config, device)
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3)."""
+        if not len(points):
+            return np.zeros(0), np.zeros((0, 3))
+        found = self._asked(points, "gradient")
+        assert found.gradient is not None
+        return found.distance.astype(np.float64), found.gradient.astype(np.float64)
+
+    def distance(self, points: Float64) -> Float64:
+        """points (Q, 3) [m] -> distance (Q,) [m]."""
+        return self._asked(points).distance.astype(np.float64) if len(points) else np.zeros(0)
+
+    def nearest(self, points: Float64) -> NDArray[np.int64]:
+        """points (Q, 3) [m] -> the index (Q,) of the sphere that gives the exact distance."""
+        if not len(points):
+            return np.zeros(0, np.int64)
+        found = self._asked(points, "entry")
+        assert found.entry is not None
+        return self.spheres.points.source[found.entry]
+
+    def _asked(self, points: Float64, *wanted: str) -> Answers:
+        return self.field.query(self.spheres.points.relative(checked_points(points)), wanted)
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self.field.close()
+
+
+def device_field(
+    spheres: Spheres, kernels: Mapping[str, LogSumExpField], config: FieldConfig, device: Memory
+) -> DeviceField:
+    """The exact distance and `kernels` on a device, and the choice between them that ``config.distance`` names."""
+    chosen = KERNEL_OF[config.distance]
+    choice = Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION)
+    terms = {name: field.terms() for name, field in kernels.items()}
+    radii = spheres.points.offsets(spheres.radii)
+    return DeviceField(device, spheres.points.clusters, radii, terms, choice)
