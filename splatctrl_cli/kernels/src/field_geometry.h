@@ -127,9 +127,13 @@ struct GridSpan {
 
   SPLATCTRL_HOST_DEVICE int blocks(int axis) const { return (size[axis] + kBlock - 1) / kBlock; }
   // Where cell (i, j, k) stands in the arrays.
-  SPLATCTRL_HOST_DEVICE long cell(int i, int j, int k) const { return (static_cast<long>(i - first) * size[1] + j) * size[2] + k; }
+  SPLATCTRL_HOST_DEVICE long cell(int i, int j, int k) const {
+    return (static_cast<long>(i - first) * size[1] + j) * size[2] + k;
+  }
   // Half the diagonal of the centres of `cells`^3 cells.
-  SPLATCTRL_HOST_DEVICE float radius(int cells) const { return 0.5f * static_cast<float>((cells - 1) * voxel) * kSqrt3 * 1.000001f; }
+  SPLATCTRL_HOST_DEVICE float radius(int cells) const {
+    return 0.5f * static_cast<float>((cells - 1) * voxel) * kSqrt3 * 1.000001f;
+  }
 };
 
 // The middle of the centres of `cells`^3 cells.

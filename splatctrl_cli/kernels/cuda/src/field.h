@@ -34,7 +34,9 @@ struct FieldTask {
 };
 
 __device__ inline int lane_of_thread() { return static_cast<int>(threadIdx.x) % kWarp; }
-__device__ inline int warp_of_grid() { return static_cast<int>(blockIdx.x) * kWarps + static_cast<int>(threadIdx.x) / kWarp; }
+__device__ inline int warp_of_grid() {
+  return static_cast<int>(blockIdx.x) * kWarps + static_cast<int>(threadIdx.x) / kWarp;
+}
 
 __device__ inline float warp_sum(float v) {
 #pragma unroll
@@ -42,7 +44,9 @@ __device__ inline float warp_sum(float v) {
   return v;
 }
 
-__device__ inline bool is_less(Nearest a, Nearest b) { return a.score < b.score || (a.score == b.score && a.entry < b.entry); }
+__device__ inline bool is_less(Nearest a, Nearest b) {
+  return a.score < b.score || (a.score == b.score && a.entry < b.entry);
+}
 
 __device__ inline Nearest warp_least(Nearest n) {
 #pragma unroll

@@ -96,7 +96,8 @@ extern "C" __global__ __launch_bounds__(kWarp* kWarps) void bake_hard(const Fiel
       near, lane,
       [&](int i, int at) {
         const Point p = place_of(task.spheres, i);
-        listed[warp][at] = make_float4(p.x - cells.middle.x, p.y - cells.middle.y, p.z - cells.middle.z, task.offsets.value[i]);
+        const Point m = cells.middle;
+        listed[warp][at] = make_float4(p.x - m.x, p.y - m.y, p.z - m.z, task.offsets.value[i]);
         entries[warp][at] = i;
       },
       [&](int size) {
@@ -112,17 +113,18 @@ extern "C" __global__ __launch_bounds__(kWarp* kWarps) void bake_hard(const Fiel
   for (int h = 0; h < 2; ++h) {
     const long at = cells.at(task.grid, h, lane);
     if (at < 0) continue;
-    const Point p = place_of(task.spheres, entry[h]);
+    const Point p = place_of(task.spheres, entry[h]), m = cells.middle;
     const Place& x = cells.place[h];
-    to_sphere(x.x - (p.x - cells.middle.x), x.y - (p.y - cells.middle.y), x.z - (p.z - cells.middle.z), task.offsets.value[entry[h]]).write(task, at);
+    const float radius = task.offsets.value[entry[h]];
+    to_sphere(x.x - (p.x - m.x), x.y - (p.y - m.y), x.z - (p.z - m.z), radius).write(task, at);
     if (task.entry != nullptr) task.entry[at] = entry[h];
   }
 }
 
 // Adds the terms of a list at a lane's two places. Where exponents could overflow they are taken less the largest so far.
 template <class Terms>
-__device__ void add_listed(const float4* listed, const float2* of, int size, bool is_safe, const typename Terms::Exponents at[2],
-                           float shift[2], typename Terms::Sums sums[2]) {
+__device__ void add_listed(const float4* listed, const float2* of, int size, bool is_safe,
+                           const typename Terms::Exponents at[2], float shift[2], typename Terms::Sums sums[2]) {
   if (!is_safe) {
     for (int h = 0; h < 2; ++h) {
       float most = shift[h];
@@ -158,8 +160,10 @@ __device__ void bake_terms(const FieldTask& task, float4* listed, float2* of) {
         const bool is_safe = !__any_sync(kAllLanes, !(reach < kSafeExponent));
         add_listed<Terms>(listed, of, size, is_safe, at, shift, sums);
       });
-  for (int h = 0; h < 2; ++h)
-    if (const long cell = cells.at(task.grid, h, lane); cell >= 0) terms.finish(cells.place[h], shift[h], sums[h]).write(task, cell);
+  for (int h = 0; h < 2; ++h) {
+    const long cell = cells.at(task.grid, h, lane);
+    if (cell >= 0) terms.finish(cells.place[h], shift[h], sums[h]).write(task, cell);
+  }
 }
 
 extern "C" __global__ __launch_bounds__(kWarp* kWarps) void bake_gaussian(const FieldTask* task) {

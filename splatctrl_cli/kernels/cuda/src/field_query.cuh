@@ -38,9 +38,13 @@ __device__ void query_terms(const FieldTask& task) {
   if (lane == 0) terms.finish(here, 0.0f, sums).write(task, q);
 }
 
-extern "C" __global__ __launch_bounds__(kWarp* kWarps) void query_gaussian(const FieldTask* task) { query_terms<GaussianTerms>(*task); }
+extern "C" __global__ __launch_bounds__(kWarp* kWarps) void query_gaussian(const FieldTask* task) {
+  query_terms<GaussianTerms>(*task);
+}
 
-extern "C" __global__ __launch_bounds__(kWarp* kWarps) void query_matern(const FieldTask* task) { query_terms<MaternTerms>(*task); }
+extern "C" __global__ __launch_bounds__(kWarp* kWarps) void query_matern(const FieldTask* task) {
+  query_terms<MaternTerms>(*task);
+}
 
 // Of n cells or points: hard (n) and kernel (n), gradients (n, 3), the kernel's null where the exact one is taken.
 struct ChoiceTask {

@@ -74,7 +74,8 @@ struct GaussianTerms {
   }
   __device__ bool chooses(int i) const {
     const Point p = place_of(task.spheres, i);
-    return squared_distance(p, middle) - task.offsets.value[i] <= limit + 2.0f * radius * sqrtf(squared_distance(p, reference));
+    const float score = squared_distance(p, middle) - task.offsets.value[i];
+    return score <= limit + 2.0f * radius * sqrtf(squared_distance(p, reference));
   }
   __device__ Term term(int i) const {
     const Point p = place_of(task.spheres, i);
@@ -82,18 +83,22 @@ struct GaussianTerms {
     const float along = (reference.x - middle.x + 0.5f * x) * x + (reference.y - middle.y + 0.5f * y) * y +
                         (reference.z - middle.z + 0.5f * z) * z;
     const float exponent = static_cast<float>(task.exact[i] - log_weight) - along * inverse;
-    return {make_float4(x, y, z, exponent), make_float2(task.radius[i] - reference_radius, task.sign == nullptr ? 1.0f : task.sign[i])};
+    const float sign = task.sign == nullptr ? 1.0f : task.sign[i];
+    return {make_float4(x, y, z, exponent), make_float2(task.radius[i] - reference_radius, sign)};
   }
   __device__ Exponents at(Place x) const { return {x.x * inverse, x.y * inverse, x.z * inverse}; }
   __device__ float reach_scale() const { return radius * inverse; }
 
   // shift: what was taken off the exponents.
   __device__ Distance finish(Place x, float shift, const Sums& s) const {
-    const float dx = x.x - (reference.x - middle.x), dy = x.y - (reference.y - middle.y), dz = x.z - (reference.z - middle.z);
+    const float dx = x.x - (reference.x - middle.x), dy = x.y - (reference.y - middle.y);
+    const float dz = x.z - (reference.z - middle.z);
     const float unit = 2.0f * task.length * task.length, scale = 1.0f / s.weight, mean = s.radius * scale;
-    const float squared = squared_length(dx, dy, dz) - static_cast<float>(unit * log_weight) - unit * (shift + logf(s.weight));
+    const float log_sum = unit * (shift + logf(s.weight));
+    const float squared = squared_length(dx, dy, dz) - static_cast<float>(unit * log_weight) - log_sum;
     const float root = sqrtf(squared), mean_radius = reference_radius + mean;
-    if (!(root > 0.0f) || !(s.weight > 0.0f) || !(fabsf(mean_radius) <= 1.001f * task.largest_radius)) return no_distance();
+    const bool has_value = root > 0.0f && s.weight > 0.0f && fabsf(mean_radius) <= 1.001f * task.largest_radius;
+    if (!has_value) return no_distance();
     const float to[3] = {dx, dy, dz};
     float gradient[3];
     for (int a = 0; a < 3; ++a) {
@@ -159,7 +164,8 @@ struct MaternTerms {
             make_float2(0.0f, task.sign == nullptr ? 1.0f : task.sign[i])};
   }
   __device__ float from(Place x) const {
-    return sqrtf(squared_length(x.x - (reference.x - middle.x), x.y - (reference.y - middle.y), x.z - (reference.z - middle.z)));
+    return sqrtf(squared_length(x.x - (reference.x - middle.x), x.y - (reference.y - middle.y),
+                                x.z - (reference.z - middle.z)));
   }
   __device__ Exponents at(Place x) const { return {x.x, x.y, x.z, from(x), 1.0f / task.length}; }
   __device__ float reach_scale() const { return radius / task.length; }
