@@ -20,8 +20,8 @@ from splatctrl_cli.jobs.robot import (
 )
 from splatctrl_cli.robot.coverage import LinkCoverage
 from splatctrl_cli.robot.self_collision import LinkPair
+from splatctrl_cli.robot.sphere_files import RENAMED
 from splatctrl_cli.robot.sphere_fit import FitOptions
-from splatctrl_cli.robot.spheres import RENAMED
 
 
 def run_spheres(args: argparse.Namespace) -> int:

@@ -13,9 +13,8 @@ from splatctrl_cli.control.fallbacks import Choice, Rung, descend, held
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.preconditions import check_coverage, check_model, checked_posture
-from splatctrl_cli.control.printed_program import PRINTED, solve_printed
 from splatctrl_cli.control.qp import QpSolver, solver_named, unsolved
-from splatctrl_cli.control.qp_rows import RowBuilder, Rows
+from splatctrl_cli.control.qp_rows import PRINTED, RowBuilder, Rows, solve_printed
 from splatctrl_cli.control.terms import BarrierTerm, Cost, CostTerm, ReachGoal, RowKind, State, standard_costs, summed
 from splatctrl_cli.records import Bool, DistanceField, Float64
 

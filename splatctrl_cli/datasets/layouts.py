@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from splatctrl_cli.captures.capture_journal import check_not_partial
+from splatctrl_cli.captures.capture_writer import check_not_partial
 from splatctrl_cli.containers.log_formats import SUFFIXES, is_bag_folder
 from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.datasets.image_folder import ImageFolderSource

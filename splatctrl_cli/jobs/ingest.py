@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.captures.capture_journal import JOURNAL, read_identity
 from splatctrl_cli.captures.capture_pack import pack_capture, unpack_capture
-from splatctrl_cli.captures.capture_writer import CaptureSummary, write_capture
+from splatctrl_cli.captures.capture_writer import JOURNAL, CaptureSummary, read_identity, write_capture
 from splatctrl_cli.datasets.image_folder import HOLDOUT
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import DAMAGED

@@ -13,10 +13,9 @@ from splatctrl_cli.config.fixed import SAME_MOMENT_NS
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.files.ply import read_points
-from splatctrl_cli.jobs.camera_agreement import CameraAgreement
 from splatctrl_cli.jobs.correct_views import Corrections
 from splatctrl_cli.jobs.device import CPU, Device, FitDevice
-from splatctrl_cli.jobs.open_recording import guessed_unit
+from splatctrl_cli.jobs.open_recording import CameraAgreement, guessed_unit
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations

@@ -22,9 +22,15 @@ from splatctrl_cli.robot.coverage import CoverageReport, LinkCoverage, coverage_
 from splatctrl_cli.robot.link_meshes import Solid, mesh_path, read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import SelfCollisionPairs, read_srdf, self_collision_pairs
-from splatctrl_cli.robot.sphere_files import SphereFile, read_sphere_file, read_spheres, spheres_yaml
+from splatctrl_cli.robot.sphere_files import (
+    SphereFile,
+    are_links_renamed,
+    matched_links,
+    read_sphere_file,
+    read_spheres,
+    spheres_yaml,
+)
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
-from splatctrl_cli.robot.spheres import are_links_renamed, matched_links
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 SCALES = {

@@ -10,7 +10,7 @@ from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.perceptual import Lpips
+from splatctrl_cli.evaluate.images import Lpips
 from splatctrl_cli.evaluate.score import PROTOCOL, as_json, free_mass, total_score
 from splatctrl_cli.evaluate.score_report import (
     AVERAGING,
@@ -27,7 +27,6 @@ from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
 from splatctrl_cli.jobs.open_recording import RecordingRequest
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.jobs.score_cloud import CloudSettings, cloud_figures
 from splatctrl_cli.jobs.score_reference import (
     Reference,
     cameras_to_score,
@@ -35,7 +34,7 @@ from splatctrl_cli.jobs.score_reference import (
     open_reference,
     recording_check,
 )
-from splatctrl_cli.jobs.score_views import Ranked, Scorer, Scores
+from splatctrl_cli.jobs.score_views import CloudSettings, Ranked, Scorer, Scores, cloud_figures
 from splatctrl_cli.records import Label
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, view_picture
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, run_value

@@ -15,9 +15,8 @@ from splatctrl_cli.datasets.dtu import scan_folders
 from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.images import psnr
+from splatctrl_cli.evaluate.images import Lpips, psnr
 from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, TIME, Scale
-from splatctrl_cli.evaluate.perceptual import Lpips
 from splatctrl_cli.evaluate.score_report import AVERAGING, SCALES, judged, mean_of
 from splatctrl_cli.jobs.device import CPU, Device, demanded
 from splatctrl_cli.jobs.open_recording import RecordingRequest, is_folder_of_views, open_to_train

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.containers.mcap_index import LogIndex
-from splatctrl_cli.containers.mcap_log import McapLog
+from splatctrl_cli.containers.mcap_log import LogIndex, McapLog
 from splatctrl_cli.containers.mcap_records import ChunkIndex
 from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.logs.decoder import (

@@ -11,7 +11,7 @@ from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.report.viewer import for_script, three_js
+from splatctrl_cli.report.space import for_script, three_js
 
 PARTS = Path(__file__).parent / "page_parts"
 QUALITY = 70  # of JPEG: WebP is a third smaller, and takes ten times as long

@@ -14,8 +14,14 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
-from splatctrl_cli.robot.sphere_files import read_spheres
-from splatctrl_cli.robot.spheres import RENAMED, are_links_renamed, lever_arms, matched_links, spheres_of
+from splatctrl_cli.robot.sphere_files import (
+    RENAMED,
+    are_links_renamed,
+    lever_arms,
+    matched_links,
+    read_spheres,
+    spheres_of,
+)
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 

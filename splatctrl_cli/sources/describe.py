@@ -7,7 +7,7 @@ from typing import Any
 
 from splatctrl_cli.calibration.calibration_file import describe_calibration, is_calibration
 from splatctrl_cli.captures.capture_header import is_capture, read_capture_header
-from splatctrl_cli.captures.capture_journal import check_not_partial
+from splatctrl_cli.captures.capture_writer import check_not_partial
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.containers.log_formats import CONTAINERS, SUFFIXES, is_bag_folder
 from splatctrl_cli.containers.raw_log import RawLog

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.captures.capture import CaptureSource
-from splatctrl_cli.captures.capture_journal import JOURNAL
-from splatctrl_cli.captures.capture_writer import write_capture
+from splatctrl_cli.captures.capture_writer import JOURNAL, write_capture
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.logs import ros_log

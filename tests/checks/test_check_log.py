@@ -17,8 +17,17 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_logs
-from tests.logs.break_log import Change, Message, broken_log, set_stamp, stamp_of
-from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, make_log
+from tests.logs.make_log import (
+    FRAME_NS,
+    START_NS,
+    Change,
+    LogRecipe,
+    Message,
+    broken_log,
+    make_log,
+    set_stamp,
+    stamp_of,
+)
 
 ROOT = Path(__file__).parents[2]
 COLOR, DEPTH, INFO = "/cam0/color/image_raw/compressed", "/cam0/depth/image_raw", "/cam0/color/camera_info"

@@ -11,8 +11,7 @@ import pytest
 
 from splatctrl_cli.checks.finding import CHECKS
 from tests.cli.test_ingest import run
-from tests.logs.break_log import Message, broken_log
-from tests.logs.make_log import LogRecipe, make_log
+from tests.logs.make_log import LogRecipe, Message, broken_log, make_log
 
 GOOD = LogRecipe(num_frames=20)
 

@@ -20,7 +20,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_source
 from splatctrl_cli.states.state_source import open_states
 from tests.cli.replay_desk import BALL, START, Desk, grid_seen, splats_of, write_scene
-from tests.logs.make_log import LogRecipe, make_log
+from tests.logs.make_log import LogRecipe, encoded, make_log, messages_of, write_raw
 from tests.logs.make_states import (
     NEW_CONTROLLER,
     START_NS,
@@ -32,7 +32,6 @@ from tests.logs.make_states import (
     store_with,
     write_mcap,
 )
-from tests.logs.write_log import encoded, messages_of, write_raw
 
 pytestmark = pytest.mark.usefixtures("without_plots")
 

@@ -18,7 +18,7 @@ from splatctrl_cli.jobs.reconstruct import ReconstructResult
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult
 from splatctrl_cli.records import LossReport
 from tests.cli import here
-from tests.datasets.make_idr import half_size
+from tests.datasets.make_layout import half_size
 from tests.jobs.wall import FRAMES, FakeScene, FakeSource, set_up, write_scene
 
 

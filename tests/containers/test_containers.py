@@ -22,8 +22,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
-from tests.logs.make_log import make_log
-from tests.logs.write_log import rewritten
+from tests.logs.make_log import make_log, rewritten
 from tests.properties import few
 
 TOPICS = ("/a", "/b/c", "/d e")

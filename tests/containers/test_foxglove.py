@@ -26,9 +26,8 @@ from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
 from tests.containers.test_log_formats import assert_same
-from tests.logs.make_log import LogRecipe, make_log
-from tests.logs.write_log import encoded as ros_message
-from tests.logs.write_log import messages_of, rewritten, write_bag
+from tests.logs.make_log import LogRecipe, make_log, messages_of, rewritten, write_bag
+from tests.logs.make_log import encoded as ros_message
 
 TIME = "timestamp .google.protobuf.Timestamp"
 TYPES = {  # fields of each type, numbered as Foxglove numbers them: name and type, [] where it repeats

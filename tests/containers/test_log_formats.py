@@ -12,8 +12,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
-from tests.logs.make_log import STORE, LogRecipe, make_log
-from tests.logs.write_log import messages_of, write_bag
+from tests.logs.make_log import STORE, LogRecipe, make_log, messages_of, write_bag
 
 
 def as_ros2_folder(log: Path, folder: Path, plugin: StoragePlugin) -> Path:

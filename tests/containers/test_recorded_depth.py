@@ -18,8 +18,7 @@ from splatctrl_cli.logs.decoder import IMAGE, MessageDecoder
 from splatctrl_cli.logs.messages import read_image
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.sources.source import open_source
-from tests.logs.make_log import HEIGHT, WIDTH, LogRecipe, T, make_log
-from tests.logs.write_log import encoded, rewritten
+from tests.logs.make_log import HEIGHT, WIDTH, LogRecipe, T, encoded, make_log, rewritten
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 

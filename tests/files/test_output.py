@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.errors import InputError, UsageError, WriteError
-from splatctrl_cli.files import output, output_lock
+from splatctrl_cli.files import output
 from splatctrl_cli.files.output import check_can_be_written, output_path, partial_path, write_durably
 
 
@@ -263,10 +263,12 @@ def test_an_output_within_an_output_is_written(tmp_path: Path) -> None:
 def test_an_output_that_appeared_meanwhile_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
 
+    held = output.held
+
     @contextmanager
     def held_late(partial: Path, *, is_folder: bool) -> Iterator[None]:
         out.mkdir()  # the other run ended between the look at the output and the lock
-        with output_lock.held(partial, is_folder=is_folder):
+        with held(partial, is_folder=is_folder):
             yield
 
     monkeypatch.setattr(output, "held", held_late)

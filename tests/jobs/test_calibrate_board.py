@@ -20,7 +20,7 @@ from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.simulate.arm import HAND
 from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.recording import RecordingOptions, Scene
-from tests.calibration.boards import printed, with_board
+from tests.calibration.scan import printed, with_board
 
 OPTIONS = RecordingOptions(duration_s=3.0, fps=4.0, width=320, height=240, color_rays=0)
 BOARD = Board(columns=7, rows=4, square=0.03)

@@ -28,9 +28,8 @@ from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
 from tests.cli.replay_desk import Desk
 from tests.jobs.stage import Stage
-from tests.logs.make_log import START_NS, LogRecipe, make_log
+from tests.logs.make_log import START_NS, STORE, LogRecipe, encoded, make_log, messages_of, write_bag, write_raw
 from tests.logs.make_states import joint_state
-from tests.logs.write_log import STORE, encoded, messages_of, write_bag, write_raw
 from tests.robot.shapes import written
 from tests.states.test_state_files import lerobot
 

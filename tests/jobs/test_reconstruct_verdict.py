@@ -1,16 +1,21 @@
-"""What a reconstruction's verdict says of its map, each criterion alone."""
+"""What a reconstruction's verdict says of its map, each criterion alone; and views that do not fit together."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from splatctrl_cli.config import Config
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.config import Config, OccupancyConfig
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
+from splatctrl_cli.jobs.open_recording import CameraAgreement, RecordingRequest, open_to_train
+from splatctrl_cli.jobs.progress import SILENT
 from splatctrl_cli.jobs.reconstruct_verdict import GATED, Reconstructed, longest_blind, reconstruct_verdict
-from splatctrl_cli.records import LossReport
+from splatctrl_cli.records import LossReport, RgbdFrame
 from splatctrl_cli.scene.audit_row import AuditRow
+from splatctrl_cli.scene.time_steps import TimeStep
 
 TENTH = 100_000_000  # [ns]
 CAMERAS = ("cam0", "cam1")
@@ -148,3 +153,31 @@ def test_a_gate_on_points_inside_a_robot_that_no_pixel_showed_is_not_evaluable()
     verdict = reconstruct_verdict(made(*STEPS, self_mask={}, self_mask_residual_mm=None), gate)
     assert verdict.exit_code == 5 and "inside_robot_points is unknown, as it rests on nothing" in verdict.sentence
     assert verdict.as_dict()["counts"]["splats"] == len(STEPS)
+
+
+@pytest.fixture(scope="module")
+def views(sample_data: Path) -> list[RgbdFrame]:
+    """Of a still scene, from different places."""
+    source = open_to_train(RecordingRequest(path=sample_data / "dtu", is_dtu=True))
+    return [record for record in source.records() if isinstance(record, RgbdFrame)]
+
+
+def check(views: list[RgbdFrame], factor: float, *, is_allowed: bool = False, is_still: bool = True) -> None:
+    scaled = tuple(replace(view, depth=view.depth * np.float32(factor)) for view in views)
+    made = CameraAgreement("scene", is_allowed=is_allowed, is_still=is_still)
+    made.check(TimeStep(frames=scaled, position=None), OccupancyConfig(max_range=100.0), SILENT)
+
+
+def test_views_at_their_own_scale_pass(views: list[RgbdFrame]) -> None:
+    check(views, 1.0)
+
+
+@pytest.mark.parametrize("factor", [10.0, 0.1])
+def test_depths_ten_times_too_far_or_near_are_refused_with_the_option_to_give(
+    views: list[RgbdFrame], factor: float
+) -> None:
+    with pytest.raises(InputError) as refused:
+        check(views, factor)
+    assert "--depth-scale" in (refused.value.remedy or "")
+    assert "--allow-disagreement" in (refused.value.remedy or "")
+    check(views, factor, is_allowed=True)

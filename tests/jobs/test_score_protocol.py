@@ -20,11 +20,11 @@ from splatctrl_cli.evaluate.cloud import spaced
 from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.jobs.open_recording import RecordingRequest, is_folder_of_views
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.jobs.score_cloud import CloudSettings
 from splatctrl_cli.jobs.score_reference import missing_views
+from splatctrl_cli.jobs.score_views import CloudSettings
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
-from tests.datasets.make_idr import half_size
+from tests.datasets.make_layout import half_size
 from tests.evaluate.make_observed_space import write_observed
 
 QUICK = ("-q", "--max-splats", "600", "--set", "scene.first_iterations=8", "--set", "scene.refine_iterations=4")

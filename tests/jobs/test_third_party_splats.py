@@ -12,7 +12,7 @@ from splatctrl_cli.jobs import score_reference
 from splatctrl_cli.jobs.bake_request import read_bake_source
 from splatctrl_cli.jobs.open_recording import RecordingRequest
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.jobs.score_cloud import CloudSettings
+from splatctrl_cli.jobs.score_views import CloudSettings
 from splatctrl_cli.records import GaussianSet
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply

@@ -1,13 +1,89 @@
-"""Small MCAP logs with a known content, made in code: a fixed or moving camera over a flat wall, joints, tf."""
+"""Logs written message by message, small ones with a known content (a fixed or moving camera over a flat wall,
+joints, tf), and good ones broken in exactly one way.
+"""
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Bag1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Bag2Writer
+from rosbags.typesys import Stores, get_typestore
 
-from tests.logs.write_log import STORE, encoded, write_raw
+from splatctrl_cli.containers.log_formats import open_raw_log
+from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+SCHEMAS = {"cdr": "ros2msg", "ros1": "ros1msg", "protobuf": "protobuf", "json": "jsonschema"}  # by encoding
+
+
+@lru_cache
+def _definition(store: Any, kind: str, version: int) -> str:
+    return str(store.generate_msgdef(kind, ros_version=version)[0])
+
+
+def encoded(log_ns: int, topic: str, content: Any, store: Any = STORE, *, ros: int = 2) -> RawMessage:
+    """A message of ROS 1 or 2 as a log has it."""
+    kind = content.__msgtype__
+    encoding, write = ("cdr", store.serialize_cdr) if ros == 2 else ("ros1", store.serialize_ros1)
+    channel = Topic(name=topic, type_name=kind, encoding=encoding, definition=_definition(store, kind, ros))
+    return RawMessage(topic=channel, log_time_ns=log_ns, data=bytes(write(content, kind)))
+
+
+def write_raw(path: Path, messages: Iterable[RawMessage], **options: Any) -> Path:
+    """An MCAP of the messages, in their order; options are the writer's."""
+    schemas: dict[tuple[str, str], int] = {}
+    channels: dict[str, int] = {}
+    with path.open("wb") as stream:
+        writer = McapWriter(stream, **{"compression": CompressionType.ZSTD, **options})
+        writer.start(profile="ros2", library="tests")
+        for message in messages:
+            topic, time = message.topic, message.log_time_ns
+            if topic.name not in channels:
+                name = topic.schema or topic.type_name
+                name = name.replace("/msg/", "/") if topic.encoding == "ros1" else name
+                key = name, topic.definition
+                if key not in schemas:
+                    definition = topic.definition.encode("latin-1" if topic.encoding == "protobuf" else "utf-8")
+                    schemas[key] = writer.register_schema(name, SCHEMAS.get(topic.encoding, ""), definition)
+                channels[topic.name] = writer.register_channel(topic.name, topic.encoding, schemas[key])
+            writer.add_message(channels[topic.name], time, message.data, time)
+        writer.finish()
+    return path
+
+
+def write_bag(
+    path: Path, messages: Iterable[RawMessage], store: Any = STORE, plugin: StoragePlugin | None = None
+) -> Path:
+    """A bag of the messages by rosbags: of ROS 2 in a folder, kept by `plugin`, or without one a file of ROS 1."""
+    with Bag1Writer(path) if plugin is None else Bag2Writer(path, version=9, storage_plugin=plugin) as writer:
+        connections: dict[str, Any] = {}
+        for message in messages:
+            name, kind = message.topic.name, message.topic.type_name
+            if name not in connections:
+                connections[name] = writer.add_connection(name, kind, typestore=store)
+            writer.write(connections[name], message.log_time_ns, message.data)
+    return path
+
+
+def messages_of(log: Path) -> Iterator[RawMessage]:
+    """All messages of a log that is whole."""
+    damage = Damage()
+    yield from open_raw_log(log).messages(damage)
+    assert not damage.count
+
+
+def rewritten(log: Path, path: Path, change: Callable[[RawMessage], RawMessage]) -> Path:
+    """The log with every message changed."""
+    return write_raw(path, map(change, messages_of(log)))
+
 
 T = STORE.types
 WIDTH, HEIGHT = 32, 24
@@ -208,3 +284,34 @@ def header(stamp: int, frame: str) -> Any:
     seconds, nanoseconds = divmod(stamp, 1_000_000_000)
     time = T["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
     return T["std_msgs/msg/Header"](stamp=time, frame_id=frame)
+
+
+Message = tuple[int, str, str, Any]  # log time [ns], topic, type, message
+Change = Callable[[int, str, str, Any], Iterable[Message]]
+
+
+def broken_log(path: Path, change: Change, recipe: LogRecipe | None = None) -> Path:
+    """The log of `recipe` with every message replaced by what `change` makes of it."""
+    good = make_log(path.with_suffix(".good.mcap"), recipe or LogRecipe(num_frames=30))
+    changed = (
+        encoded(time, topic, content)
+        for message in messages_of(good)
+        for time, topic, _, content in change(message.log_time_ns, message.topic.name, *_decoded(message))
+    )
+    return write_raw(path, changed)
+
+
+def _decoded(message: RawMessage) -> tuple[str, Any]:
+    """Type and content, whose arrays can be written."""
+    kind = message.topic.type_name
+    return kind, STORE.deserialize_cdr(bytearray(message.data), kind)
+
+
+def stamp_of(message: Any) -> int:
+    """Header stamp [ns]."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def set_stamp(message: Any, stamp_ns: int) -> None:
+    """Give a message another header stamp."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)

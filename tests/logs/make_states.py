@@ -9,7 +9,7 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.logs.write_log import STORE, encoded, write_bag, write_raw
+from tests.logs.make_log import STORE, encoded, write_bag, write_raw
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

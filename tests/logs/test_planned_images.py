@@ -15,8 +15,7 @@ from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
-from tests.logs.make_log import LogRecipe, make_log
-from tests.logs.write_log import messages_of, write_raw
+from tests.logs.make_log import LogRecipe, make_log, messages_of, write_raw
 
 TOPIC = Topic(name="/a", type_name="t", encoding="cdr")
 

@@ -12,8 +12,17 @@ from splatctrl_cli.logs.source_options import PoseTopic, SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
-from tests.logs.make_log import FRAME_NS, START_NS, STORE, LogRecipe, camera_x, make_log
-from tests.logs.write_log import encoded, messages_of, write_raw
+from tests.logs.make_log import (
+    FRAME_NS,
+    START_NS,
+    STORE,
+    LogRecipe,
+    camera_x,
+    encoded,
+    make_log,
+    messages_of,
+    write_raw,
+)
 
 T = STORE.types
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"

@@ -20,7 +20,7 @@ from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.survey import survey
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
-from tests.logs.write_log import encoded, write_bag
+from tests.logs.make_log import encoded, write_bag
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 T = STORE.types

@@ -27,8 +27,18 @@ from splatctrl_cli.logs.video import VideoFileLog, open_log
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_logs, open_session, open_source
-from tests.logs.make_log import FRAME_NS, HEIGHT, START_NS, WIDTH, LogRecipe, color_pixels, header, make_log
-from tests.logs.write_log import messages_of, write_raw
+from tests.logs.make_log import (
+    FRAME_NS,
+    HEIGHT,
+    START_NS,
+    WIDTH,
+    LogRecipe,
+    color_pixels,
+    header,
+    make_log,
+    messages_of,
+    write_raw,
+)
 
 NUM, GOP = 12, 5
 RECIPE = LogRecipe(has_joints=False, num_frames=NUM, color_format="png")

@@ -1,11 +1,22 @@
-"""The timeline of a report: curves, margin, strips and what is escaped in them."""
+"""The timeline of a report, and the scene beside it: curves, margin, strips, escapes; bodies and numbers."""
 
+import base64
+import json
 import re
+import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.libraries import trimesh
+from splatctrl_cli.records import Label
+from splatctrl_cli.report.space import Space, SplatsAt, bodies_of, coarsened, packed, three_js
 from splatctrl_cli.report.timeline import HEIGHT, LEFT, RIGHT, TOP, WIDTH, legend, runs_of, timeline
+from splatctrl_cli.robot.surface import RobotSurface
+from splatctrl_cli.robot.urdf import Shape
+from tests.plain import plain_splats
 
 SECONDS = np.linspace(0.0, 2.0, 5)
 
@@ -60,3 +71,61 @@ def test_names_are_no_markup() -> None:
 def test_the_legend_has_the_least_value_of_each_measure() -> None:
     rows = legend({"exact": np.array([0.0123, np.nan]), "truth": np.full(2, np.nan)})
     assert [row[1:] for row in rows] == [("to the splats", "least 12.3 mm"), ("truth", "no value")]
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "extents"),
+    [
+        ("box", (0.2, 0.4, 0.6), (0.2, 0.4, 0.6)),
+        ("cylinder", (0.1, 0.5), (0.2, 0.2, 0.5)),
+        ("sphere", (0.3,), (0.6, 0.6, 0.6)),
+        ("capsule", (0.1, 0.5), (0.2, 0.2, 0.7)),
+    ],
+)
+def test_a_primitive_is_drawn_in_its_place_and_size(
+    kind: str, size: tuple[float, ...], extents: tuple[float, ...]
+) -> None:
+    T = np.eye(4)
+    T[:3, 3] = [1.0, 2.0, 3.0]
+    surface = RobotSurface.from_parts([Shape(link="hand", kind=kind, size=size, T_link_shape=T)])
+    vertices = bodies_of(surface)["hand"].vertices
+    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+    np.testing.assert_allclose(upper - lower, extents, rtol=0.02)
+    np.testing.assert_allclose((upper + lower) / 2, [1.0, 2.0, 3.0], atol=1e-3)
+
+
+def test_unknown_space_is_its_border_and_in_larger_cubes_where_that_is_too_much() -> None:
+    is_unknown = np.zeros((40, 40, 40), bool)
+    is_unknown[10:30, 10:30, 10:30] = True
+    fine, edge = coarsened(is_unknown, np.zeros(3), 0.1, 10_000)
+    assert (len(fine), edge) == (20**3 - 18**3, 0.1)
+    coarse, edge = coarsened(is_unknown, np.zeros(3), 0.1, 500)
+    assert (len(coarse), edge) == (10**3 - 8**3, pytest.approx(0.2))
+    np.testing.assert_allclose(coarse.min(axis=0) - edge / 2, 10 * 0.1 - 0.05, atol=1e-6)  # the same lower corner
+
+
+def test_unknown_space_around_the_grid_has_no_border_there() -> None:
+    assert len(coarsened(np.ones((5, 5, 5), bool), np.zeros(3), 0.1, 100)[0]) == 0
+
+
+def test_splats_are_packed_to_a_hundredth_of_a_per_cent_of_their_box() -> None:
+    generator = np.random.default_rng(0)
+    centers = generator.uniform(-1.5, 1.5, (200, 3))
+    labels = np.where(np.arange(200) < 50, Label.ROBOT, Label.OBJECT)
+    splats = plain_splats(centers, generator.uniform(0.002, 0.05, 200), labels=labels)
+    scene = json.loads(packed(Space(splats=[SplatsAt(time_s=0.0, splats=splats)])))
+    block, (coded,) = zlib.decompress(base64.b64decode(scene["bytes"])), scene["header"]["splats"]
+    kind, start, count = coded["centers"]["array"]
+    whole = np.frombuffer(block, kind, count, start).reshape(3, -1).T
+    np.testing.assert_allclose(whole * coded["centers"]["step"] + coded["centers"]["lower"], centers, atol=3e-5)
+    kind, start, count = coded["radii"]
+    radii = np.frombuffer(block, kind, count, start) * coded["largest"] / 65535
+    np.testing.assert_allclose(radii, splats.radii, atol=1e-6)
+    assert len(packed(Space(splats=[SplatsAt(time_s=0.0, splats=splats)]))) < 6000
+
+
+def test_without_the_three_js_of_trimesh_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert b"THREE" in zlib.decompress(base64.b64decode(three_js()))
+    monkeypatch.setattr(trimesh.resources, "get_bytes", lambda name: Path(name).read_bytes())
+    with pytest.raises(UsageError, match=r"three.js: not found in trimesh.*pip install 'trimesh"):
+        three_js()

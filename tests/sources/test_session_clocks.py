@@ -17,8 +17,7 @@ from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_session, open_source
 from tests.containers.test_log_formats import assert_same
 from tests.logs import make_log as maker
-from tests.logs.break_log import broken_log
-from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, camera_x, make_log
+from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, broken_log, camera_x, make_log
 
 Message = tuple[int, str, str, Any]
 

@@ -21,8 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NoReturn
 
-from splatctrl_cli.files.output import partial_path, write_durably
-from splatctrl_cli.files.output_lock import remove
+from splatctrl_cli.files.output import partial_path, remove, write_durably
 
 Entry = Callable[[list[str]], int]
 
