@@ -49,6 +49,8 @@ TOO_LONG = {  # for a test: minutes; the page has their figures
     "simulate --human-arm near-pickup --seed 3 -o shared",
     "reconstruct docs/examples/apc_shelf.toml --root SCENE --max-splats 10000 -o shelf",
     "sweep demo_output/audit --over KEY=A:B",
+    "study table2 --trials 20 -o out/table2",
+    "study table2 --problem cubby-0007 -o out/one",
     "score shelf --reference docs/examples/apc_shelf.toml --root SCENE",
 }
 RUN_BY_GOLDEN = ("README.md", "start.md")  # all their commands: tests/tools/test_golden.py

@@ -30,7 +30,14 @@ from splatctrl_cli.cli.recording_options import (
     simulate_options,
 )
 from splatctrl_cli.cli.replay_options import replay_options
-from splatctrl_cli.cli.run_options import batch_options, compare_options, report_options, sweep_options, view_options
+from splatctrl_cli.cli.run_options import (
+    batch_options,
+    compare_options,
+    report_options,
+    study_options,
+    sweep_options,
+    view_options,
+)
 from splatctrl_cli.cli.scene_options import (
     export_options,
     query_options,
@@ -271,6 +278,13 @@ COMMANDS = {
         ),
         run="sweep:run",
         options=sweep_options,
+    ),
+    "study": Command(
+        summary="repeat an experiment of the paper, trial by trial",
+        examples=("study table2 --trials 20 -o out/table2", "study table2 --problem cubby-0007 -o out/one"),
+        run="study:run",
+        options=study_options,
+        judges=True,
     ),
     "compare": Command(
         summary="say what got worse between two runs, two batches, or since a stored baseline",

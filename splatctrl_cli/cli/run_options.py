@@ -1,9 +1,9 @@
-"""The options of ``batch``, ``sweep``, ``compare``, ``report`` and ``view``: of many runs, and of looking at them."""
+"""The options of ``batch``, ``sweep``, ``study``, ``compare``, ``report`` and ``view``: of many runs."""
 
 import argparse
 from pathlib import Path
 
-from splatctrl_cli.cli.options import add_output
+from splatctrl_cli.cli.options import add_output, add_threads
 from splatctrl_cli.cli.parser import Options, Parser, real, whole
 
 ROOT = "folder in which the scene and robot of a replay's command line are looked for, if they were moved"
@@ -61,6 +61,25 @@ def sweep_options(add: Options, parser: Parser) -> None:
     add("--tolerance SHARE", near, real(1e-6, 0.5), 1 / 64)
     add("--workers N", "runs at once (default: one per core)", whole(1, 256))
     add("--dask ADDRESS", "make the runs on a Dask cluster that shares this folder")
+
+
+def study_options(add: Options, parser: Parser) -> None:
+    """Of ``splatctrl study``."""
+    add("STUDY", "which experiment of the paper", ("table2",))
+    add("-o/--out DIR", "folder of the study, where it goes on (default: STUDY)", Path)
+    add("--trials N", "problems of each environment (default: as many as the paper's)", whole(1, 100_000))
+    add("--methods A,B", "ours, tsdf, truth, ... (docs/study.md; default: all that are installed)", _names)
+    add("--problems DIR", "MotionBenchMaker's problems of the Panda (default: as SPLATCTRL_REAL_DATA has them)", Path)
+    add("--width PX", "of the cameras' images", whole(32, 1280), 320)
+    add("--workers N", "problems that run at once (default: one per core)", whole(1, 256))
+    add("--shard I/N", "only every N-th problem, from the I-th on", _shard)
+    add("--problem NAME", "run one problem alone, such as cubby-0007")
+    add("--force", "replace the output of --problem if it exists")
+    add_threads(parser)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(text.split(","))
 
 
 def compare_options(add: Options, parser: Parser) -> None:

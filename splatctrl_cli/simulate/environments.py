@@ -64,7 +64,7 @@ def _tabletop(rng: np.random.Generator) -> Environment:
         place = np.array([0.30, rng.choice([-0.60, 0.60])])
         tables.append((place, np.array([0.9, 0.4]), rng.uniform(0.05, 0.15)))
     solids = [
-        _box(f"table_{n}", (*size, 0.05 + top), (*middle, top - 0.5 * (0.05 + top)), _texture(rng))
+        _box(f"table_{n}", (*size, 0.05 + top), (*middle, top - 0.5 * (0.05 + top)), drawn_texture(rng))
         for n, (middle, size, top) in enumerate(tables)
     ]
     taken: list[tuple[Float64, float]] = [(np.zeros(2), BASE)]
@@ -85,9 +85,9 @@ def _tabletop(rng: np.random.Generator) -> Environment:
         taken.append((spot, radius))
         center = (*spot, top + 0.5 * size[2])
         if rng.random() < 0.5:
-            solids.append(_box(f"box_{number}", tuple(size), center, _texture(rng), rng.uniform(0, np.pi)))
+            solids.append(_box(f"box_{number}", tuple(size), center, drawn_texture(rng), rng.uniform(0, np.pi)))
         else:
-            solids.append(_cylinder(f"cylinder_{number}", 0.5 * size[0], size[2], center, _texture(rng)))
+            solids.append(_cylinder(f"cylinder_{number}", 0.5 * size[0], size[2], center, drawn_texture(rng)))
     places = []
     for _ in range(24):
         middle, extent, top = tables[int(rng.integers(len(tables)))]
@@ -110,7 +110,7 @@ def _shelf(rng: np.random.Generator, *, is_merged: bool) -> Environment:
     dividers = [("upright", n, row) for n in range(1, columns) for row in range(rows)]
     dividers += [("board", n, column) for n in range(1, rows) for column in range(columns)]
     missing = dividers[int(rng.integers(len(dividers)))] if is_merged else None
-    texture, solids = _texture(rng), [_box("table", (1.5, 1.5, 0.05), (0.4, 0.0, -0.025), _texture(rng))]
+    texture, solids = drawn_texture(rng), [_box("table", (1.5, 1.5, 0.05), (0.4, 0.0, -0.025), drawn_texture(rng))]
 
     def add(name: str, size: Sequence[float], middle: Sequence[float]) -> None:
         placed = T.copy()
@@ -164,7 +164,8 @@ def _turned(yaw: float) -> Float64:
     return T
 
 
-def _texture(rng: np.random.Generator) -> Texture:
+def drawn_texture(rng: np.random.Generator) -> Texture:
+    """Of a thing: a pattern and two colours."""
     dark, bright = PALETTE[str(rng.choice(sorted(PALETTE)))]
     pattern = str(rng.choice(["noise", "stripes", "checks"]))
     return Texture(

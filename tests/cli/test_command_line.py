@@ -23,7 +23,7 @@ from splatctrl_cli.sources.source import open_source
 from tests.cli import here
 from tests.logs.make_log import LogRecipe, make_log
 
-NO_OUTPUT = ("info", "check", "batch", "sweep", "compare", "config", "completion")  # or one where it goes on
+NO_OUTPUT = ("info", "check", "batch", "sweep", "study", "compare", "config", "completion")  # or one where it goes on
 WRITERS = [command for command in COMMANDS if command not in NO_OUTPUT]
 HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "trimesh", "mcap", "clarabel")
 QUICK = (

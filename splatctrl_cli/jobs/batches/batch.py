@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
-from splatctrl_cli.files.output import write_durably, write_json
+from splatctrl_cli.files.output import MARKERS, write_durably, write_json
 from splatctrl_cli.jobs.batches.graph import COMMANDS, CommandLine, Node, nodes_of, of_shard
 from splatctrl_cli.jobs.batches.keys import keys_of
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run
@@ -220,6 +220,26 @@ def node_document(run: Run) -> dict[str, Any]:
     for name in ("variant", "words", "needs"):
         plain[name] = json.loads(plain[name])
     return {"id": plain.pop("node"), **plain, "outcome": run.outcome or None}
+
+
+def check_same_asked(out: Path, name: str, asked: Mapping[str, Any], *, what: str) -> None:
+    """Raise UsageError where a folder is of a sweep or study (`what`) that was asked for something else, or of
+    something else altogether; its file `name` has what it was asked for. InputError where that cannot be read.
+    """
+    file = out / name
+    if not file.is_file():
+        if any((out / other).exists() for other in (*MARKERS, "batch.json")):
+            raise UsageError(f"{out}: is no {what}, but something else", remedy="give another --out")
+        return
+    try:
+        before = json.loads(file.read_text(encoding="utf-8"))["asked"]
+        differs = [key for key in asked if before.get(key) != asked[key]]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{file}: is not what a {what} writes", remedy="give another --out") from None
+    if differs:
+        raise UsageError(
+            f"{out}: was begun with other settings: {', '.join(differs)}", remedy="give them again, or another --out"
+        )
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """A sweep from its request to its result: a replay made again with other values until its verdict is another."""
 
-import json
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -10,8 +9,8 @@ from typing import Any
 
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.verdict import EXIT_CODES, Outcome
-from splatctrl_cli.files.output import MARKERS, check_can_be_written, write_durably, write_json
-from splatctrl_cli.jobs.batches.batch import scheduling, write_batch
+from splatctrl_cli.files.output import check_can_be_written, write_durably, write_json
+from splatctrl_cli.jobs.batches.batch import check_same_asked, scheduling, write_batch
 from splatctrl_cli.jobs.batches.graph import CommandLine, Node, nodes_of
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run
 from splatctrl_cli.jobs.batches.run import ERROR, SKIPPED, Scheduler
@@ -128,7 +127,7 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
     chain, out = chain_of(run, keys, command_line), request.out.absolute()
     asked = _asked(run, ranges, request)
     check_can_be_written(out)
-    _check_same_sweep(out, asked)
+    check_same_asked(out, FILE, asked, what="sweep")
     runs = Runs(run=run, chain=chain, out=out, command_line=command_line)
     starts = {name: a for name, (a, _) in ranges.items()}
     runs.nodes_at(starts | {name: b for name, (_, b) in ranges.items()})  # refuses what an option does not take
@@ -198,24 +197,6 @@ def _asked(run: RunFolder, ranges: Mapping[str, tuple[float, float]], request: S
         "over": {name: list(ends) for name, ends in ranges.items()},
         "tolerance": request.tolerance,
     }
-
-
-def _check_same_sweep(out: Path, asked: Mapping[str, Any]) -> None:
-    """Raise UsageError where the folder is of another sweep, or of something else."""
-    file = out / FILE
-    if not file.is_file():
-        if any((out / name).exists() for name in (*MARKERS, "batch.json")):
-            raise UsageError(f"{out}: is no sweep, but something else", remedy="give another --out")
-        return
-    try:
-        before = json.loads(file.read_text(encoding="utf-8"))["asked"]
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{file}: is not what a sweep writes", remedy="give another --out") from None
-    differs = [name for name in asked if before.get(name) != asked[name]]
-    if differs:
-        raise UsageError(
-            f"{out}: was begun with other settings: {', '.join(differs)}", remedy="give them again, or another --out"
-        )
 
 
 @dataclass(kw_only=True)

@@ -1,0 +1,58 @@
+"""Shares of trials that succeed: intervals, and whether two methods differ on the same trials."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from scipy.stats import binom, norm
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, kw_only=True)
+class Share:
+    """num_successes of num trials, and the interval from low to high that has the true share with `CONFIDENCE`."""
+
+    num_successes: int
+    num: int
+    low: float
+    high: float
+
+    @property
+    def value(self) -> float:
+        """The share, NaN of no trial."""
+        return self.num_successes / self.num if self.num else math.nan
+
+
+def share_of(num_successes: int, num: int) -> Share:
+    """A share with Wilson's score interval (Wilson 1927), which stays within 0 and 1; of no trial: all of that."""
+    if not num:
+        return Share(num_successes=0, num=0, low=0.0, high=1.0)
+    z = float(norm.ppf(0.5 + CONFIDENCE / 2))
+    p, scale = num_successes / num, 1.0 + z * z / num
+    middle = (p + z * z / (2 * num)) / scale
+    half = z * math.sqrt(p * (1 - p) / num + z * z / (4 * num * num)) / scale
+    low = 0.0 if num_successes == 0 else middle - half
+    return Share(num_successes=num_successes, num=num, low=low, high=1.0 if num_successes == num else middle + half)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Paired:
+    """Of trials that two methods both had: how many only the first, and only the second, succeeded in; p_value: of
+    McNemar's exact test that neither is better.
+    """
+
+    num: int
+    only_first: int
+    only_second: int
+    p_value: float
+
+
+def paired(outcomes: Sequence[tuple[bool, bool]]) -> Paired:
+    """McNemar's test, exact (binomial, two-sided), of pairs of successes (first, second); p is 1 without a pair that
+    differs.
+    """
+    first = sum(a and not b for a, b in outcomes)
+    second = sum(b and not a for a, b in outcomes)
+    p_value = min(1.0, 2.0 * float(binom.cdf(min(first, second), first + second, 0.5))) if first + second else 1.0
+    return Paired(num=len(outcomes), only_first=first, only_second=second, p_value=p_value)

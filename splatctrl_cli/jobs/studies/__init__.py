@@ -1,0 +1,1 @@
+"""Studies: the paper's experiments repeated, each trial published; every study is a batch of problems."""

@@ -1,0 +1,139 @@
+"""What a motion came to: the paper's rule against the truth, and the house's own verdict by what the map knew.
+
+T states, J joints; between two states the joints move straight, and are judged everywhere on the way.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.goals import pose_error
+from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.jobs.progress import SILENT
+from splatctrl_cli.jobs.replays.criteria_input import Judged
+from splatctrl_cli.jobs.replays.inputs import LoggedStates, MeasuredRobot, measured_robot
+from splatctrl_cli.jobs.replays.known_scene import KnownScene
+from splatctrl_cli.jobs.replays.metrics import metrics_of
+from splatctrl_cli.jobs.replays.modes import replayed
+from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replays.verdict import replay_verdict
+from splatctrl_cli.jobs.studies.problems import Problem
+from splatctrl_cli.jobs.studies.views import Views
+from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.planner.configuration_clearance import Clearance
+from splatctrl_cli.planner.edges import check_edges
+from splatctrl_cli.planner.path import least_clearance
+from splatctrl_cli.records import Float64, LossReport, Record
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.truth import closest_of
+
+GOAL_POSITION, GOAL_ROTATION = 0.03, np.radians(1.0)  # [m], [rad]: the paper's rule (IV-B)
+TOUCH = 1e-7  # [m] of true clearance that a free way keeps everywhere
+NO_PLAN = "no plan found"
+START_BLOCKED, GOAL_BLOCKED = "start inside an obstacle of the map", "goal inside an obstacle of the map"
+HIT_SEEN, HIT_UNSEEN = "collision with seen surface", "collision with unseen surface"
+HIT_SELF = "collision with itself"
+GOAL_MISSED, STALLED, NOT_EVALUABLE = "goal missed", "stalled before the goal", "not evaluable"
+CAUSES = (NO_PLAN, START_BLOCKED, GOAL_BLOCKED, HIT_SEEN, HIT_UNSEEN, HIT_SELF, GOAL_MISSED, STALLED, NOT_EVALUABLE)
+REQUEST = ReplayRequest(log=Path("trial"), out=Path("trial"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Execution:
+    """A motion against the truth. cause: of `CAUSES`, empty for a success by the paper's rule; clearance [m]: the
+    least true one on the whole way, negative in collision; position_error [m], rotation_error [rad] at its end.
+    """
+
+    cause: str
+    clearance: float
+    position_error: float
+    rotation_error: float
+
+    @property
+    def has_collided(self) -> bool:
+        """Whether anything was touched."""
+        return self.cause in (HIT_SEEN, HIT_UNSEEN, HIT_SELF)
+
+
+def against_truth(problem: Problem, position: Float64, views: Views) -> Execution:
+    """A motion (T, J) against the problem's solids: proved free by conservative advancement, not at samples."""
+    room = Clearance.of(problem.model, problem.solids)
+    frame = problem.model.frame_names[-1]
+    ends = [problem.model.frame_pose(q, frame) for q in (position[-1], problem.goal)]
+    error = pose_error(*ends)
+    moved, turned = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
+    cause = GOAL_MISSED if moved > GOAL_POSITION or turned > GOAL_ROTATION else ""
+    is_free = check_edges(room, position[:-1], position[1:], contact=TOUCH).is_free
+    if not is_free.all():
+        cause = _what_is_hit(problem, room, position, views)
+    clearance = least_clearance(room, position, tolerance=5e-4)
+    return Execution(
+        cause=cause,
+        clearance=clearance.upper if is_free.all() else min(clearance.upper, 0.0),
+        position_error=moved,
+        rotation_error=turned,
+    )
+
+
+def _what_is_hit(problem: Problem, room: Clearance, position: Float64, views: Views) -> str:
+    """Whether the deepest contact of the states, or of the middles between them, is with something seen."""
+    middles = 0.5 * (position[:-1] + position[1:])
+    postures = np.concatenate([position, middles])
+    rows = room.rows(postures)
+    deepest, row = np.unravel_index(int(np.argmin(rows)), rows.shape)
+    if row >= len(room.moving):
+        return HIT_SELF
+    center = problem.model.sphere_centers(postures[deepest])[room.moving[row]]
+    _, surface = closest_of(problem.primitives, center[None], 0)
+    return HIT_SEEN if views.has_seen(surface)[0] else HIT_UNSEEN
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionSource:
+    """A motion as a log without frames."""
+
+    name: str
+    joint_names: tuple[str, ...]
+    cameras: tuple[str, ...] = ()
+    has_clock: bool = True
+    loss: LossReport = field(default_factory=LossReport)
+
+    def records(self) -> Iterator[Record]:
+        """None: the states are read already."""
+        return iter(())
+
+    def digests(self) -> dict[str, str]:
+        """None: it is no file."""
+        return {}
+
+
+def measured(model: RobotModel, config: Config) -> MeasuredRobot:
+    """The robot, with what its spheres leave uncovered, as a verdict wants it."""
+    return measured_robot(REQUEST, model, config.control)
+
+
+def verdict_on(robot: MeasuredRobot, position: Float64, stamp_ns: int, known: KnownScene, config: Config) -> Verdict:
+    """The verdict of an audit of a motion (T, J) from a stamp [ns] on, a state each period, by the map alone."""
+    period = config.control.period
+    stamps = stamp_ns + np.round(np.arange(len(position)) * period * 1e9).astype(np.int64)
+    straight = np.zeros_like(position)  # a driven arm moves straight from state to state
+    states = StateColumns(stamp_ns=stamps, position=position, velocity=straight)
+    source = MotionSource(name="trial", joint_names=robot.model.joint_names)
+    logged = LoggedStates(source=source, states=states, poses=None)
+    inputs = ReplayInputs(
+        source=source,
+        states=states,
+        model=robot.model,
+        scene=known,
+        truth=None,
+        digests={},
+        surfaces=robot.surfaces,
+        kept=robot.kept,
+    )
+    found = replayed(REQUEST, inputs, config, SILENT)
+    metrics = metrics_of(found) | logged.metrics()
+    request = ReplayRequest(log=REQUEST.log, out=REQUEST.out, config=config)
+    return replay_verdict(Judged(request=request, inputs=inputs, logged=logged, replay=found, metrics=metrics))

@@ -1,0 +1,209 @@
+"""What each method of a study knows of the scene after the cameras' frames: a distance to plan in.
+
+Q points, world frame, metres. A distance is a lower bound of a 1-Lipschitz one, so that what a planner proves of an
+edge holds of it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.audit import DistanceFunction
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.field.baker import Baker, Planes
+from splatctrl_cli.field.distance import SphereField
+from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, GridLayout
+from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
+from splatctrl_cli.jobs.replays.compare import ROUNDING
+from splatctrl_cli.jobs.replays.known_scene import KnownScene, known_space, seen_of, splat_fields
+from splatctrl_cli.jobs.studies.problems import Problem
+from splatctrl_cli.jobs.studies.views import Step, Views
+from splatctrl_cli.libraries import of_extra
+from splatctrl_cli.planner.configuration_clearance import HasDistance, OnlyDistance
+from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, RgbdFrame
+from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.posture import RobotPosture, posture_of
+from splatctrl_cli.scene.self_mask import PixelKind, self_mask, self_mask_metrics
+from splatctrl_cli.voxels import Balls, OccupancyGrid, VoxelState
+
+TSDF_VOXEL, TSDF_BAND = 0.01, 0.04  # [m] edge of a voxel, and how far from a surface the TSDF reaches
+UNSEEN_NEAR = 0.08  # [m] about the arm at its start, which it hides, and at the goal, which it is given
+START_GAP = 2e-3  # [m] that an obstacle of the map is from the arm at its start, or it is the arm's own
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """A distance as a scene to plan in."""
+
+    distance: DistanceFunction
+
+
+@dataclass(frozen=True, kw_only=True)
+class Map:
+    """scene: what the method takes for things; unseen: the distance to space that no camera saw, None where the
+    method does not tell it from free space. known: what a verdict and a controller look at, None without. num_parts:
+    splats, voxels or triangles.
+    """
+
+    scene: HasDistance
+    unseen: DistanceFunction | None = None
+    known: KnownScene | None = None
+    num_parts: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted:
+    """A reconstruction of views: its fitter and the residuals of its self-mask."""
+
+    fitter: SceneFitter
+    figures: dict[str, object]
+
+
+def fitted(problem: Problem, views: Views, config: Config, threads: int) -> Fitted:
+    """The map after all time steps, the arm at the start in each."""
+    fitter = SceneFitter(config.scene, config.occupancy, workspace_of(problem), seed=problem.number, threads=threads)
+    rows = [fitter.step(step, _posture(problem, step)) for step in views.steps]
+    return Fitted(fitter=fitter, figures={"voxel": config.occupancy.voxel, **self_mask_metrics(rows)})
+
+
+def workspace_of(problem: Problem) -> Box:
+    """What the arm reaches around its base."""
+    reach, base = problem.model.reach(), problem.model.base_position
+    return Box(lower=base - reach, upper=base + reach)
+
+
+def splat_map(problem: Problem, made: Fitted, config: Config, threads: int) -> Map:
+    """Ours: the exact distance to splats and to occupied voxels without one, and what was never seen.
+
+    The planner's scene is without those that reach into the arm where it stands: what is there is the arm, and a few
+    of its pixels that were taken for something else. The verdict's has them.
+    """
+    fitter = made.fitter
+    fields, voxels = splat_fields(fitter.splats(), config, threads, fitter.unrepresented), fitter.known_voxels()
+    seen = seen_of(voxels.seen)
+    known = KnownScene(
+        at=lambda stamp_ns: fields,
+        observed=known_space(voxels.grid),
+        seen_at=lambda stamp_ns: seen,
+        has_seen_times=False,  # nothing moves in a study: how old depth is decides nothing
+        figures=lambda: made.figures,
+        first_ns=None,
+        cameras=None,
+        digests={},
+    )
+    return Map(
+        scene=Asked(distance=_less_rounding(_beside_the_start(problem, fitter, threads))),
+        unseen=unseen_distance(problem, voxels.grid, config),
+        known=known,
+        num_parts=len(fitter.splats()),
+    )
+
+
+def _beside_the_start(problem: Problem, fitter: SceneFitter, threads: int) -> SphereField:
+    """The spheres of the map but those that reach into the arm's moving spheres at its start."""
+    spheres = obstacle_spheres(fitter.splats(), fitter.unrepresented).splats
+    moving = problem.model.moving_spheres
+    body = SphereField(problem.model.sphere_centers(problem.start)[moving], problem.model.sphere_set.radii[moving])
+    kept = body.query(spheres.centers.astype(np.float64))[0] - spheres.radii > START_GAP
+    return SphereField(spheres.centers[kept], spheres.radii[kept], threads=threads)
+
+
+def _less_rounding(field: SphereField) -> DistanceFunction:
+    return lambda points: field.query(points)[0] - ROUNDING
+
+
+def unseen_distance(problem: Problem, grid: OccupancyGrid, config: Config) -> DistanceFunction | None:
+    """A lower bound of the distance to voxels that no camera saw and the arm was not in, as balls of their width;
+    None without any. Those `UNSEEN_NEAR` the arm's start and goal are left out.
+    """
+    states = grid.states(config.occupancy.free_below, config.occupancy.occupied_above)
+    is_unseen = states == VoxelState.NEVER_SEEN
+    centers = np.concatenate([problem.model.sphere_centers(q) for q in (problem.start, problem.goal)])
+    radii = np.tile(problem.model.sphere_set.radii, 2)
+    ends = [(centers + side * (radii + UNSEEN_NEAR)[:, None] - grid.origin) / grid.voxel for side in (-1, 1)]
+    low = np.maximum(np.floor(ends[0].min(axis=0)).astype(np.int64), 0)
+    window = tuple(slice(a, b) for a, b in zip(low, np.ceil(ends[1].max(axis=0)).astype(np.int64) + 1, strict=True))
+    cells = low + np.argwhere(is_unseen[window])
+    near = SphereField(centers, radii).query(grid.origin + grid.voxel * cells)[0] < UNSEEN_NEAR
+    is_unseen[tuple(cells[near].T)] = False
+    if not is_unseen.any() or is_unseen.all():
+        return None
+    away = (grid.voxel * (distance_transform_edt(~is_unseen) - 0.5)).astype(np.float32)
+    channels: Planes = {"sdf": away, "bound": away - np.float32(HALF_DIAGONAL * grid.voxel)}
+    return GridField(DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header={})).certified
+
+
+def printed_map(problem: Problem, made: Fitted, config: Config, threads: int) -> Map:
+    """As IV-B has it: the kernel distance of the splats alone on a grid, interpolated; free is what reads above 0."""
+    fitter = made.fitter
+    layout = GridLayout.over(workspace_of(problem), config.field.voxel)
+    splats = field_splats(fitter.splats())
+    baker = Baker(splats, layout, config.field, channels=("sdf",), threads=threads)
+    planes = baker.allocate(layout.shape[0])
+    baker.bake(0, layout.shape[0], planes)
+    grid = DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=planes, header={})
+    return Map(scene=OnlyDistance(field=GridField(grid)), num_parts=len(splats))
+
+
+def occupancy_map(made: Fitted, config: Config, threads: int) -> Map:
+    """An occupancy grid alone: a ball around each occupied voxel that is not the robot's."""
+    grid = made.fitter.occupancy.grid()
+    states = grid.states(config.occupancy.free_below, config.occupancy.occupied_above)
+    is_thing = (states == VoxelState.OCCUPIED) & (grid.entity & Label.ROBOT == 0)
+    centers = grid.origin + grid.voxel * np.argwhere(is_thing)
+    if not len(centers):
+        raise NotEvaluableError("occupancy grid: no voxel is occupied")
+    balls = Balls.of_voxels(centers.astype(np.float32), grid.voxel, np.zeros(len(centers), np.uint8))
+    field = SphereField(balls.centers, np.full(len(balls), balls.radius, np.float32), threads=threads)
+    return Map(scene=Asked(distance=_less_rounding(field)), num_parts=len(balls))
+
+
+def tsdf_map(problem: Problem, views: Views, config: Config) -> Map:
+    """Open3D's TSDF of the frames without the arm's pixels: the distance to its mesh. Raises UsageError without the
+    extra.
+    """
+    o3d = of_extra("open3d", "open3d", "a TSDF")
+    volume = o3d.pipelines.integration.ScalableTSDFVolume(
+        voxel_length=TSDF_VOXEL,
+        sdf_trunc=TSDF_BAND,
+        color_type=o3d.pipelines.integration.TSDFVolumeColorType.NoColor,
+    )
+    for frame in without_robot(problem, views, config):
+        k = frame.intrinsics
+        pinhole = o3d.camera.PinholeCameraIntrinsic(k.width, k.height, k.fx, k.fy, k.cx, k.cy)
+        image = o3d.geometry.RGBDImage.create_from_color_and_depth(
+            o3d.geometry.Image(np.ascontiguousarray(frame.color)),
+            o3d.geometry.Image(np.ascontiguousarray(frame.depth, np.float32)),
+            depth_scale=1.0,
+            depth_trunc=config.occupancy.max_range,
+            convert_rgb_to_intensity=False,
+        )
+        volume.integrate(image, pinhole, np.linalg.inv(frame.T_world_camera))
+    mesh = volume.extract_triangle_mesh()
+    if not len(mesh.triangles):
+        raise NotEvaluableError("TSDF: no surface was found")
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+
+    def distance(points: Float64) -> Float64:
+        asked = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))
+        return np.asarray(scene.compute_distance(asked).numpy(), np.float64) - ROUNDING
+
+    return Map(scene=Asked(distance=distance), num_parts=len(mesh.triangles))
+
+
+def without_robot(problem: Problem, views: Views, config: Config) -> list[RgbdFrame]:
+    """Every frame, without depth where it shows the arm."""
+    return [_without_robot(frame, _posture(problem, step), config) for step in views.steps for frame in step]
+
+
+def _without_robot(frame: RgbdFrame, robot: RobotPosture, config: Config) -> RgbdFrame:
+    is_kept = self_mask(frame, robot, config.occupancy).kinds == PixelKind.OBJECT
+    return replace(frame, depth=np.where(is_kept, frame.depth, np.float32(0)))
+
+
+def _posture(problem: Problem, step: Step) -> RobotPosture:
+    return posture_of(problem.model, problem.start, {frame.stamp_ns: problem.start for frame in step})

@@ -1,0 +1,197 @@
+"""The problems of a study: drawn environments by their seed, and those of MotionBenchMaker from their archive."""
+
+import tarfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import yaml
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.simulated_task import solids_of, task_of
+from splatctrl_cli.planner.solid_scene import Solids
+from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
+from splatctrl_cli.simulate.environments import ENVIRONMENTS, drawn_texture
+from splatctrl_cli.simulate.primitives import Primitive
+
+ARCHIVE, ROBOT = "problems.tar.bz2", "panda_spherized.urdf"  # of MotionBenchMaker, in one folder
+FAMILIES = ("bookshelf_small", "bookshelf_tall", "bookshelf_thin", "box", "cage", "table_pick", "table_under_pick")
+PER_FAMILY = 50  # problems, from 1 on
+KINDS = {"box": "box", "cylinder": "cylinder", "sphere": "sphere"}  # MoveIt's words and ours
+ROOM = {  # size and middle [m] of floor and walls: what stands behind everything, beyond what the arm's map holds
+    "floor": ((4.8, 4.4, 0.05), (0.1, 0.0, -1.60)),
+    "wall_back": ((0.05, 4.4, 4.0), (-2.00, 0.0, 0.20)),
+    "wall_front": ((0.05, 4.4, 4.0), (2.30, 0.0, 0.20)),
+    "wall_left": ((4.8, 0.05, 4.0), (0.1, 2.00, 0.20)),
+    "wall_right": ((4.8, 0.05, 4.0), (0.1, -2.00, 0.20)),
+}
+Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """From a posture to another (J,) [rad] among things, world frame; number: the seed of a drawn one."""
+
+    environment: str
+    number: int
+    model: RobotModel
+    things: tuple[Primitive, ...]
+    start: Float64
+    goal: Float64
+
+    @property
+    def name(self) -> str:
+        """As on the command line."""
+        return name_of(self.environment, self.number)
+
+    @property
+    def primitives(self) -> tuple[Primitive, ...]:
+        """The truth: the things, and the room that they are in."""
+        return (*self.things, *room())
+
+    @property
+    def solids(self) -> Solids:
+        """The same, as a planner asks it."""
+        return solids_of(self.primitives)
+
+
+def name_of(environment: str, number: int) -> str:
+    """Of a problem: environment and number."""
+    return f"{environment}-{number:04d}"
+
+
+def read_problem(name: str, archive: Path | None) -> Problem:
+    """The problem of a name; archive: the folder of MotionBenchMaker's problems and their robot.
+
+    Raises InputError for a name that is none, a folder without the problem, or one of another robot.
+    """
+    environment, _, number = name.rpartition("-")
+    if environment in ENVIRONMENTS and number.isdigit():
+        model = simulated_arm()
+        task = task_of(environment, int(number), model)
+        return Problem(
+            environment=environment,
+            number=int(number),
+            model=model,
+            things=task.environment.primitives,
+            start=task.waypoints[0],
+            goal=task.waypoints[-1],
+        )
+    if environment not in FAMILIES or not number.isdigit():
+        known = ", ".join((*ENVIRONMENTS, *FAMILIES))
+        raise InputError(f"--problem {name}: expected ENVIRONMENT-NUMBER", remedy=f"environments: {known}")
+    if archive is None:
+        raise InputError(f"--problem {name}: is of MotionBenchMaker", remedy="give its folder with --problems")
+    (found,) = read_archive(archive, panda(archive), [(environment, int(number))])
+    return found
+
+
+def room() -> list[Primitive]:
+    """Floor and walls: without them a camera that looks past the things gets no depth, and nothing is known there."""
+    made = []
+    for number, (name, (size, middle)) in enumerate(ROOM.items()):
+        T = np.eye(4)
+        T[:3, 3] = middle
+        drawn = drawn_texture(np.random.default_rng(number))
+        made.append(Primitive(name=name, kind="box", size=size, T_world_shape=T, texture=drawn))
+    return made
+
+
+def simulated_arm() -> RobotModel:
+    """The arm that `simulate` records."""
+    with TemporaryDirectory() as folder:
+        urdf, spheres = Path(folder) / "robot.urdf", Path(folder) / "robot_spheres.yaml"
+        urdf.write_text(arm_urdf(), encoding="utf-8")
+        spheres.write_text(arm_spheres_yaml(), encoding="utf-8")
+        return RobotModel.from_urdf(urdf, spheres)
+
+
+def panda(archive: Path) -> RobotModel:
+    """The Panda that the problems are of, with its 59 spheres."""
+    return RobotModel.from_urdf(archive / ROBOT)
+
+
+def read_archive(archive: Path, model: RobotModel, wanted: Sequence[tuple[str, int]] | None = None) -> list[Problem]:
+    """The problems by family and number, those `wanted` or all. Raises InputError as `read_problem`."""
+    file, texts = archive / ARCHIVE, dict[tuple[str, int, str], bytes]()
+    names = {(f"{family}_panda", f"{kind}{n:04d}"): (family, n, kind) for family, n, kind in _members(wanted)}
+    try:
+        with tarfile.open(file) as members:
+            for member in members:
+                path = Path(member.name)
+                key = names.get((path.parent.name, path.stem))
+                content = members.extractfile(member) if key is not None and member.isfile() else None
+                if key is not None and content is not None:
+                    texts[key] = content.read()
+    except (OSError, EOFError, tarfile.TarError) as error:
+        raise InputError(f"{file}: cannot be read: {error}", remedy="give MotionBenchMaker's archive") from None
+    found = sorted({(family, number) for family, number, _ in texts})
+    lacking = [name_of(*each) for each in wanted or () if tuple(each) not in found]
+    if lacking or not found:
+        what = ", ".join(lacking) or "problem"
+        raise InputError(f"{file}: has no {what}", remedy="give MotionBenchMaker's archive")
+    return [_problem(family, number, texts, model, file) for family, number in found]
+
+
+def _members(wanted: Sequence[tuple[str, int]] | None) -> list[tuple[str, int, str]]:
+    every = [(family, number) for family in FAMILIES for number in range(1, PER_FAMILY + 1)]
+    return [(*each, kind) for each in (every if wanted is None else wanted) for kind in ("scene", "request")]
+
+
+def _problem(
+    family: str, number: int, texts: Mapping[tuple[str, int, str], bytes], model: RobotModel, file: Path
+) -> Problem:
+    where = f"{file}: {name_of(family, number)}"
+    try:
+        request, scene = (yaml.load(texts[family, number, kind], Loader) for kind in ("request", "scene"))
+        state = request["start_state"]["joint_state"]
+        (constraints,) = request["goal_constraints"]
+        start = dict(zip(state["name"], state["position"], strict=True))
+        goal = {c["joint_name"]: c["position"] for c in constraints["joint_constraints"]}
+        things = scene["world"]["collision_objects"]
+        solids = tuple(each for thing in things for each in _primitives(thing))
+    except (KeyError, TypeError, ValueError, yaml.YAMLError) as error:
+        raise InputError(f"{where}: damaged: {type(error).__name__}: {error}") from None
+    return Problem(
+        environment=family,
+        number=number,
+        model=model,
+        things=solids,
+        start=_posture(start, model, where),
+        goal=_posture(goal, model, where),
+    )
+
+
+def _primitives(thing: Mapping[str, Any]) -> list[Primitive]:
+    """A MoveIt collision object's solids, with a texture each."""
+    made = []
+    for number, (solid, pose) in enumerate(zip(thing["primitives"], thing["primitive_poses"], strict=True)):
+        size = tuple(float(value) for value in solid["dimensions"])
+        name = f"{thing['id']}.{number}"
+        seed = [len(thing["id"]), sum(map(ord, name))]
+        made.append(
+            Primitive(
+                name=name,
+                kind=KINDS[solid["type"]],
+                size=size[::-1] if solid["type"] == "cylinder" else size,  # MoveIt: height, then radius
+                T_world_shape=transform_from(pose["position"], pose["orientation"]),
+                texture=drawn_texture(np.random.default_rng(seed)),
+            )
+        )
+    return made
+
+
+def _posture(by_name: Mapping[str, float], model: RobotModel, where: str) -> Float64:
+    lacking = [name for name in model.joint_names if name not in by_name]
+    if lacking:
+        raise InputError(
+            f"{where}: is of another robot: expected joint {lacking[0]}, got {', '.join(by_name) or 'none'}",
+            remedy=f"give the folder with the robot of these problems as {ROBOT}",
+        )
+    return np.array([by_name[name] for name in model.joint_names], dtype=np.float64)

@@ -1,0 +1,277 @@
+"""One problem of a study through its methods: what each knew, planned and drove, and what that came to."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+
+from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
+from splatctrl_cli.errors import SplatCtrlError
+from splatctrl_cli.evaluate.verdict import Outcome as Judgement
+from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.jobs.replays.inputs import MeasuredRobot
+from splatctrl_cli.jobs.studies import judge
+from splatctrl_cli.jobs.studies.maps import (
+    Asked,
+    Fitted,
+    Map,
+    fitted,
+    occupancy_map,
+    printed_map,
+    splat_map,
+    tsdf_map,
+)
+from splatctrl_cli.jobs.studies.problems import Problem
+from splatctrl_cli.jobs.studies.views import Views, views_of
+from splatctrl_cli.planner.configuration_clearance import HasDistance
+from splatctrl_cli.planner.path import joint_length
+from splatctrl_cli.planner.planned import GOAL_BLOCKED, START_BLOCKED, planned_detours, planned_path
+from splatctrl_cli.planner.tracking import follow_joints
+from splatctrl_cli.records import Float64
+from splatctrl_cli.simulate.environments import ENVIRONMENTS
+
+OURS, TSDF, TRUTH = "ours", "tsdf", "truth"
+QP_IK, QP_IK_DETOURS, PAPER, OCCUPANCY = "qp-ik", "qp-ik-detours", "paper", "occupancy"
+FULL = (OURS, TSDF, TRUTH)  # methods of every problem; the others are of the first drawn ones
+METHODS = (*FULL, QP_IK, QP_IK_DETOURS, PAPER, OCCUPANCY)
+SUBSET = 20  # problems of each drawn environment that go through every method
+CAMERAS = (2, 4, 6)
+DETOURS = 3
+NO_MARGIN = 1e-4  # [m]
+FIRST = 1500  # iterations of the search through seen space alone, before that through any
+BLOCKED = {START_BLOCKED: judge.START_BLOCKED, GOAL_BLOCKED: judge.GOAL_BLOCKED}
+NUM_STEPS = 5  # of each camera, the arm at rest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One method on one problem with so many cameras (0: it needs none); a row of what is published.
+
+    success: by the paper's rule; verdict: the house's label, empty without one; cause: of `judge.CAUSES`, empty for a
+    success; is_false_green: judged safe, and something was touched. true_clearance [m]: the least on the whole way;
+    margin [m]: what the planner kept; in_known_space: the way planned keeps out of space that no camera saw.
+    """
+
+    environment: str
+    number: int
+    cameras: int
+    method: str
+    success: bool
+    cause: str
+    verdict: str = ""
+    is_false_green: bool = False
+    outcome: str = ""
+    reason: str = ""
+    true_clearance: float | None = None
+    margin: float | None = None
+    in_known_space: bool | None = None
+    position_error: float | None = None
+    rotation_error: float | None = None
+    duration_s: float | None = None
+    joint_path_rad: float | None = None
+    num_parts: int | None = None
+
+    @classmethod
+    def columns(cls) -> list[str]:
+        """Names of its fields."""
+        return [column.name for column in fields(cls)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """What a method did: a motion (T, J), None where cause says why there is none."""
+
+    position: Float64 | None
+    cause: str = ""
+    outcome: str = ""
+    margin: float | None = None
+    in_known_space: bool | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rig:
+    """A problem seen by its first cameras; config: of all methods but the paper's literal one."""
+
+    problem: Problem
+    views: Views
+    config: Config
+    threads: int
+    stopwatch: Stopwatch
+
+    @cached_property
+    def task(self) -> ReplayTask:
+        """From the start to the tip's pose at the goal; its posture is the first that is tried there."""
+        frame = self.problem.model.frame_names[-1]
+        return ReplayTask(
+            start=self.problem.start,
+            T_world_goal=self.problem.model.frame_pose(self.problem.goal, frame),
+            frame=frame,
+            stamp_ns=self.views.frames[-1].stamp_ns,
+            home=self.problem.goal,
+        )
+
+    @cached_property
+    def fitted(self) -> Fitted:
+        """The reconstruction."""
+        return fitted(self.problem, self.views, self.config, self.threads)
+
+    @cached_property
+    def splats(self) -> Map:
+        """Our map."""
+        return splat_map(self.problem, self.fitted, self.config, self.threads)
+
+
+Drive = Callable[[Rig, Map], Attempt]
+
+
+def trials_of(
+    problem: Problem, config: Config, methods: Sequence[str], *, width: int, threads: int, stopwatch: Stopwatch
+) -> Iterator[Trial]:
+    """Every method that the problem goes through, with every number of cameras."""
+    chosen = [name for name in methods if name in FULL or is_in_subset(problem.environment, problem.number)]
+    with stopwatch.stage("views"):
+        views = views_of(problem, max(CAMERAS), width=width, num_steps=NUM_STEPS)
+    robot = judge.measured(problem.model, config)
+    for num_cameras in CAMERAS:
+        rig = Rig(
+            problem=problem,
+            views=views.of_first(num_cameras),
+            config=config,
+            threads=threads,
+            stopwatch=stopwatch,
+        )
+        for name in chosen:
+            if name != TRUTH:
+                yield trial_of(rig, name, num_cameras, robot)
+    if TRUTH in chosen:
+        yield trial_of(rig, TRUTH, 0, robot)
+
+
+def is_in_subset(environment: str, number: int) -> bool:
+    """Whether a problem goes through every method."""
+    return environment in ENVIRONMENTS and number < SUBSET
+
+
+def trial_of(rig: Rig, method: str, num_cameras: int, robot: MeasuredRobot) -> Trial:
+    """One method; what cannot be done at all is a trial without success, with its reason."""
+    problem = rig.problem
+    begun = Trial(
+        environment=problem.environment,
+        number=problem.number,
+        cameras=num_cameras,
+        method=method,
+        success=False,
+        cause=judge.NOT_EVALUABLE,
+    )
+    try:
+        make, drive = MAKERS[method]
+        with rig.stopwatch.stage(f"{method}: map"):
+            known = make(rig)
+        with rig.stopwatch.stage(f"{method}: plan"):
+            attempt = drive(rig, known)
+    except SplatCtrlError as error:
+        return replace(begun, reason=error.message)
+    told = replace(
+        begun,
+        cause=attempt.cause,
+        outcome=attempt.outcome,
+        margin=attempt.margin,
+        in_known_space=attempt.in_known_space,
+        num_parts=known.num_parts,
+    )
+    if attempt.position is None:
+        return told
+    with rig.stopwatch.stage(f"{method}: judge"):
+        return _judged(rig, told, attempt, known, robot)
+
+
+def _judged(rig: Rig, trial: Trial, attempt: Attempt, known: Map, robot: MeasuredRobot) -> Trial:
+    """The trial with what its motion came to, against the truth and by what the map knew."""
+    position = attempt.position
+    assert position is not None
+    execution = judge.against_truth(rig.problem, position, rig.views)
+    cause = execution.cause if execution.has_collided else attempt.cause or execution.cause
+    trial = replace(
+        trial,
+        success=not cause,
+        cause=cause,
+        true_clearance=execution.clearance,
+        position_error=execution.position_error,
+        rotation_error=execution.rotation_error,
+        duration_s=rig.config.control.period * (len(position) - 1),
+        joint_path_rad=joint_length(position),
+    )
+    if known.known is None:
+        return trial
+    verdict = judge.verdict_on(robot, position, rig.task.stamp_ns, known.known, rig.config)
+    return replace(
+        trial,
+        verdict=verdict.label,
+        is_false_green=verdict.outcome is Judgement.PASSED and execution.has_collided,
+        reason=str(verdict.decisive[0]) if verdict.decisive else "",
+    )
+
+
+def by_planner(rig: Rig, known: Map) -> Attempt:
+    """A planned path, followed in joint space: through space that cameras saw, or where there is none through any."""
+    unseen, scene = known.unseen, known.scene
+    if unseen is None:
+        return _planned(rig, scene, rig.config)
+    seen_alone = Asked(distance=lambda points: np.minimum(scene.distance(points), unseen(points)))
+    attempt = _planned(
+        rig, seen_alone, replace(rig.config, planner=replace(rig.config.planner, max_iterations=FIRST))
+    )
+    if attempt.position is not None:
+        return replace(attempt, in_known_space=True)
+    return replace(_planned(rig, scene, rig.config), in_known_space=False)
+
+
+def as_printed(rig: Rig, known: Map) -> Attempt:
+    """A planned path that keeps no margin."""
+    config = rig.config
+    return _planned(rig, known.scene, replace(config, control=replace(config.control, margin=NO_MARGIN)))
+
+
+def _planned(rig: Rig, scene: HasDistance, config: Config) -> Attempt:
+    plan = planned_path(rig.problem.model, scene, rig.task, config.planner, config.control)
+    if plan.path is None:
+        return Attempt(position=None, cause=BLOCKED.get(plan.outcome, judge.NO_PLAN), outcome=plan.outcome)
+    run = follow_joints(plan.path, plan.clearance, rig.task.frame, config.planner, config.control)
+    return Attempt(position=run.position, outcome=plan.outcome, margin=plan.margin)
+
+
+def by_controller(num_detours: int) -> Drive:
+    """QP-IK from the start to the goal, with so many ways out that are planned where it stalls."""
+
+    def drive(rig: Rig, known: Map) -> Attempt:
+        config, model, task = rig.config, rig.problem.model, rig.task
+        control = replace(config.control, max_detours=num_detours, solver="daqp")
+        assert known.known is not None
+        barrier = known.known.at(task.stamp_ns).barrier
+        detour = planned_detours(
+            model, lambda stamp: known.scene, task.frame, config.planner, control, home=task.home
+        )
+        trace = closed_loop(model, control, task, lambda stamp: barrier, plan_detour=detour if num_detours else None)
+        cause = "" if trace.outcome is Outcome.GOAL_REACHED else judge.STALLED
+        return Attempt(position=np.asarray(trace.position), cause=cause, outcome=trace.outcome, margin=control.margin)
+
+    return drive
+
+
+def _printed(rig: Rig) -> Map:
+    config = load_config(None, ["preset=paper"])
+    made = fitted(rig.problem, rig.views, config, rig.threads)
+    return printed_map(rig.problem, made, config, rig.threads)
+
+
+MAKERS: Mapping[str, tuple[Callable[[Rig], Map], Drive]] = {  # how a method's map is made, and what drives the arm
+    OURS: (lambda rig: rig.splats, by_planner),
+    TSDF: (lambda rig: tsdf_map(rig.problem, rig.views, rig.config), by_planner),
+    TRUTH: (lambda rig: Map(scene=rig.problem.solids), by_planner),
+    QP_IK: (lambda rig: rig.splats, by_controller(0)),
+    QP_IK_DETOURS: (lambda rig: rig.splats, by_controller(DETOURS)),
+    PAPER: (_printed, as_printed),
+    OCCUPANCY: (lambda rig: occupancy_map(rig.fitted, rig.config, rig.threads), by_planner),
+}

@@ -1,0 +1,114 @@
+"""What a motion comes to: everywhere on the way and not at samples, by cause, and greens that were not to be."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.evaluate.verdict import Outcome, Verdict, held, verdict_of
+from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.jobs.studies import judge, trial
+from splatctrl_cli.jobs.studies.maps import Map
+from splatctrl_cli.jobs.studies.problem_run import FALSE_GREEN, verdict_on_trials
+from splatctrl_cli.jobs.studies.problems import Problem, simulated_arm
+from splatctrl_cli.jobs.studies.trial import OURS, Attempt, Rig, Trial, trial_of
+from splatctrl_cli.jobs.studies.views import Views, views_of
+from splatctrl_cli.planner.configuration_clearance import Clearance
+from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.environments import drawn_texture
+from splatctrl_cli.simulate.primitives import Primitive
+
+HOME = np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785])
+TURN = np.array([0.8, 0, 0, 0, 0, 0, 0])  # [rad] from either side of the post to the other
+
+
+@pytest.fixture(scope="module")
+def model() -> RobotModel:
+    return simulated_arm()
+
+
+def post(model: RobotModel, radius: float = 0.03) -> Primitive:
+    """A post that the hand sweeps half way, and that neither end is near."""
+    T = np.eye(4)
+    T[:3, 3] = model.frame_pose(HOME, "hand")[:3, 3]
+    texture = drawn_texture(np.random.default_rng(0))
+    return Primitive(name="post", kind="cylinder", size=(radius, 0.3), T_world_shape=T, texture=texture)
+
+
+@pytest.fixture(scope="module")
+def problem(model: RobotModel) -> Problem:
+    return Problem(
+        environment="tabletop", number=0, model=model, things=(post(model),), start=HOME - TURN, goal=HOME + TURN
+    )
+
+
+@pytest.fixture(scope="module")
+def views(problem: Problem) -> Views:
+    return views_of(problem, 2, width=160, num_steps=1)
+
+
+def test_a_way_that_touches_a_thing_between_two_states_alone_has_collided(problem: Problem, views: Views) -> None:
+    position = np.array([problem.start, problem.goal])
+    assert Clearance.of(problem.model, problem.solids).at(position).min() > 0.04  # at the states nothing is near
+    execution = judge.against_truth(problem, position, views)
+    assert execution.has_collided and execution.clearance <= 0.0
+    alone = judge.against_truth(replace(problem, things=()), position, views)
+    assert not alone.cause and alone.clearance > 0.0
+
+
+def test_a_thing_that_no_camera_measured_is_an_unseen_one(problem: Problem, views: Views) -> None:
+    position = np.array([problem.start, HOME, problem.goal])
+    assert judge.against_truth(problem, position, views).cause == judge.HIT_SEEN
+    blind = Views(steps=tuple(tuple(replace(f, depth=0 * f.depth) for f in step) for step in views.steps))
+    assert judge.against_truth(problem, position, blind).cause == judge.HIT_UNSEEN
+
+
+@pytest.mark.parametrize(("joint", "angle", "cause"), [(6, 0.0, ""), (6, np.radians(1.1), judge.GOAL_MISSED)])
+def test_the_goal_is_reached_within_3_cm_and_1_degree(
+    problem: Problem, views: Views, joint: int, angle: float, cause: str
+) -> None:
+    end = problem.goal.copy()
+    end[joint] += angle
+    free = replace(problem, things=())
+    assert judge.against_truth(free, np.array([problem.start, end]), views).cause == cause
+
+
+def test_an_arm_that_folds_into_itself_has_hit_itself(problem: Problem, views: Views) -> None:
+    folded = np.array([0.0, 0.0, 0.0, -3.07, 0.0, -0.01, 0.785])
+    free = replace(problem, things=())
+    assert judge.against_truth(free, np.array([problem.start, folded]), views).cause == judge.HIT_SELF
+
+
+def passed(*_: object) -> Verdict:
+    return verdict_of("replay", [held("kept", 0.1, 0.02, "m", 2)], passed="safe")
+
+
+def through_the_post(problem: Problem) -> Float64:
+    return np.array([problem.start, problem.goal])
+
+
+def test_a_green_verdict_on_a_motion_that_collides_is_counted_as_false(
+    problem: Problem, views: Views, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = Map(scene=problem.solids, known=object(), num_parts=1)  # type: ignore[arg-type]
+    driven = Attempt(position=through_the_post(problem), outcome="solved")
+    monkeypatch.setattr(trial, "MAKERS", {OURS: (lambda rig: known, lambda rig, known: driven)})
+    monkeypatch.setattr(judge, "verdict_on", passed)
+    rig = Rig(problem=problem, views=views, config=Config(), threads=1, stopwatch=Stopwatch())
+    row = trial_of(rig, OURS, 2, None)  # type: ignore[arg-type]
+    assert (row.verdict, row.success, row.is_false_green) == ("safe", False, True)
+    verdict = verdict_on_trials([row])
+    assert verdict.outcome is Outcome.FAILED and verdict.label == FALSE_GREEN
+    assert "tabletop 0, 2 cameras, ours: judged safe, and there was a collision with" in verdict.sentence
+    honest = replace(row, is_false_green=False)
+    assert verdict_on_trials([honest]).outcome is Outcome.PASSED
+
+
+def test_what_a_method_cannot_do_is_a_failed_trial_with_its_reason(problem: Problem, views: Views) -> None:
+    blind = Views(steps=tuple(tuple(replace(f, depth=0 * f.depth) for f in step) for step in views.steps))
+    rig = Rig(problem=problem, views=blind, config=Config(), threads=1, stopwatch=Stopwatch())
+    row = trial_of(rig, "occupancy", 2, None)  # type: ignore[arg-type]
+    assert not row.success and row.cause == judge.NOT_EVALUABLE and "no voxel is occupied" in row.reason
+    assert isinstance(row, Trial)
