@@ -152,6 +152,7 @@ NEAR_APART = 0.01  # [m] a point of a shell is at least so far from every other 
 NEAR_NEW = 0.05  # [m] from the arm at the first state: space that the motion comes to
 NEAR_FRESH_SHARE = 0.75  # of the seen points; the arm itself hides up to a quarter of its shell for seconds
 NEAR_BLIND = 0.9  # of the new points of a sphere's shell never seen: it comes to the unknown
+NEAR_DIRECTIONS = 200  # of a sphere, in which unseen space is looked for: 20 mm apart on a shell of 80 mm
 NEAR_FEWEST = 5  # such points, at least
 UNWATCHED_NS = 500_000_000  # [ns] without depth from about the arm: two frame sets of a slow recording
 UNWATCHED_AFTER_NS = 10_000_000_000  # [ns] after a motion, in which the next depth is waited for

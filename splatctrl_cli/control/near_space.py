@@ -56,8 +56,7 @@ class NearSpace:
         self._model = model
         self._moving = np.flatnonzero(model.moving_spheres)
         self._radii = np.asarray(model.sphere_set.radii, np.float64)
-        self._offsets = (self._radii[self._moving] + margin)[:, None, None] * DIRECTIONS
-        self._owners = np.repeat(self._moving, len(DIRECTIONS))
+        self._margin = margin
         self._first: Float64 | None = None  # centres (S, 3) of the first state
         self._next_ns = -(2**63)
 
@@ -77,13 +76,11 @@ class NearSpace:
         centers = self._model.sphere_centers(q)
         if self._first is None:
             self._first = centers
-        points = (centers[self._moving][:, None] + self._offsets).reshape(-1, 3)
-        is_outside = _is_outside(points, centers, self._radii + fixed.NEAR_APART, self._owners)
-        points, owners = points[is_outside], self._owners[is_outside]
-        fewest = fixed.NEAR_LEAST_SHARE * len(self._owners)
+        points, owners = self._shell(centers, DIRECTIONS)
+        fewest = fixed.NEAR_LEAST_SHARE * len(self._moving) * len(DIRECTIONS)
         seen = known.last_ns(points)
         is_never = seen < 0
-        is_new = _is_outside(points, self._first, self._radii + fixed.NEAR_NEW)
+        is_new = self._is_new(points)
         unseen = blind = age = ahead = np.nan
         if is_new.sum() >= fewest:
             unseen = float(is_never[is_new].mean())
@@ -96,7 +93,11 @@ class NearSpace:
             age, ahead = float(np.quantile(ages, fixed.NEAR_FRESH_SHARE)), max(-float(ages.min()), 0.0)
         unanswered, place = self._nearest(known.unanswered, centers)
         unanswered = max(unanswered - known.voxel / 2, 0.0)  # from its nearest face
-        hidden, hidden_place = _nearest_of(points[is_new & is_never], distance)
+        hidden, hidden_place = np.inf, np.full(3, np.nan)
+        if distance is not None:
+            fine, _ = self._shell(centers, FINE)
+            fine = fine[self._is_new(fine)]
+            hidden, hidden_place = _nearest_of(fine[known.last_ns(fine) < 0], distance)
         return NearFigures(
             unseen=unseen,
             blind=blind,
@@ -107,6 +108,19 @@ class NearSpace:
             hidden=hidden,
             hidden_place=hidden_place,
         )
+
+    def _shell(self, centers: Float64, directions: Float64) -> tuple[Float64, NDArray[np.int64]]:
+        """Points (Q, 3), the margin away from moving spheres and outside of all others, and their spheres (Q,)."""
+        offsets = (self._radii[self._moving] + self._margin)[:, None, None] * directions
+        points = (centers[self._moving][:, None] + offsets).reshape(-1, 3)
+        owners = np.repeat(self._moving, len(directions))
+        is_outside = _is_outside(points, centers, self._radii + fixed.NEAR_APART, owners)
+        return points[is_outside], owners[is_outside]
+
+    def _is_new(self, points: Float64) -> Bool:
+        """Points (Q, 3) that the motion comes to: away from the arm of the first state."""
+        assert self._first is not None
+        return _is_outside(points, self._first, self._radii + fixed.NEAR_NEW)
 
     def _nearest(self, points: Float64, centers: Float64) -> tuple[float, Float64]:
         """The least distance [m] of points (K, 3) near the arm to its moving spheres, and that point (3,)."""
@@ -120,9 +134,9 @@ class NearSpace:
         return float(away[sphere] - radii[sphere]), points[nearest[sphere]]
 
 
-def _nearest_of(points: Float64, distance: Callable[[Float64], Float64] | None) -> tuple[float, Float64]:
+def _nearest_of(points: Float64, distance: Callable[[Float64], Float64]) -> tuple[float, Float64]:
     """The least distance [m] of points (Q, 3) to surfaces, and that point (3,)."""
-    away = distance(points) if distance is not None and len(points) else np.full(len(points), np.nan)
+    away = distance(points) if len(points) else np.full(len(points), np.nan)
     if np.isnan(away).all():
         return np.inf, np.full(3, np.nan)
     least = int(np.nanargmin(away))
@@ -144,4 +158,13 @@ def _directions() -> Float64:
     return np.asarray(steps / np.linalg.norm(steps, axis=1)[:, None])
 
 
+def _spiral(num: int) -> Float64:
+    """Unit vectors (num, 3) spread evenly over the sphere, on a Fibonacci spiral."""
+    z = 1.0 - 2.0 * (np.arange(num) + 0.5) / num
+    angle = np.pi * (1.0 + 5.0**0.5) * np.arange(num)
+    flat = np.sqrt(1.0 - z * z)
+    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
+
+
 DIRECTIONS = _directions()
+FINE = _spiral(fixed.NEAR_DIRECTIONS)

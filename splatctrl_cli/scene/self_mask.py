@@ -30,13 +30,15 @@ class PixelKind(IntEnum):
 class SelfMask:
     """kinds (H, W) uint8 of a frame's pixels (`PixelKind`); robot_depth (H, W) float32 [m] of the rendered robot, 0 =
     none; residuals: by link, measured less rendered depth (K,) [m] of pixels inside the robot's outline, up to
-    `MASK_FAR_OFF`; num_inside: by link, measured points inside its body that its surface does not explain.
+    `MASK_FAR_OFF`; num_inside: by link, measured points inside its body that its surface does not explain; reach [m]:
+    how far before the robot, at its median depth, a thing is taken for it.
     """
 
     kinds: UInt8
     robot_depth: Float32
     residuals: Mapping[str, Float32]
     num_inside: Mapping[str, int]
+    reach: float = 0.0
 
 
 def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
@@ -83,6 +85,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
         mask,
+        reach=float(np.median(tolerance_at(rendered[is_robot], config))),
         residuals=_by_link(offset[is_told], link[is_told], surface.links),
         num_inside={
             name: len(found) for name, found in _by_link(inside[is_inside], inside[is_inside], surface.links).items()
@@ -154,13 +157,14 @@ def tolerance_at(depth: Float32, config: OccupancyConfig) -> Float32:
 
 @dataclass(frozen=True, kw_only=True)
 class LinkResidual:
-    """Of one link: the median [m] of measured less rendered depth and the number of pixels that it rests on, and how
-    many measured points lie inside the link unexplained.
+    """Of one link: the median [m] of measured less rendered depth and the number of pixels that it rests on, how many
+    measured points lie inside the link unexplained, and the least `SelfMask.reach` [m] of those that show it.
     """
 
     median: float | None
     num_pixels: int
     num_inside: int
+    reach: float
 
     @property
     def sign(self) -> int:
@@ -179,6 +183,7 @@ def link_residuals(masks: Sequence[SelfMask]) -> dict[str, LinkResidual]:
             median=float(np.median(joined)) if len(joined) else None,
             num_pixels=len(joined),
             num_inside=sum(mask.num_inside.get(link, 0) for mask in masks),
+            reach=min((mask.reach for mask in masks if link in mask.residuals), default=0.0),
         )
     return found
 
@@ -187,7 +192,12 @@ def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
     """`link_residuals` as `AuditRow` has them, of the links that were seen or hold points."""
     found = link_residuals(masks)
     rows = {
-        link: {"median_mm": round(1e3 * r.median, 2), "sign": r.sign, "num_pixels": r.num_pixels}
+        link: {
+            "median_mm": round(1e3 * r.median, 2),
+            "sign": r.sign,
+            "num_pixels": r.num_pixels,
+            "reach_mm": round(1e3 * r.reach, 2),
+        }
         for link, r in found.items()
         if r.median is not None
     }
@@ -195,9 +205,10 @@ def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
 
 
 def self_mask_metrics(rows: Sequence[AuditRow]) -> dict[str, Any]:
-    """For ``run.json``, over the time steps: by link the median of its steps' residuals [mm] and its pixels
-    (`self_mask`); the largest of them by size where it rests on `MASK_PIXELS` (`self_mask_residual_mm`, None without
-    any); points inside the robot (`inside_robot_points`), and the first step and link that had one.
+    """For ``run.json``, over the time steps: by link the median of its steps' residuals [mm] and of their reach [mm],
+    and its pixels (`self_mask`); the largest of them by size where it rests on `MASK_PIXELS`
+    (`self_mask_residual_mm`, None without any); points inside the robot (`inside_robot_points`), and the first step
+    and link that had one.
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
     found = {}
@@ -207,7 +218,12 @@ def self_mask_metrics(rows: Sequence[AuditRow]) -> dict[str, Any]:
         order = np.argsort(medians)
         middle = np.searchsorted(np.cumsum(np.array(counts)[order]), 0.5 * sum(counts))
         median = float(medians[order[middle]])
-        found[link] = {"median_mm": median, "sign": int(np.sign(median)), "num_pixels": int(sum(counts))}
+        found[link] = {
+            "median_mm": median,
+            "sign": int(np.sign(median)),
+            "num_pixels": int(sum(counts)),
+            "reach_mm": float(np.median([r.get("reach_mm", 0.0) for r in of_link])),
+        }
     enough = [row["median_mm"] for row in found.values() if row["num_pixels"] >= MASK_PIXELS]
     first = next(((row.stamp_ns, link) for row in rows for link in row.inside_robot), (None, None))
     return {

@@ -150,6 +150,25 @@ def came_after_the_last_map(stage: Stage) -> None:
     stage.later, stage.later_from = [stage.ball_at_the_end(0.01)], SECOND + QUARTER
 
 
+def came_before_a_late_map(stage: Stage) -> None:
+    """From 0.9 s on a ball is where the arm ends at 1 s, and the map of 1 s is known 0.2 s later."""
+    stage.later, stage.later_from = [stage.ball_at_the_end(-0.01)], 9 * SECOND // 10
+
+
+def came_before_the_next_map(stage: Stage) -> None:
+    """The first map after the motion, a quarter of a second later, has a ball where the arm came to rest."""
+    stage.map_stamps = [i * QUARTER for i in range(6)]
+    stage.later, stage.later_from = [stage.ball_at_the_end(0.01)], SECOND + 1
+
+
+def blind_beside_the_robot(stage: Stage) -> None:
+    """A map that took what is within 45 mm of the hand for it."""
+    row = {"median_mm": 0.1, "sign": 1, "num_pixels": 900}
+    by_link = {"link5": row | {"reach_mm": 7.0}, "hand": row | {"reach_mm": 45.0}}
+    metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": stage.map_stamps[-1], "self_mask": by_link}
+    stage.run = {"metrics": metrics | {"self_mask_residual_mm": 0.1}}
+
+
 def no_new_map(stage: Stage) -> None:
     stage.states = resting(num=21)
     stage.map_stamps = [0, QUARTER]
@@ -232,6 +251,20 @@ ALONE: dict[str, Broken] = {
         "not evaluable",
         "10.0 mm from where the arm was",
     ),
+    "late map": (
+        came_before_a_late_map,
+        ("--latency", "0.2"),
+        "map age",
+        "contact",
+        "depth of 0.80 s, which the map",
+    ),
+    "next map": (
+        came_before_the_next_map,
+        (),
+        "map age",
+        "not evaluable",
+        "the next depth, 0.25 s after the last state",
+    ),
     "map age": (no_new_map, (), "map age", "not evaluable", "1.75 s old, allowed 1 s"),
     "gap": (gap_in_the_log, (), "judged time", "not evaluable", "0.50 s of 1.00 s lie between states"),
     "three stamps": (three_stamps, (), "judged time", "not evaluable", "2 gaps"),
@@ -240,6 +273,13 @@ ALONE: dict[str, Broken] = {
     "one map": (one_map_at_the_end, (), "judged time", "not evaluable", "the first 1.00 s (10 states) come before"),
     "latency": (lambda _: None, ("--latency", "0.9"), "judged time", "not evaluable", "come before the first map"),
     "coarse map": (coarse_voxels, (), "map resolution", "not evaluable", "voxels of 30.0 mm, allowed 25.0 mm"),
+    "blind map": (
+        blind_beside_the_robot,
+        (),
+        "map resolution",
+        "not evaluable",
+        "within 45.0 mm of hand was taken for",
+    ),
     "starved map": (without_a_splat, (), "clearance", "not evaluable", "raise --max-splats"),
 }
 """By name: what breaks it, arguments, and the criterion, label and words of the verdict."""

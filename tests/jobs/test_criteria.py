@@ -30,6 +30,7 @@ def judged(**replay: Any) -> Any:
         "margin": 0.02,
         "near": NOTHING_NEAR,
         "unwatched": (),
+        "overtaken": (),
         "map_age_s": np.zeros(NUM),
         "events": [],
         "lead_in_s": 0.0,

@@ -1,6 +1,6 @@
 """Float64 references of what the verdict takes from motions: one formula, one plain loop each."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,15 +82,29 @@ def hidden(
 ) -> float:
     """The least distance [m] to surfaces of the points on the shells in new space that were never seen."""
     found = [np.inf]
-    for _, point in _shells(arm, q, margin):
+    for _, point in _shells(arm, q, margin, _spiral(200)):
         if min(_gaps(arm, q_first, point)) > 0.05 and int(last_seen(point[None])[0]) < 0:
             found.append(float(distance(point[None])[0]))
     return min(found)
 
 
-def _shells(arm: ArmModel, q: Float64, margin: float) -> Iterator[tuple[int, Float64]]:
+def _spiral(num: int) -> list[tuple[float, float, float]]:
+    """Directions by the golden angle, each a slice of equal height further down."""
+    found = []
+    for k in range(num):
+        height = 1 - (2 * k + 1) / num
+        angle, flat = np.pi * (1 + np.sqrt(5)) * k, np.sqrt(1 - height**2)
+        found.append((float(flat * np.cos(angle)), float(flat * np.sin(angle)), height))
+    return found
+
+
+CUBE = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
+
+
+def _shells(
+    arm: ArmModel, q: Float64, margin: float, steps: Sequence[tuple[float, float, float]] = CUBE
+) -> Iterator[tuple[int, Float64]]:
     """Points of the moving spheres' shells outside of all other spheres, and whose they are."""
-    steps = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
     for s in np.flatnonzero(arm.moving_spheres):
         for step in steps:
             away = np.array(step) / np.linalg.norm(step)

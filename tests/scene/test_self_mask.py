@@ -10,7 +10,7 @@ from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, RgbdFrame
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.scene.posture import RobotPosture
-from splatctrl_cli.scene.self_mask import PixelKind, link_residuals, self_mask, without_mixed
+from splatctrl_cli.scene.self_mask import PixelKind, audited, link_residuals, self_mask, without_mixed
 
 K = Intrinsics(fx=160.0, fy=160.0, cx=79.5, cy=59.5, width=160, height=120)
 FLOOR, CENTER, RADIUS = 1.2, np.array([0.0, 0.0, 0.9]), 0.1
@@ -156,6 +156,17 @@ def test_what_is_seen_far_before_or_behind_the_robot_says_nothing_of_its_residua
     depth[:, :90] += offset  # most of the ball
     found = link_residuals([self_mask(frame(depth), robot(), CONFIG)])["arm"]
     assert found.median == pytest.approx(0.0, abs=2e-4)
+
+
+def test_a_link_is_told_apart_as_well_as_by_the_best_of_its_cameras() -> None:
+    """Within 4 mm and two sigmas of the sensor's error at its depth, and nothing nearer."""
+    wide = replace(CONFIG, self_mask_tolerance=0.05)
+    masks = [self_mask(frame(ball_depth()), robot(), config) for config in (wide, CONFIG)]
+    depth = np.median(masks[0].robot_depth[masks[0].robot_depth > 0])
+    want = CONFIG.self_mask_tolerance + 2 * CONFIG.depth_error * depth**2
+    assert masks[1].reach == pytest.approx(want, rel=0.01)
+    assert link_residuals(masks)["arm"].reach == masks[1].reach < masks[0].reach
+    assert audited(masks)["self_mask"]["arm"]["reach_mm"] == pytest.approx(1e3 * want, rel=0.01)
 
 
 def test_spheres_that_stand_for_a_link_enclose_it() -> None:

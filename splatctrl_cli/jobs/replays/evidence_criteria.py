@@ -6,29 +6,23 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import (
     BLIND,
-    CLOCKS_APART,
     COARSE_VOXEL,
     HIDDEN,
     MISPLACED,
-    SAME_MOMENT_NS,
     SOME_UNSEEN,
     UNSEEN,
 )
-from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Criterion, Reason, held, lacking
 from splatctrl_cli.jobs.replays.criteria_input import (
-    SLOW,
     UNKNOWN,
     Judged,
-    counted,
-    events_of,
     least_of,
     mm,
     nearby,
     seconds_at,
 )
-from splatctrl_cli.jobs.replays.metrics import is_blank
+from splatctrl_cli.jobs.replays.time_criteria import clocks, evidence_age, judged_time, map_age
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
@@ -126,154 +120,6 @@ def _unanswered(judged: Judged) -> Iterator[Reason]:
     )
 
 
-def evidence_age(judged: Judged) -> Iterator[Reason]:
-    """The depth about the arm is at most `--max-map-age` old, none is newer than the state that it judges, and where
-    there was none for half a second the next shows nothing in the arm's place of that time. Frames without depth do
-    not count; a baked field does not say when it was seen (a note).
-    """
-    yield from _unwatched(judged)
-    ahead = nearby(judged, "ahead")
-    allowed = SAME_MOMENT_NS / 1e9  # the frames of one time step lie apart
-    if ahead is not None and ahead[0] > allowed:
-        yield lacking(
-            sentence=f"the newest depth near the arm is {ahead[0]:.2f} s later than the state that it judges",
-            value=-ahead[0],
-            threshold=-allowed,
-            unit="s",
-            time_s=ahead[1],
-            remedy="a state is judged by what was known then: reconstruct with snapshots, or check the clocks",
-            count=ahead[2],
-        )
-    near = nearby(judged, "age")
-    if near is not None and near[0] > judged.request.max_map_age:
-        yield lacking(
-            sentence=f"the newest depth near the arm is {near[0]:.2f} s old, allowed "
-            f"{judged.request.max_map_age:g} s",
-            value=near[0],
-            threshold=judged.request.max_map_age,
-            unit="s",
-            time_s=near[1],
-            remedy="frames without depth do not count: check the cameras ('splatctrl check')",
-            count=near[2],
-        )
-    elif near is not None:
-        words = f"depth from about the arm at most {near[0]:.2f} s before"
-        yield held(words, near[0], judged.request.max_map_age, "s", near[2])
-
-
-def _unwatched(judged: Judged) -> Iterator[Reason]:
-    """What the next depth shows of a time without any."""
-    first_ns, margin = int(judged.replay.audit.stamp_ns[0]), judged.replay.margin
-    for found in judged.replay.unwatched:
-        since, until, when = ((ns - first_ns) * 1e-9 for ns in (found.since_ns, found.until_ns, found.stamp_ns))
-        yield lacking(
-            sentence=f"no camera gave depth from about the arm from {since:.2f} to {until:.2f} s, and then a thing "
-            f"is {mm(found.clearance)} from where the arm was, margin {mm(margin)},",
-            value=found.clearance,
-            threshold=margin,
-            unit="m",
-            time_s=when,
-            remedy="nobody can say when it came: cameras must give depth all the time",
-            count=judged.num_states,
-        )
-
-
-def map_age(judged: Judged) -> Iterator[Reason]:
-    """The map is at most `--max-map-age` old; of a baked field, the time from its moment."""
-    ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age
-    known = ages[np.isfinite(ages)]
-    if not len(known):
-        if judged.request.field is not None and judged.inputs.source.has_clock:
-            yield lacking(
-                sentence="the field does not say what time it shows",
-                remedy="give --scene, or bake a reconstruction instead of bare splats",
-                count=judged.num_states,
-            )
-        return
-    most = float(known.max())
-    if most <= allowed:
-        yield held(f"at most {most:.2f} s", most, allowed, "s", len(known))
-        return
-    worst = max(events_of(judged.replay, EventKind.STALE_MAP), key=lambda event: event.worst)
-    yield lacking(
-        sentence=f"the map is up to {most:.2f} s old, allowed {allowed:g} s, from {worst.start_s:.2f} to "
-        f"{worst.end_s:.2f} s",
-        value=most,
-        threshold=allowed,
-        unit="s",
-        time_s=worst.worst_s,
-        remedy="the cameras must cover the motion in time; --max-map-age says how old a map may be",
-        count=len(known),
-    )
-
-
-def judged_time(judged: Judged) -> Iterator[Reason]:
-    """No gap longer than `verdict.longest_interval` in which the arm could reach the margin within its velocity
-    limits; no state without a distance or dropped for its stamp (*judged states*); at most `verdict.lead_in` before
-    the first map.
-    """
-    config, stamps = judged.request.config.verdict, judged.replay.audit.stamp_ns
-    blank = is_blank(judged.replay)
-    if blank.any():
-        yield lacking(
-            criterion="judged states",
-            sentence=f"the path leaves known space: at {int(blank.sum())} of {len(stamps)} states a sphere is where "
-            "the field has no distance, first",
-            value=float(blank.mean()),
-            threshold=config.unjudged,
-            time_s=seconds_at(judged, int(np.argmax(blank))),
-            remedy="bake with field.unknown = free or obstacle, over a box that holds the motion",
-            count=len(stamps),
-        )
-    yield from _gaps(judged)
-    dropped = judged.inputs.source.loss.conflicting_states
-    if dropped > config.unjudged * (dropped + len(stamps)):
-        yield lacking(
-            criterion="judged states",
-            sentence=f"{dropped} logged states were dropped: they repeat a stamp with other positions",
-            value=float(dropped),
-            threshold=config.unjudged,
-            remedy="stamp every state with its own time, or give --stamps log",
-            count=len(stamps),
-        )
-    yield from _lead_in(judged)
-
-
-def _gaps(judged: Judged) -> Iterator[Reason]:
-    """Between states too far apart to bound the motion."""
-    replay, config = judged.replay, judged.request.config.verdict
-    stamps, unbounded = replay.audit.stamp_ns, replay.between["unbounded"]
-    duration = max(float(stamps[-1] - stamps[0]) * 1e-9, 1e-9)
-    share = float(unbounded.sum()) / duration
-    if share > config.unjudged:
-        worst = max(events_of(replay, EventKind.NOT_BOUNDED), key=lambda event: event.worst)
-        yield lacking(
-            sentence=f"{float(unbounded.sum()):.2f} s of {duration:.2f} s lie between states too far apart to bound "
-            f"the motion ({counted(int((unbounded > 0).sum()), 'gap')}, the longest {worst.worst:.2f} s, ending",
-            value=share,
-            threshold=config.unjudged,
-            time_s=worst.worst_s,
-            cause=f"expected at most {config.longest_interval:g} s)",
-            remedy=SLOW,
-            count=len(stamps),
-        )
-
-
-def _lead_in(judged: Judged) -> Iterator[Reason]:
-    """States before the first map."""
-    replay = judged.replay
-    if not replay.lead_in_s > judged.request.config.verdict.lead_in:
-        return
-    yield lacking(
-        sentence=f"the first {replay.lead_in_s:.2f} s ({replay.num_before_scene} states) come before the first map",
-        value=replay.lead_in_s,
-        threshold=judged.request.config.verdict.lead_in,
-        unit="s",
-        remedy="judge the rest alone with --start-time first-map",
-        count=judged.num_states,
-    )
-
-
 def map_error(judged: Judged) -> Iterator[Reason]:
     """With `--evidence`: the surface clearance less the bound on the map's error is at least 0.
 
@@ -323,27 +169,6 @@ def bound_words(bound: ConformalBound) -> str:
     )
 
 
-def clocks(judged: Judged) -> Iterator[Reason]:
-    """Cameras and robot agree within 50 ms beyond the estimate's own uncertainty."""
-    clock = judged.logged.clock
-    if clock is None or clock.offset_s is None or clock.uncertainty_s is None:
-        return
-    offset, uncertainty = float(clock.offset_s), float(clock.uncertainty_s)
-    apart = abs(offset) - uncertainty
-    if apart <= CLOCKS_APART:
-        yield held(f"{1e3 * abs(offset):.0f} ms apart", abs(offset), CLOCKS_APART, "s", clock.num_intervals)
-        return
-    yield lacking(
-        sentence=f"the cameras' clock is {1e3 * abs(offset):.0f} ms {'ahead of' if offset > 0 else 'behind'} "
-        f"the robot's (+- {1e3 * uncertainty:.0f} ms)",
-        value=abs(offset),
-        threshold=CLOCKS_APART,
-        unit="s",
-        remedy="synchronise the clocks, or shift one in the log",
-        count=clock.num_intervals,
-    )
-
-
 def belonging(judged: Judged) -> Iterator[Reason]:
     """Scene, log and robot belong together: digests, first frames, calibration, times, joints, links; files as
     written; splats that agree with their occupancy grid.
@@ -376,17 +201,30 @@ def calibration(judged: Judged) -> Iterator[Reason]:
 
 
 def map_resolution(judged: Judged) -> Iterator[Reason]:
-    """The map's voxels are at most 25 mm: what no splat stands for may be as large as one."""
-    voxel = judged.inputs.scene.figures().get("voxel")
-    if voxel is None or voxel <= COARSE_VOXEL:
-        return
-    yield lacking(
-        sentence=f"the map has voxels of {mm(voxel)}, allowed {mm(COARSE_VOXEL)} beside a robot",
-        value=float(voxel),
-        threshold=COARSE_VOXEL,
-        unit="m",
-        remedy="reconstruct with --urdf, or with --set scene.scale=1",
-    )
+    """The map's voxels are at most 25 mm, as what no splat stands for may be as large as one; and what was taken for
+    the robot is nearer to it than the margin, as a thing that touches it may go unseen as far.
+    """
+    figures, margin = judged.inputs.scene.figures(), judged.replay.margin
+    voxel, by_link = figures.get("voxel"), figures.get("self_mask")
+    if voxel is not None and voxel > COARSE_VOXEL:
+        yield lacking(
+            sentence=f"the map has voxels of {mm(voxel)}, allowed {mm(COARSE_VOXEL)} beside a robot",
+            value=float(voxel),
+            threshold=COARSE_VOXEL,
+            unit="m",
+            remedy="reconstruct with --urdf, or with --set scene.scale=1",
+        )
+    reaches = {link: 1e-3 * row.get("reach_mm", 0.0) for link, row in (by_link or {}).items()}
+    blind = max(reaches, key=reaches.__getitem__, default=None)
+    if blind is not None and reaches[blind] > margin:
+        yield lacking(
+            sentence=f"what is within {mm(reaches[blind])} of {blind} was taken for the robot, margin {mm(margin)}",
+            value=reaches[blind],
+            threshold=margin,
+            unit="m",
+            who=blind,
+            remedy="lower occupancy.self_mask_tolerance or occupancy.depth_error, or place a camera nearer",
+        )
 
 
 OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
@@ -397,6 +235,6 @@ OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
     Criterion(name="judged time", find=judged_time, broken=f"{UNKNOWN}; `--start-time first-map` judges the rest"),
     Criterion(name="known space", find=known_space, broken=UNKNOWN),
     Criterion(name="evidence age", find=evidence_age, broken=UNKNOWN),
-    Criterion(name="map age", find=map_age, broken=UNKNOWN),
+    Criterion(name="map age", find=map_age, broken=f"{UNKNOWN}; *contact* or *margin broken* by its own depth"),
     Criterion(name="clocks", find=clocks, broken=UNKNOWN),
 )

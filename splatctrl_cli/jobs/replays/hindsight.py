@@ -1,18 +1,20 @@
-"""What came while no camera looked: where the next depth shows a thing in the arm's place of a moment before it."""
+"""What the map of a moment did not show yet: later depth has a thing in the arm's place of that moment."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
 from splatctrl_cli.config.fixed import UNWATCHED_AFTER_NS, UNWATCHED_APART_NS, UNWATCHED_NS
-from splatctrl_cli.control.audit import moving_clearance
 from splatctrl_cli.control.near_space import NearSpace
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.records import Float64, Stamps
-from splatctrl_cli.robot.model import RobotModel
 
 STEP_NS = 100_000_000  # between looks after a motion
+
+ClearanceIn = Callable[[int, Stamps, Float64], Float64]
+"""In the scene known at a stamp, of states (T,), (T, J): their clearances (T,) [m], declared contact left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +29,73 @@ class Unwatched:
     clearance: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class Overtaken:
+    """A state that keeps the margin in the map that was known at `stamp_ns`, and is `clearance` [m], less than the
+    margin, from a thing that the depth of `depth_ns` shows, which that map did not have yet.
+    """
+
+    depth_ns: int
+    stamp_ns: int
+    clearance: float
+
+
+class NewerDepth:
+    """Holds states against the depth of their own time where maps are late, and the last against the next depth."""
+
+    def __init__(self, scene: KnownScene, margin: float, clearance_in: ClearanceIn) -> None:
+        self._scene, self._margin, self._clearance_in = scene, margin, clearance_in
+        self._waiting: list[tuple[int, Float64]] = []  # states whose own depth is not known yet
+        self._last: tuple[int, Float64] | None = None
+        self.found: list[Overtaken] = []
+
+    def add(self, stamps: Stamps, positions: Float64, clearance: Float64) -> None:
+        """The next states (T,), (T, J), and their clearances (T,) [m] in the map that was known then."""
+        is_clear = clearance >= self._margin
+        states = [(int(stamps[k]), positions[k].copy()) for k in np.flatnonzero(is_clear)]
+        self._last = states[-1] if is_clear[-1] else None
+        if self._scene.latency_ns:
+            self._waiting += states
+            self._hold(int(stamps[-1]))
+
+    def finish(self) -> None:
+        """After the motion: what its last states' own depth shows, and the next after that."""
+        if self._last is None or not self._scene.stamps_ns:
+            return
+        stamp_ns, q = self._last
+        own_ns = stamp_ns + self._scene.latency_ns
+        self._hold(own_ns)
+        before_ns, known_ns = self._scene.depth_ns(own_ns), self._scene.next_ns(own_ns)
+        next_ns = None if known_ns is None else self._scene.depth_ns(known_ns)
+        if known_ns is None or before_ns is None or next_ns is None or next_ns - before_ns > UNWATCHED_NS:
+            return  # or `Hindsight` looks back at all that time
+        self._compare(known_ns, [(stamp_ns, q)])
+
+    def _hold(self, now_ns: int) -> None:
+        """Against the scenes that are known by now."""
+        late = self._scene.latency_ns
+        due = [state for state in self._waiting if state[0] + late <= now_ns]
+        del self._waiting[: len(due)]
+        for _, together in groupby(due, key=lambda state: self._scene.depth_ns(state[0] + late)):
+            states = list(together)
+            self._compare(states[0][0] + late, states)
+
+    def _compare(self, known_ns: int, states: Sequence[tuple[int, Float64]]) -> None:
+        stamps = np.array([stamp for stamp, _ in states])
+        clearance = self._clearance_in(known_ns, stamps, np.array([q for _, q in states]))
+        worst = int(clearance.argmin())
+        depth_ns = self._scene.depth_ns(known_ns)
+        if clearance[worst] < self._margin and depth_ns is not None:
+            self.found.append(
+                Overtaken(depth_ns=depth_ns, stamp_ns=int(stamps[worst]), clearance=float(clearance[worst]))
+            )
+
+
 class Hindsight:
     """Keeps the postures since the last depth from about the arm, and holds them against the map after the next."""
 
-    def __init__(self, model: RobotModel, scene: KnownScene, near: NearSpace, margin: float) -> None:
-        self._model, self._scene, self._near, self._margin = model, scene, near, margin
+    def __init__(self, scene: KnownScene, near: NearSpace, margin: float, clearance_in: ClearanceIn) -> None:
+        self._scene, self._near, self._margin, self._clearance_in = scene, near, margin, clearance_in
         self._stamps: list[int] = []
         self._postures: list[Float64] = []
         self._seen_ns: int | None = None  # when most of the space about the arm was last seen
@@ -77,20 +141,18 @@ class Hindsight:
 
     def _hold_against(self, since_ns: int, until_ns: int, num: int) -> None:
         """The first `num` postures against the map at `until_ns`: those that were clear of what was known of then."""
-        q = np.asarray(self._postures[:num])
-        after = self._clearance(until_ns, q)
-        late = np.flatnonzero(after < self._margin)
-        late = np.array([k for k in late if self._clearance(self._stamps[k], q[[k]])[0] >= self._margin], np.int64)
-        if not len(late):
+        stamps, q = np.array(self._stamps[:num]), np.asarray(self._postures[:num])
+        after = self._clearance_in(until_ns, stamps, q)
+        late = [k for k in np.flatnonzero(after < self._margin) if self._was_clear(stamps[[k]], q[[k]])]
+        if not late:
             return
-        worst = int(late[np.argmin(after[late])])
+        worst = min(late, key=lambda k: after[k])
         self.found.append(
             Unwatched(
                 since_ns=since_ns, until_ns=until_ns, stamp_ns=self._stamps[worst], clearance=float(after[worst])
             )
         )
 
-    def _clearance(self, stamp_ns: int, q: Float64) -> Float64:
-        """Of postures (T, J) in the map that is known at a stamp (T,) [m]."""
-        distance = self._scene.at(stamp_ns).distances["exact"]
-        return moving_clearance(self._model, self._model.sphere_centers_batch(q), distance)[0].distance
+    def _was_clear(self, stamp: Stamps, q: Float64) -> bool:
+        """A state (1,), (1, J) in the map of its own time."""
+        return bool(self._clearance_in(int(stamp[0]), stamp, q)[0] >= self._margin)

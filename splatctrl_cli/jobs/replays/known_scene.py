@@ -103,6 +103,11 @@ class KnownScene:
         index = self._index_at(stamp_ns)
         return math.nan if index < 0 else (stamp_ns - self.stamps_ns[index]) * 1e-9
 
+    def depth_ns(self, stamp_ns: int) -> int | None:
+        """The stamp [ns] of the newest depth in the scene that is known at a stamp; None where there are no times."""
+        index = self._index_at(stamp_ns)
+        return None if index < 0 else self.stamps_ns[index]
+
     def step_at(self, stamp_ns: int) -> SceneStep | None:
         """The two newest scenes at a stamp, None where there is only one."""
         index = self._index_at(stamp_ns)

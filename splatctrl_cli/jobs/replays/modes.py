@@ -194,6 +194,7 @@ def _replay(
     stamps = record.audit.stamp_ns
     requested, logged = _requested_ns(request, inputs), inputs.states.stamp_ns
     before = logged[(logged >= requested) & (logged < stamps[0])]
+    record.newer_depth.finish()
     record.hindsight.finish()
     return Replay(
         model=inputs.model,
@@ -209,6 +210,7 @@ def _replay(
         between=record.between,
         near=record.near,
         unwatched=tuple(record.hindsight.found),
+        overtaken=tuple(record.newer_depth.found),
         strain=record.strain,
         statics=record.statics,
         closest=record.closest,

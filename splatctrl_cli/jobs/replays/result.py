@@ -12,7 +12,7 @@ from splatctrl_cli.control.standstill import Separation
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.clearance_agreement import ClearanceAgreement
 from splatctrl_cli.jobs.replays.evidence import MapError
-from splatctrl_cli.jobs.replays.hindsight import Unwatched
+from splatctrl_cli.jobs.replays.hindsight import Overtaken, Unwatched
 from splatctrl_cli.jobs.replays.state_store import Figures, StoredAudit, StoredOpenLoop, StoredSteps
 from splatctrl_cli.planner.comparison import Motion, MotionFigures
 from splatctrl_cli.planner.planned import PlannedPath
@@ -49,10 +49,11 @@ class Replay:
     """One finished replay of T states: their audit, the trace of its mode, and the truth where it is known.
 
     num_before_scene: requested states earlier than the first scene, left out, over lead_in_s [s]; start_time_s: of
-    the first state in the log [s]; between, near, unwatched, strain, statics and closest: as `ReplayRecord` has them;
-    obstacles (T,): what is nearest to the nearest sphere, in words; map_age_s (T,): of the scene in use; kept_steps:
-    of a controller; divergence: of a closed loop from the log, by columns joints [rad], position [m], rotation [rad];
-    map_error: where the request names evidence of it; separations: with a standstill the distances from people, by
+    the first state in the log [s]; between, near, strain, statics and closest: as `ReplayRecord` has them; unwatched,
+    overtaken: what later depth showed; obstacles (T,): what is nearest to the nearest sphere, in words; map_age_s
+    (T,): of the scene in use; kept_steps: of a controller; divergence: of a closed loop from the log, by columns
+    joints [rad], position [m], rotation [rad]; map_error: where the request names evidence of it; separations: with a
+    standstill the distances from people, by
     name of the motion, sampled at `period` [s]; comparison: every motion of --baseline and its figures; outside: of a
     user's own controller, and ours, with the baseline qp-ik: our controller in its place.
     """
@@ -70,6 +71,7 @@ class Replay:
     between: Figures
     near: Figures
     unwatched: tuple[Unwatched, ...]
+    overtaken: tuple[Overtaken, ...]
     strain: Figures
     statics: Mapping[str, tuple[float, float]]
     closest: Mapping[KeptMargin, tuple[float, int]]

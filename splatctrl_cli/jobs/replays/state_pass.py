@@ -16,7 +16,7 @@ from splatctrl_cli.control.near_space import NearSpace, Seen
 from splatctrl_cli.control.preconditions import static_clearance
 from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep
-from splatctrl_cli.jobs.replays.hindsight import Hindsight
+from splatctrl_cli.jobs.replays.hindsight import Hindsight, NewerDepth
 from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene
 from splatctrl_cli.jobs.replays.state_store import BLOCK, Figures, StoredAudit, StoredObjects
 from splatctrl_cli.records import Float64, Stamps
@@ -34,10 +34,10 @@ class ReplayRecord:
     the clearance of a posture on the way instead (`met`), the time [s] that nobody can bound (`unbounded`), the
     clearance [m] of the body at the state (`surface`), and that of the spheres to the splats alone (`represented`).
     near: what was known about the arm (the columns of `NearFigures`), NaN at states that were not looked at.
-    hindsight: what later depth says of times without any. strain: velocity and acceleration as shares of their
-    limits. statics: by sphere that no joint moves, its clearance [m] when its surroundings were first seen and the
-    least in any. closest: of pairs of links that keep less than the margin asked for, how near they came [m] and the
-    stamp; nothing of those that stayed apart.
+    hindsight: what later depth says of times without any; newer_depth: of states that a late map judged. strain:
+    velocity and acceleration as shares of their limits. statics: by sphere that no joint moves, its clearance [m]
+    when its surroundings were first seen and the least in any. closest: of pairs of links that keep less than the
+    margin asked for, how near they came [m] and the stamp; nothing of those that stayed apart.
     """
 
     def __init__(
@@ -78,7 +78,8 @@ class ReplayRecord:
             np.broadcast_to(limit, model.velocity_limit.shape) if limit.any() else None,
         )
         self.near, self._near = Figures(), NearSpace(model, config.control.margin)
-        self.hindsight = Hindsight(model, scene, self._near, config.control.margin)
+        self.hindsight = Hindsight(scene, self._near, config.control.margin, self._clearance_in)
+        self.newer_depth = NewerDepth(scene, config.control.margin - SLIGHTLY_UNDER, self._clearance_in)
         self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
         self._last_scene: KnownFields | None = None
         self._seen_before: Seen | None = None  # when the fixed spheres were last looked at
@@ -102,6 +103,7 @@ class ReplayRecord:
         )
         part = self._look_at_self(self._without_expected(part))
         self.audit.add(part)
+        self.newer_depth.add(stamps, positions, part.clearance["exact"].distance)
         self.obstacles.extend(["" if obstacle is None else str(obstacle) for obstacle in self._nearest(part)])
         self.ages.append(map_age_s=np.array([scene.age_s(stamp) for stamp in stamps.tolist()]))
         self._bound(part, velocities)
@@ -135,20 +137,31 @@ class ReplayRecord:
         """The audit without the spheres whose contact is declared, where they would break the margin."""
         if not self._declared.expected_contact:
             return part
-        links, moving = self._model.sphere_set.links, self._reach.moving
-        clearance, of_spheres = dict(part.clearance), dict(part.of_spheres)
+        clearance, of_spheres, moving = dict(part.clearance), dict(part.of_spheres), self._reach.moving
+        known = self._scene.at(int(part.stamp_ns[0]))
         for name, each in part.of_spheres.items():
-            kept = each.copy()
-            for state, column in zip(*np.nonzero(each < self._margin), strict=True):
-                stamp, sphere = int(part.stamp_ns[state]), int(moving[column])
-                center = self._model.sphere_centers(part.position[state])[[sphere]]
-                place = np.array(self._scene.at(stamp).obstacles(center)[0].position)
-                if self._declared.expects(links[sphere], place, (stamp - self._first_state_ns) * 1e-9):
-                    kept[state, column] = np.inf
+            kept = of_spheres[name] = self._unexpected(known, part.stamp_ns, part.position, each)
             nearest = kept.argmin(axis=1)
-            of_spheres[name] = kept
             clearance[name] = Clearance(distance=kept[np.arange(len(kept)), nearest], sphere=moving[nearest])
         return replace(part, clearance=clearance, of_spheres=of_spheres)
+
+    def _unexpected(self, known: KnownFields, stamps: Stamps, positions: Float64, each: Float64) -> Float64:
+        """Clearances `each` (T, M) [m] of the moving spheres, infinite where contact is declared."""
+        links, kept = self._model.sphere_set.links, each.copy()
+        for state, column in zip(*np.nonzero(each < self._margin), strict=True):
+            sphere = int(self._reach.moving[column])
+            center = self._model.sphere_centers(positions[state])[[sphere]]
+            place = np.array(known.obstacles(center)[0].position)
+            if self._declared.expects(links[sphere], place, (int(stamps[state]) - self._first_state_ns) * 1e-9):
+                kept[state, column] = np.inf
+        return kept
+
+    def _clearance_in(self, scene_ns: int, stamps: Stamps, positions: Float64) -> Float64:
+        """Of states (T,), (T, J) in the scene that is known at another time than theirs (T,) [m]."""
+        known = self._scene.at(scene_ns)
+        centers = self._model.sphere_centers_batch(positions)
+        each = moving_clearance(self._model, centers, known.distances["exact"])[1]
+        return np.asarray(self._unexpected(known, stamps, positions, each).min(axis=1))
 
     def _look_at_self(self, part: AuditTrace) -> AuditTrace:
         """The audit with how near the links' own surfaces come to each other, where they are known: spheres that
