@@ -14,10 +14,9 @@ from splatctrl_cli.config.fixed import STATES_STILL
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import blocks_of, ranges
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.logs.joint_log import JointStream
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.logs.state_messages import STATE_TYPES
+from splatctrl_cli.logs.state_messages import STATE_TYPES, JointStream
 from splatctrl_cli.logs.state_topics import joint_records
 from splatctrl_cli.logs.survey import Survey
 from splatctrl_cli.records import Float64, JointState, LossReport, spread

@@ -17,7 +17,7 @@ from splatctrl_cli.jobs.reconstruct import declarations_of
 from splatctrl_cli.jobs.replays.criteria_input import Judged
 from splatctrl_cli.jobs.replays.evidence import Evidence, check_evidence, map_error, open_evidence
 from splatctrl_cli.jobs.replays.files import write_replay
-from splatctrl_cli.jobs.replays.goal import check_goal, check_twists
+from splatctrl_cli.jobs.replays.goal import check_controller, check_goal, check_twists
 from splatctrl_cli.jobs.replays.golden import read_golden
 from splatctrl_cli.jobs.replays.inputs import (
     LoggedStates,
@@ -34,7 +34,6 @@ from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.jobs.replays.lockstep import check_lockstep, opened_scene, reads_whole_log
 from splatctrl_cli.jobs.replays.metrics import Metrics, metric_names, metrics_of
 from splatctrl_cli.jobs.replays.modes import replayed
-from splatctrl_cli.jobs.replays.outside import check_controller
 from splatctrl_cli.jobs.replays.pictures import draw_worst_frames, worst_sights
 from splatctrl_cli.jobs.replays.provenance import Mismatch, made_from_mismatches, scene_mismatches, truth_mismatch
 from splatctrl_cli.jobs.replays.request import MODES, ReplayInputs, ReplayRequest

@@ -12,10 +12,10 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.planner.planned import goal_postures
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.coverage import coverage_of_solids
-from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.link_meshes import mesh_path, read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import random_postures
+from splatctrl_cli.robot.self_margins import SelfSurfaces
 from splatctrl_cli.robot.sphere_files import spheres_yaml
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf

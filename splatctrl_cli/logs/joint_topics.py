@@ -16,10 +16,9 @@ from splatctrl_cli.containers.raw_log import Topic
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import npy_head, npy_of
 from splatctrl_cli.files.spilled_rows import Rows, blocks_of, ranges
-from splatctrl_cli.logs.joint_log import JointLog, JointStream
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.logs.state_messages import STATE_TYPES
+from splatctrl_cli.logs.state_messages import STATE_TYPES, JointLog, JointStream
 from splatctrl_cli.logs.state_topics import joint_records
 from splatctrl_cli.logs.survey import Survey, TopicSurvey
 from splatctrl_cli.records import Float64, LossReport

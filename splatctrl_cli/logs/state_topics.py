@@ -20,10 +20,9 @@ from splatctrl_cli.config.fixed import (
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, absent, ranges
 from splatctrl_cli.logs.decoder import JOINT_STATE
-from splatctrl_cli.logs.joint_log import JointStream
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import NO_STATES, StateColumns
-from splatctrl_cli.logs.state_messages import NAMELESS, STANDARD_TYPES, STATE_TYPES, TRAJECTORY
+from splatctrl_cli.logs.state_messages import NAMELESS, STANDARD_TYPES, STATE_TYPES, TRAJECTORY, JointStream
 from splatctrl_cli.logs.state_track import RawTrack, cleaned
 from splatctrl_cli.logs.survey import Survey, TopicSurvey
 from splatctrl_cli.records import Bool, Float64, LossReport, Stamps

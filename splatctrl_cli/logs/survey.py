@@ -25,10 +25,9 @@ from splatctrl_cli.logs.decoder import (
     stamp_ns,
 )
 from splatctrl_cli.logs.image_stamps import StampClock
-from splatctrl_cli.logs.joint_log import JointLog
 from splatctrl_cli.logs.messages import ImageMessage, read_image
 from splatctrl_cli.logs.realsense import OPTION, TRANSFORM, RealSense
-from splatctrl_cli.logs.state_messages import STANDARD_TYPES, STATE_TYPES, RawJoints, read_states
+from splatctrl_cli.logs.state_messages import STANDARD_TYPES, STATE_TYPES, JointLog, RawJoints, read_states
 from splatctrl_cli.logs.tf_tree import TfTree
 from splatctrl_cli.logs.video import VideoLog
 from splatctrl_cli.records import Float64

@@ -12,8 +12,7 @@ import pytest
 from splatctrl_cli.records import Float64, JointState, SphereSet
 from splatctrl_cli.robot.sphere_files import spheres_yaml
 from tests.cli.replay_desk import SECOND, Desk, FakeSource, splats_of, write_scene
-from tests.robot.folding_arm import CROSSED, FOLDED, LIMIT, OPEN, URDF, covering_spheres
-from tests.robot.shapes import written
+from tests.robot.shapes import CROSSED, FOLDED, LIMIT, OPEN, URDF, covering_spheres, written
 
 FAR = ((1.2, 1.2, 0.9), 0.05)
 COVERING, FAT = covering_spheres(), covering_spheres(1.6)  # the fat ones overlap in every posture

@@ -1,20 +1,198 @@
-"""Pairs of links get the margin that their spheres can keep, which still keeps their surfaces apart."""
+"""Pairs of links get the margin that their spheres can keep, which still keeps their surfaces apart; and how far the
+surfaces of links are from each other.
+"""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config.fixed import LEAST_OVERLAP
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop, num_on_rung
+from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.solid_scene import Solids
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, SphereSet
+from splatctrl_cli.robot.link_meshes import Solid, read_solids
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import random_postures
-from splatctrl_cli.robot.self_margins import kept_margins, with_kept_margins
+from splatctrl_cli.robot.self_collision import DisabledPair, random_postures
+from splatctrl_cli.robot.self_margins import (
+    LinkSurface,
+    SelfSurfaces,
+    depth_in,
+    kept_margins,
+    surface_gap,
+    with_kept_margins,
+)
+from splatctrl_cli.robot.urdf import read_urdf
 from tests.control.fakes import Balls
-from tests.robot.folding_arm import GAP, URDF, covering_spheres, folding_arm
+from tests.reference.mesh_gap import surface_distance
+from tests.robot.shapes import (
+    CROSSED,
+    FOLDED,
+    GAP,
+    OPEN,
+    URDF,
+    arm_of,
+    covering_spheres,
+    folding_arm,
+    l_shape,
+    written,
+)
+
+
+def solids_of(folder: Path, shape: str) -> tuple[Solid, ...]:
+    return read_solids(read_urdf(written(folder, arm_of(shape, '<sphere radius="0.1"/>'))))["base"]
+
+
+def box(folder: Path, x: float, y: float, z: float) -> LinkSurface:
+    return LinkSurface(solids_of(folder, f'<box size="{x} {y} {z}"/>'))
+
+
+def turned(rng: np.random.Generator) -> Float64:
+    return np.asarray(Rotation.random(rng=rng).as_matrix())
+
+
+def at(shift: ArrayLike, rotation: Float64 | None = None) -> Float64:
+    T = np.eye(4)
+    T[:3, 3] = shift
+    T[:3, :3] = np.eye(3) if rotation is None else rotation
+    return T
+
+
+def test_boxes_are_as_far_apart_as_their_faces_edges_and_corners(tmp_path: Path) -> None:
+    one = box(tmp_path, 0.2, 0.2, 0.2)
+    for shift, gap in (((0.3, 0.05, 0), 0.1), ((0.3, 0.4, 0), np.hypot(0.1, 0.2)), ((0.3, 0.3, 0.3), 0.1 * 3**0.5)):
+        assert surface_gap(one, one, at(shift)) == pytest.approx(gap, abs=1e-12)
+
+
+def test_the_gap_is_that_of_the_reference_and_the_same_from_either_side(tmp_path: Path) -> None:
+    mesh = l_shape()
+    shape = TriangleMesh(vertices=np.array(mesh.vertices), faces=np.array(mesh.faces), is_closed=True)
+    hook = LinkSurface([Solid(link="a", surface=shape, slack=0.0, body=shape)])
+    (plate,) = solids_of(tmp_path, '<box size="0.2 0.3 0.02"/>')
+    rng, found = np.random.default_rng(2), []
+    for _ in range(30):
+        T = at(rng.uniform([-0.25, -0.25, -0.35], [0.55, 0.55, 0.45]), turned(rng))
+        moved = plate.surface.corners @ T[:3, :3].T + T[:3, 3]
+        expected = surface_distance(shape.corners, moved)
+        gap = surface_gap(hook, LinkSurface([plate]), T)
+        found.append(gap)
+        assert gap == pytest.approx(expected, abs=1e-9) if expected > 0 else gap < 0
+        assert surface_gap(LinkSurface([plate]), hook, np.linalg.inv(T)) == pytest.approx(gap, abs=1e-9)
+    assert 3 < sum(gap < 0 for gap in found) < 27
+
+
+def test_surfaces_that_cross_without_a_vertex_inside_overlap(tmp_path: Path) -> None:
+    rod, other = box(tmp_path, 0.02, 0.02, 0.4), box(tmp_path, 0.4, 0.03, 0.03)
+    assert surface_gap(rod, other, np.eye(4)) == -LEAST_OVERLAP
+    assert surface_gap(rod, other, at((0, 0.03, 0))) == pytest.approx(0.005, abs=1e-12)
+
+
+def test_a_link_inside_another_overlaps_it_by_its_depth(tmp_path: Path) -> None:
+    large, small = box(tmp_path, 0.4, 0.4, 0.4), box(tmp_path, 0.02, 0.02, 0.02)
+    for a, b in ((large, small), (small, large)):
+        assert surface_gap(a, b, np.eye(4)) == pytest.approx(-0.19, abs=1e-9)
+    assert surface_gap(large, small, at((0.195, 0, 0))) == pytest.approx(-0.015, abs=1e-9)
+
+
+def test_the_depth_in_a_solid_is_the_distance_to_its_surface(tmp_path: Path) -> None:
+    mesh, rng = l_shape(), np.random.default_rng(3)
+    bent = TriangleMesh(vertices=np.array(mesh.vertices), faces=np.array(mesh.faces), is_closed=True)
+    hook = Solid(link="a", surface=bent, slack=0.0, body=bent)
+    rod = '<cylinder radius="0.05" length="0.3"/>'
+    for solid in (*solids_of(tmp_path, rod), *solids_of(tmp_path, '<box size="0.2 0.3 0.02"/>'), hook):
+        corners = solid.surface.vertices
+        points = rng.uniform(corners.min(axis=0), corners.max(axis=0), (300, 3))
+        expected = -MeshDistance(solid.surface).signed(points)
+        assert np.count_nonzero(expected > 0) > 30
+        np.testing.assert_allclose(np.maximum(depth_in(solid)(points), 0), np.maximum(expected, 0), atol=1e-12)
+
+
+def test_round_shapes_are_never_said_to_be_farther_apart_than_they_are(tmp_path: Path) -> None:
+    ball = LinkSurface(solids_of(tmp_path, '<sphere radius="0.1"/>'))
+    rng = np.random.default_rng(1)
+    for direction in rng.normal(size=(20, 3)):
+        gap = surface_gap(ball, ball, at(0.25 * direction / np.linalg.norm(direction), turned(rng)))
+        assert 0.05 - 4 * ball.slack < gap <= 0.05
+    assert surface_gap(ball, ball, at((0.1999, 0, 0))) < 0
+
+
+def test_an_open_surface_is_crossed_and_has_no_inside(tmp_path: Path) -> None:
+    whole = solids_of(tmp_path, '<box size="0.2 0.2 0.2"/>')[0].surface
+    sheet = TriangleMesh(vertices=whole.vertices, faces=whole.faces[2:], is_closed=False)
+    tray = LinkSurface([Solid(link="a", surface=sheet, slack=0.0, body=whole)])
+    pin = box(tmp_path, 0.02, 0.02, 0.02)
+    assert surface_gap(tray, pin, np.eye(4)) == pytest.approx(0.09)
+    assert surface_gap(tray, pin, at((0, 0, 0.1))) < 0
+
+
+def nearest(model: RobotModel, surfaces: SelfSurfaces, *postures: Float64, enough: float = 0.05) -> Float64:
+    q = np.array(postures)
+    return surfaces.gaps(q, model.sphere_centers_batch(q), enough).min(axis=1, initial=np.inf)
+
+
+def test_bounds_from_spheres_never_exceed_the_gap_of_the_surfaces(tmp_path: Path) -> None:
+    for scale in (1.0, 0.6):
+        model, surfaces = folding_arm(tmp_path, covering_spheres(scale))
+        postures = random_postures(model, 60, seed=3)
+        told = nearest(model, surfaces, *postures, enough=-np.inf)
+        exact = np.array([surfaces.gap(q, ("block", "drum")) for q in postures])
+        assert np.all(told <= np.maximum(exact, 0.0) + 1e-9)
+        np.testing.assert_array_equal(nearest(model, surfaces, *postures, enough=np.inf), exact)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.6, 0.6, 0.1])
+def test_spheres_that_stick_out_or_leave_much_uncovered_fool_nobody(tmp_path: Path, scale: float) -> None:
+    model, surfaces = folding_arm(tmp_path, covering_spheres(scale))
+    assert surfaces.pairs == (("block", "drum"),)
+    found = nearest(model, surfaces, OPEN, FOLDED, CROSSED)
+    assert found[0] == pytest.approx(GAP, abs=1e-4)
+    assert found[1] < -0.004 and found[2] < 0
+
+
+def test_a_body_without_spheres_is_judged_by_its_surface(tmp_path: Path) -> None:
+    model, surfaces = folding_arm(tmp_path, covering_spheres(parts=("block", "neck")))
+    assert nearest(model, surfaces, FOLDED)[0] < -0.004 < 0 < nearest(model, surfaces, OPEN)[0]
+
+
+def test_a_body_without_geometry_is_judged_by_its_spheres(tmp_path: Path) -> None:
+    bare = URDF[: URDF.index('<link name="drum">')] + '<link name="drum"/>' + URDF[URDF.index('<joint name="turn"') :]
+    model, surfaces = folding_arm(tmp_path, covering_spheres(), bare)
+    assert surfaces.pairs == () and set(surfaces.names) == {"block and drum"}
+    assert nearest(model, surfaces, FOLDED)[0] < 0 < nearest(model, surfaces, OPEN)[0]
+
+
+def test_pairs_of_an_srdf_or_that_no_posture_parts_are_not_judged(tmp_path: Path) -> None:
+    model, _ = folding_arm(tmp_path, covering_spheres())
+    solids = read_solids(model.urdf)
+    off = [DisabledPair(links=("drum", "block"), reason="Never")]
+    silent = SelfSurfaces(model, solids, off)
+    assert silent.pairs == silent.names == ()
+    assert nearest(model, silent, FOLDED)[0] == np.inf
+    low = URDF.replace('xyz="0 0 0.052"', 'xyz="0 0 0.02"')
+    assert folding_arm(tmp_path, covering_spheres(), low)[1].pairs == ()
+
+
+def test_the_gap_grows_with_the_scale_of_everything(tmp_path: Path) -> None:
+    gaps = []
+    for scale in (1.0, 2.0, 4.0):
+        a, b = (box(tmp_path, *(scale * np.array(size))) for size in ((0.2, 0.1, 0.1), (0.1, 0.3, 0.1)))
+        T = at(scale * np.array([0.3, 0.2, 0.1]), turned(np.random.default_rng(0)))
+        gaps.append(surface_gap(a, b, T))
+    assert all(after == pytest.approx(2 * before, rel=1e-9) for before, after in pairwise(gaps))
+
+
+def test_spheres_of_no_link_make_no_pair(tmp_path: Path) -> None:
+    none = SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
+    model, surfaces = folding_arm(tmp_path, none)
+    assert nearest(model, surfaces, FOLDED)[0] < 0
+
 
 MARGIN = 0.02
 FAR = Balls([[9.0, 9.0, 9.0]], [0.1])

@@ -13,8 +13,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import self_collision_pairs
 from splatctrl_cli.robot.sphere_files import read_sphere_file
 from tests.control.fakes import Balls
-from tests.robot.shapes import written
-from tests.robot.ur10e import flange, ur10e_urdf
+from tests.robot.shapes import flange, ur10e_urdf, written
 
 READY = np.array([0.0, -2.2, 1.9, -1.383, -1.57, 0.0])  # cuRobo's default posture
 

@@ -16,7 +16,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.environments import ENVIRONMENTS, Environment, drawn, ring_of_cameras
 from splatctrl_cli.simulate.primitives import signed_distance
 from splatctrl_cli.simulate.recording import RecordingOptions
-from tests.robot.folding_arm import covering_spheres, folding_arm
+from tests.robot.shapes import covering_spheres, folding_arm
 
 
 @pytest.fixture(scope="module")

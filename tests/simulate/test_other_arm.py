@@ -9,17 +9,16 @@ from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.simulated_arm import adapted_motion
 from splatctrl_cli.records import Float64, SphereSet
-from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_margins import SelfSurfaces
 from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.arm import hand_pose
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.recording import RecordingOptions, Scene
 from splatctrl_cli.simulate.render import Meshes, Renderer
-from tests.robot.shapes import arm_of, written
-from tests.robot.ur10e import JOINTS, ur10e_urdf
+from tests.robot.shapes import JOINTS, arm_of, ur10e_urdf, written
 
 TEXTURE = Texture(pattern="noise", feature=0.05, dark=(0.1, 0.2, 0.3), bright=(0.9, 0.8, 0.7), seed=3)
 

@@ -26,11 +26,16 @@ from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.records import Box, Float64, RecordSource
 from splatctrl_cli.robot.coverage import LinkCoverage, coverage_of_solids
-from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import DisabledPair, read_srdf, without_disabled
-from splatctrl_cli.robot.self_margins import KeptMargin, fixture_margins, kept_margins, with_kept_margins
+from splatctrl_cli.robot.self_margins import (
+    KeptMargin,
+    SelfSurfaces,
+    fixture_margins,
+    kept_margins,
+    with_kept_margins,
+)
 from splatctrl_cli.states.state_source import StateSource, open_states
 
 MAX_NOTES = 10  # printed

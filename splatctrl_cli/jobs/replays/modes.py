@@ -15,10 +15,9 @@ from splatctrl_cli.control.step import OURS, Commander
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replays.compare import QP_IK, compared, planned_ways_out
-from splatctrl_cli.jobs.replays.goal import goal_waypoints, twist_figures, twist_track
+from splatctrl_cli.jobs.replays.goal import commander_of, goal_waypoints, outside_run, twist_figures, twist_track
 from splatctrl_cli.jobs.replays.inputs import check_inside
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
-from splatctrl_cli.jobs.replays.outside import commander_of, outside_run
 from splatctrl_cli.jobs.replays.provenance import times_apart
 from splatctrl_cli.jobs.replays.request import FIRST_MAP, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay

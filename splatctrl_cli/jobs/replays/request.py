@@ -15,9 +15,8 @@ from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.declared_contact import Declarations
-from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_margins import KeptMargin
+from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces
 from splatctrl_cli.simulate.truth import Truth
 
 MODES = ("audit", "open-loop", "closed-loop")
