@@ -25,7 +25,7 @@ from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter, workspa
 from splatctrl_cli.scene.contact import count_carried
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
-from splatctrl_cli.scene.scale import RecordedDepth, fitted_to
+from splatctrl_cli.scene.scale import RecordedDepth, fitted_to, in_words
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import TimeStep, cloud_box, depth_box, time_steps
 from splatctrl_cli.scene_files.scene_folder import FORMAT
@@ -346,18 +346,13 @@ class Reconstruction:
             self._first_state_ns = record.stamp_ns
 
     def _fit_to(self, depth: RecordedDepth | None, console: Progress = SILENT) -> None:
-        """Choose the lengths of the map by the depth of the first frames; with a robot, whose reach is a table's, and
-        without any depth they stay as they are.
-        """
-        if depth is None or (self.config.scene.scale == 0 and self.robot is not None):
+        """Choose the map's lengths, or beside a robot its sensor's error, by the first frames that have depth."""
+        if depth is None:
             return
-        self.depth, self.config = depth, fitted_to(self.config, depth)
-        scene, occupancy = self.config.scene, self.config.occupancy
-        voxel, least, most = occupancy.voxel, occupancy.min_range, occupancy.max_range
-        console.log(
-            f"depth is {depth.median:.3g} m in the median, scale {scene.scale:.3g}: voxels of {voxel:.3g} m, splats"
-            f" up to {scene.max_radius:.3g} m, depth from {least:.3g} to {most:.3g} m"
-        )
+        self.depth, before = depth, self.config
+        self.config = fitted_to(before, depth, has_robot=self.robot is not None)
+        if self.config is not before:
+            console.log(in_words(self.config, depth))
 
     def _new_fitter(self, workspace: Box) -> SceneFitter:
         scene = self.config.scene if self.source.has_clock else self.config.scene.derived(fill=1.0)

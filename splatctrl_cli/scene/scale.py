@@ -7,8 +7,15 @@ from typing import TypeVar
 import numpy as np
 
 from splatctrl_cli.config import Config, OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import SCALE_DEPTH, SCALE_NEAREST
-from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.config.fixed import (
+    NOISE_BLOCKS,
+    NOISE_FEWEST,
+    NOISE_LEAST_SIDE,
+    NOISE_QUANTILE,
+    SCALE_DEPTH,
+    SCALE_NEAREST,
+)
+from splatctrl_cli.records import Float32, Float64, RgbdFrame
 
 Lengths = TypeVar("Lengths", SceneConfig, OccupancyConfig)
 
@@ -29,12 +36,13 @@ Lengths of the robot and its contacts are not among them.
 @dataclass(frozen=True, kw_only=True)
 class RecordedDepth:
     """How far away [m] what was recorded is: the median, a tenth is nearer than `nearest`, and `farthest` leaves out
-    stray pixels.
+    stray pixels. noise [1/m]: `depth_noise` of the noisiest camera, 0 where no camera tells.
     """
 
     median: float
     nearest: float
     farthest: float
+    noise: float = 0.0
 
     @classmethod
     def of(cls, frames: Sequence[RgbdFrame]) -> "RecordedDepth | None":
@@ -44,15 +52,50 @@ class RecordedDepth:
         if not len(depth):
             return None
         nearest, median, farthest = (float(q) for q in np.percentile(depth, [10.0, 50.0, 99.5]))
-        return cls(median=median, nearest=nearest, farthest=farthest)
+        cameras = sorted({frame.camera for frame in frames})
+        noise = max(depth_noise([f.depth for f in frames if f.camera == camera]) for camera in cameras)
+        return cls(median=median, nearest=nearest, farthest=farthest, noise=noise)
 
 
-def fitted_to(config: Config, depth: RecordedDepth) -> Config:
-    """`config` with what was left at its default multiplied by the scale of the recording.
+def depth_noise(images: Sequence[Float32]) -> float:
+    """Standard deviation [1/m] of the inverse depth of images (H, W) [m] of one camera; 0 where they do not tell.
 
-    The scale is `scene.scale`, or where that is 0 the median depth over that of a table at arm's length. Depth counts
-    from half the nearest at least, and to the farthest at least.
+    That of a depth z is this times z^2, as for sensors that measure disparity (Khoshelham and Elberink 2012: 1.425e-3
+    of a Kinect). The inverse depth of a plane is linear in the pixel: what a linear fit leaves of a block of pixels
+    is noise where the block lies on one surface, so that of many blocks one of the smallest is taken.
     """
+    left: list[Float64] = []
+    for depth in images:
+        side = _block_side(depth)
+        rows, columns = (size // side for size in depth.shape)
+        blocks = depth[: rows * side, : columns * side].reshape(rows, side, columns, side).swapaxes(1, 2)
+        pixels = blocks.reshape(-1, side * side)
+        inverse = 1.0 / pixels[(pixels > 0).all(axis=1)].astype(np.float64)
+        v, u = np.divmod(np.arange(side * side, dtype=np.float64), side)
+        linear = np.linalg.qr(np.stack([np.ones_like(u), u, v], axis=1))[0]
+        residual = inverse - inverse @ linear @ linear.T
+        left.append(np.sqrt(np.sum(residual**2, axis=1) / (side * side - 3)))
+    found = np.concatenate(left) if left else np.zeros(0)
+    return float(np.quantile(found, NOISE_QUANTILE)) if len(found) >= NOISE_FEWEST else 0.0
+
+
+def _block_side(depth: Float32) -> int:
+    """Pixels along the side of a block: a 27th of the image, 24 of 640, as noise of neighbouring pixels is alike."""
+    return int(max(depth.shape[1] // NOISE_BLOCKS, NOISE_LEAST_SIDE))
+
+
+def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) -> Config:
+    """`config` with what was left at its default as the recording has it; the same object where nothing changes.
+
+    Lengths are multiplied by `scene.scale`, or where that is 0 by the median depth over that of a table at arm's
+    length; depth counts from half the nearest at least, and to the farthest at least. Beside a robot the scale stays,
+    and the sensor's error is that of the recording where it is larger than the default.
+    """
+    least = OccupancyConfig().depth_error
+    if has_robot and depth.noise > least == config.occupancy.depth_error:
+        config = config.derived(occupancy=config.occupancy.derived(depth_error=depth.noise))
+    if has_robot and config.scene.scale == 0:
+        return config
     is_found = config.scene.scale == 0
     scale = depth.median / SCALE_DEPTH if is_found else config.scene.scale
     scene, occupancy = scaled(config.scene, scale), scaled(config.occupancy, scale)
@@ -66,6 +109,17 @@ def fitted_to(config: Config, depth: RecordedDepth) -> Config:
     if is_found and config.occupancy.max_range == OccupancyConfig().max_range:
         ranges["max_range"] = max(occupancy.max_range, depth.farthest)
     return config.derived(scene=scene.derived(**values), occupancy=occupancy.derived(**ranges))
+
+
+def in_words(config: Config, depth: RecordedDepth) -> str:
+    """What `fitted_to` chose."""
+    scene, occupancy = config.scene, config.occupancy
+    if scene.scale == 0:
+        return f"depth is noisier than usual: {1e3 * occupancy.depth_error:.2g} mm at 1 m, growing with its square"
+    return (
+        f"depth is {depth.median:.3g} m in the median, scale {scene.scale:.3g}: voxels of {occupancy.voxel:.3g} m, "
+        f"splats up to {scene.max_radius:.3g} m, depth from {occupancy.min_range:.3g} to {occupancy.max_range:.3g} m"
+    )
 
 
 def scaled(section: Lengths, scale: float) -> Lengths:

@@ -8,12 +8,12 @@ import pytest
 
 from splatctrl_cli.config import Config, OccupancyConfig, SceneConfig
 from splatctrl_cli.kernels.raster import LossTerms, OptimiserSettings
-from splatctrl_cli.records import Box, RgbdFrame, SplatSet
+from splatctrl_cli.records import Box, Float32, RgbdFrame, SplatSet
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.keyframes import View
 from splatctrl_cli.scene.render import render
-from splatctrl_cli.scene.scale import RecordedDepth, fitted_to
+from splatctrl_cli.scene.scale import RecordedDepth, depth_noise, fitted_to, in_words
 from tests.scene.wall import INTRINSICS, WORKSPACE, frame, looking_down
 
 CONFIG = Config(scene=SceneConfig(max_splats=800, first_iterations=10))
@@ -71,6 +71,41 @@ def test_lengths_grow_with_the_depth_and_what_is_set_stays() -> None:
 def test_what_a_camera_carries_stays_too_near_beside_a_near_scene() -> None:
     made = fitted_to(Config(), RecordedDepth(median=0.5, nearest=0.1, farthest=0.8))
     assert made.occupancy.min_range == OccupancyConfig().min_range
+
+
+def slanted(noise: float, seed: int = 0) -> Float32:
+    """Depth (240, 320) of a floor seen from the side, with a box on it; noise [1/m]."""
+    v, u = np.mgrid[0:240, 0:320]
+    inverse = 0.6 + 0.9 * v / 240 + 0.2 * u / 320
+    inverse[60:160, 100:220] = 1.4
+    return (1 / (inverse + np.random.default_rng(seed).normal(0, noise, inverse.shape))).astype(np.float32)
+
+
+@pytest.mark.parametrize("noise", [0.0005, 0.0015, 0.006])
+def test_the_noise_of_depth_is_found_on_slanted_surfaces_and_beside_edges(noise: float) -> None:
+    assert depth_noise([slanted(noise)]) == pytest.approx(noise, rel=0.15)
+    assert depth_noise([slanted(noise, seed) for seed in range(3)]) == pytest.approx(noise, rel=0.15)
+
+
+def test_depth_with_holes_everywhere_says_nothing_of_its_noise() -> None:
+    depth = slanted(0.01)
+    depth[::5, ::5] = 0
+    assert depth_noise([depth]) == 0.0 == depth_noise([])
+
+
+def test_beside_a_robot_the_sensors_error_alone_follows_from_the_recording() -> None:
+    noisy = replace(ROOM, noise=0.004)
+    made = fitted_to(Config(), noisy, has_robot=True)
+    assert made.occupancy == OccupancyConfig(depth_error=0.004) and made.scene == SceneConfig()
+    assert "4 mm at 1 m" in in_words(made, noisy)
+    for given, depth in ((Config(), ROOM), (Config(occupancy=OccupancyConfig(depth_error=0.003)), noisy)):
+        assert fitted_to(given, depth, has_robot=True) is given
+
+
+def test_of_several_cameras_the_noisiest_counts() -> None:
+    frames = [replace(frame(0, camera=name), depth=slanted(noise)) for name, noise in (("a", 0.001), ("b", 0.004))]
+    depth = RecordedDepth.of(frames)
+    assert depth is not None and depth.noise == pytest.approx(0.004, rel=0.15)
 
 
 def test_a_scale_of_one_is_the_papers() -> None:
