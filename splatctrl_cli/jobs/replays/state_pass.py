@@ -21,9 +21,8 @@ from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene
 from splatctrl_cli.jobs.replays.state_store import BLOCK, Figures, StoredAudit, StoredObjects
 from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
-from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_margins import KeptMargin, sphere_gaps
+from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_gaps
 
 
 class ReplayRecord:
