@@ -7,6 +7,7 @@ and runs one node at a time, told by lines of JSON on its stdin. When stdin ends
 import contextlib
 import ctypes
 import importlib
+import itertools
 import json
 import os
 import select
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from splatctrl_cli.files.output import partial_path, remove, write_durably
+from splatctrl_cli.kernels.cuda.driver import num_cards
 
 Entry = Callable[[list[str]], int]
 
@@ -35,6 +37,8 @@ PART = ".part"  # ends the name of a result that is not whole
 _LAST = 4096  # bytes of a log that are looked at for its last lines
 _local = threading.local()  # a runner for each thread that has run a task
 _runners: list["subprocess.Popen[str]"] = []
+_numbers = itertools.count()  # of the runners
+VISIBLE, CARD = "CUDA_VISIBLE_DEVICES", "SPLATCTRL_CARD_OF_RUNNER"  # a runner's card, where there are several
 BY_THE_BATCH = ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY")  # what a batch tells of, and its nodes do not
 WROTE = (0, 1, 3, 5)  # exit codes of a command that left its output
 
@@ -154,6 +158,8 @@ def _started(entry: str) -> "subprocess.Popen[str]":
     words = [sys.executable, "-m", __name__, entry]
     told = {name: value for name, value in os.environ.items() if name not in BY_THE_BATCH}
     environment = {**told, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    if VISIBLE not in environment and (cards := num_cards()) > 1:
+        environment[CARD] = str(next(_numbers) % cards)
     pipe = subprocess.PIPE
     runner = subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, start_new_session=True, env=environment)
     _runners.append(runner)
@@ -229,6 +235,8 @@ def _be_child(function: Entry, task: Task) -> NoReturn:
         has_begun = bool(task.out) and partial_path(Path(task.out)).exists()
         words = [word for word in task.words if has_begun or word != RESUME]
         sys.argv = ["splatctrl", *words]
+        if CARD in os.environ and not any(word.startswith("cuda:") for word in words):
+            os.environ[VISIBLE] = os.environ[CARD]
         code = function(words)
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else 70

@@ -10,7 +10,7 @@ from typing import Any
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 
 LIBRARY = "libcuda.so.1"
-VERSION_FILE = Path("/proc/driver/nvidia/version")
+VERSION_FILE, CARDS = Path("/proc/driver/nvidia/version"), Path("/proc/driver/nvidia/gpus")
 OLDEST = (7, 5)  # compute capability
 OLDEST_CUDA = (13, 0)  # of the driver: an older one does not load what NVRTC 13 compiles
 OLDEST_DRIVER = 580  # the first for it
@@ -25,6 +25,13 @@ class Card:
     name: str
     capability: tuple[int, int]
     driver: str
+
+
+def num_cards() -> int:
+    """Cards that the driver has on file; none is woken, so that a process may still fork."""
+    with suppress(OSError):
+        return len([*CARDS.iterdir()])
+    return 0
 
 
 def usable_card(index: int = 0) -> Card:

@@ -22,6 +22,10 @@ def main(words: list[str]) -> int:
                     stream.write(f"{os.getpid()}\n")
             case "words":  # FILE: what comes after it
                 Path(words.pop(0)).write_text(" ".join(words))
+            case "card":  # FILE: the card that is seen; what else is a word to it
+                Path(words.pop(0)).write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "any"))
+            case "cuda:1" | "cuda":
+                pass
             case "sleep":
                 time.sleep(float(words.pop(0)))
             case "allocate":  # MB

@@ -16,6 +16,7 @@ from splatctrl_cli.jobs.batches.batch import verdict_of_runs
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run
 from splatctrl_cli.jobs.batches.run import DONE, ERROR, FAILED, SKIPPED, Clock, Scheduler, local_executor
 from splatctrl_cli.jobs.batches.task import End, Task, run_task, stop_runners
+from splatctrl_cli.kernels.cuda import driver
 from tests.jobs.bakes import Said
 from tests.jobs.batches.desk import ENTRY, batch_of, node, states
 
@@ -204,6 +205,25 @@ def test_a_runner_that_is_killed_is_replaced(tmp_path: Path) -> None:
     runs = batch_of(tmp_path, nodes, workers=1)
     assert states(runs) == {"a/job": ERROR, "b/job": DONE}
     assert runs["a/job"].cause == "its runner was killed twice"
+
+
+@pytest.mark.parametrize(("cards", "given", "seen"), [(2, None, {"0", "1"}), (1, None, {"any"}), (2, "5", {"5"})])
+def test_each_worker_has_a_card_of_its_own_where_there_are_several(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cards: int, given: str | None, seen: set[str]
+) -> None:
+    monkeypatch.setattr(driver, "CARDS", tmp_path / "gpus")
+    for k in range(cards):
+        (tmp_path / f"gpus/0000:0{k}:00.0").mkdir(parents=True)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if given is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", given)
+    stop_runners()
+    files = {name: tmp_path / f"{name}.txt" for name in "abc"}
+    nodes = [node(tmp_path, f"{name}/job", "card", str(files[name]), "cuda", "sleep", "0.5") for name in "ab"]
+    nodes.append(node(tmp_path, "c/job", "card", str(files["c"]), "cuda:1", needs=["a/job"]))
+    batch_of(tmp_path, nodes)
+    assert {files[name].read_text() for name in "ab"} == seen
+    assert files["c"].read_text() == (given or "any")  # a card that is named is one of all
 
 
 def test_a_runner_that_was_stopped_is_not_replaced(tmp_path: Path) -> None:

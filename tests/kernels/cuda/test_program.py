@@ -5,8 +5,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("cuda.core", reason="needs the extra [cuda]")
-
 from splatctrl_cli.kernels.cuda import program
 from splatctrl_cli.kernels.cuda.memory import FIELD, FIT
 
