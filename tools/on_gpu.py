@@ -173,12 +173,15 @@ def inner(part: str) -> list[str]:
 
 
 def sanitized() -> list[str]:
-    """A row for each tool of compute-sanitizer, on a few iterations of a small map."""
-    rows = ["| compute-sanitizer | result |", "|---|---|"]
+    """A row for each tool of compute-sanitizer: a few iterations of a small map, and every kernel of the fields."""
+    rows = ["| compute-sanitizer | of | result | in kernels |", "|---|---|---|---|"]
+    programs = {"the fit": inner("small"), "fields": [sys.executable, "-m", "tools.on_gpu_fields", "--small"]}
     for tool in ("memcheck", "racecheck", "initcheck", "synccheck"):
-        code, out = shell("compute-sanitizer", "--tool", tool, "--error-exitcode", "9", *inner("small"))
-        summary = [line.strip("= ") for line in out.splitlines() if "SUMMARY" in line]
-        rows.append(f"| {tool} | {'; '.join(summary) or out[-200:]} (exit {code}) |")
+        for name, program in programs.items():
+            code, out = shell("compute-sanitizer", "--tool", tool, "--error-exitcode", "9", *program)
+            summary = [line.strip("= ") for line in out.splitlines() if "SUMMARY" in line]
+            faults = sum(" at " in line and "+0x" in line for line in out.splitlines() if "Saved host" not in line)
+            rows.append(f"| {tool} | {name} | {'; '.join(summary) or out[-200:]} (exit {code}) | {faults} |")
     return rows
 
 

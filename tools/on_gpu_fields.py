@@ -7,6 +7,9 @@ import argparse
 import hashlib
 import os
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,6 +26,7 @@ from splatctrl_cli.kernels.cuda.card import CudaDevice
 from splatctrl_cli.kernels.cuda.field import Answers
 from splatctrl_cli.kernels.cuda.memory import FIELD
 from splatctrl_cli.records import Box, Float64
+from splatctrl_cli.splat_files.splats import write_ply
 
 COUNTS = (5_000, 50_000)
 CELLS, VOXEL = 256, 0.01
@@ -30,6 +34,7 @@ POINTS, STATES, SPHERES = 100_000, 20_544, 64
 CHANNELS = ("sdf", "bound", "gradient")
 DISTANCES = ("hard", "safe", "safe_gpdf")
 ROUNDS = 5
+PATH = os.pathsep.join([str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH", "")])
 
 
 def main() -> None:
@@ -41,10 +46,13 @@ def main() -> None:
     device = CudaDevice(source=FIELD)
     if given.small:
         return small(device)
-    lines = [f"{device.name}, {os.cpu_count()} cores beside it", "", *grids(device), "", *points(device)]
-    print("\n".join(lines), flush=True)
-    if given.out:
-        given.out.write_text("\n".join(lines) + "\n")
+    lines = [f"{device.name}, {os.cpu_count()} cores beside it"]
+    for part in (commands, lambda: grids(device), lambda: points(device)):
+        rows = part()
+        print("\n".join(["", *rows]), flush=True)
+        lines += ["", *rows]
+        if given.out:
+            given.out.write_text("\n".join(lines) + "\n")
 
 
 def layout(cells: int = CELLS, voxel: float = VOXEL) -> GridLayout:
@@ -56,6 +64,50 @@ def layout(cells: int = CELLS, voxel: float = VOXEL) -> GridLayout:
 def baker(count: int, distance: str, device: CudaDevice | None, cells: int = CELLS) -> Baker:
     config = FieldConfig(voxel=VOXEL, distance=distance)
     return Baker(surface_splats(count), layout(cells), config, channels=CHANNELS, device=device)
+
+
+def commands() -> list[str]:
+    """Rows for whole commands, each of a new process, the card twice: seconds, whether its bytes agree."""
+    rows = [
+        "Whole commands [s].",
+        "",
+        "| command | splats | cpu | cuda | auto takes | bytes of two |",
+        "|---|---|---|---|---|---|",
+    ]
+    lower, upper = layout().box.lower, layout().box.upper
+    bake = ["sdf-bake", "--box=" + ",".join(map(str, (*lower, *upper))), "--voxel", str(VOXEL), "--formats", "npz"]
+    asked = {
+        f"sdf-bake {CELLS}^3 safe": (5_000, [*bake, "--no-report"], "S.ply"),
+        f"sdf-bake {CELLS}^3 safe_gpdf": (50_000, [*bake, "--no-report", "--distance", "safe_gpdf"], "S.ply"),
+        "query of 100,000 points": (5_000, ["query"], "S.ply 100000.csv"),
+        "query of 1,000,000 points": (50_000, ["query"], "S.ply 1000000.csv"),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        for num in (100_000, 1_000_000):
+            np.savetxt(Path(folder) / f"{num}.csv", arms(num), fmt="%.6f", delimiter=",")
+        for what, (count, begins, files) in asked.items():
+            write_ply(Path(folder) / "S.ply", surface_splats(count), {})
+            words = [*begins, *files.split()]
+            made = {name: command(folder, words, name) for name in ("cpu", "cuda", "cuda:0", "auto")}
+            took = made["auto"][1].partition("computes on ")[2].partition(" ")[0].strip(":\n") or "-"
+            same = "equal" if made["cuda"][2] == made["cuda:0"][2] else "DIFFERENT"
+            cuda = f"{made['cuda'][0]:.1f}, {made['cuda:0'][0]:.1f}"
+            rows.append(f"| {what} | {count} | {made['cpu'][0]:.1f} | {cuda} | {took} | {same} |")
+    return rows
+
+
+def command(folder: str, words: Sequence[str], device: str) -> tuple[float, str, str]:
+    """Seconds of a command, what it says, and the digest of its answer."""
+    whole = [sys.executable, "-m", "splatctrl_cli", *words, "-o", "answer", "--force", "--device", device]
+    begin = time.perf_counter()
+    done = subprocess.run(
+        whole, cwd=folder, env={**os.environ, "PYTHONPATH": PATH}, capture_output=True, text=True, check=False
+    )
+    seconds, answer = time.perf_counter() - begin, Path(folder) / "answer"
+    if done.returncode:
+        return seconds, done.stderr[-300:], f"exit {done.returncode}: {done.stderr[-300:]}"
+    file = answer / "field.npz" if answer.is_dir() else answer
+    return seconds, done.stderr, hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def seconds_of(task: Callable[[], object], rounds: int = ROUNDS) -> float:
