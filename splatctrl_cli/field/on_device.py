@@ -52,7 +52,7 @@ class OnDevice:
         return self.spheres.points.source[found.entry]
 
     def _asked(self, points: Float64, *wanted: str) -> Answers:
-        return self.field.query(self.spheres.points.relative(checked_points(points)), wanted)
+        return self.field.query(checked_points(points), self.spheres.points.anchor, wanted)
 
     def close(self) -> None:
         """Give the device's memory back."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.kernels.cuda.memory import FIELD, Array, Launch, Memory
-from splatctrl_cli.kernels.field import LANES, Clusters, Float32, GridSpan, Int32, LogSumExp, Offsets
+from splatctrl_cli.kernels.field import LANES, Clusters, Float32, Float64, GridSpan, Int32, LogSumExp, Offsets
 
 # As field.h and field_query.cuh lay them out.
 CLUSTERS = np.dtype([("counts", "i4", 2), ("centers", "u8", 3), ("boxes", "u8", 6)], align=True)
@@ -18,7 +18,8 @@ GRID = np.dtype(
 )
 TASK = np.dtype(
     [("spheres", CLUSTERS), ("offsets", "u8", 2), ("exact", "u8"), ("radius", "u8"), ("sign", "u8"),
-     ("numbers", "f4", 4), ("grid", GRID), ("points", "u8"), ("num_points", "i4"), ("out", "u8", 3)],
+     ("numbers", "f4", 4), ("grid", GRID), ("anchor", "f8", 3), ("points", "u8"), ("num_points", "i4"),
+     ("out", "u8", 3)],
     align=True,
 )  # fmt: skip
 CHOICE = np.dtype(
@@ -102,9 +103,10 @@ class DeviceField:
         num_warps = int(np.prod([-(-n // SUB_BLOCK) for n in shape]))
         return self._answered("bake", {"grid": grid}, shape, num_warps, wanted, margin)
 
-    def query(self, points: Float32, wanted: Collection[str] = ("gradient",)) -> Answers:
-        """At points (Q, 3) relative to the spheres' anchor, Q > 0."""
-        asked = {"points": self._put("points", points), "num_points": len(points)}
+    def query(self, points: Float64, anchor: Float64, wanted: Collection[str] = ("gradient",)) -> Answers:
+        """At points (Q, 3), Q > 0, in the frame that the spheres' anchor (3,) is in."""
+        address = self._put("points", points)
+        asked: dict[str, Array | int] = {"points": address, "num_points": len(points), "anchor": anchor}
         return self._answered("query", asked, (len(points),), len(points), wanted, 0.0)
 
     def _answered(

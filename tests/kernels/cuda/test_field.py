@@ -159,7 +159,7 @@ def test_points_are_answered_as_by_the_processor(num: int, device: Memory) -> No
     of, config = spheres(num), replace(EXACT, truncation=1e-7)
     points = np.concatenate([queries(200), 3.0 * queries(40, seed=2), cloud(num)[0][:4]])
     field = device_field(device, of, config)
-    found = field.query(of.points.relative(points), ALL)
+    found = field.query(points, of.points.anchor, ALL)
     hard, _ = SphereField.over(of).query(points)
     np.testing.assert_allclose(found.hard, hard, rtol=1e-5, atol=1e-6)
     nearest = SphereField.over(of).nearest(points)
@@ -169,7 +169,7 @@ def test_points_are_answered_as_by_the_processor(num: int, device: Memory) -> No
         raw, raw_slope = kind.over(of, config).query_raw(points)
         raw[np.isnan(raw)] = hard[np.isnan(raw)]
         np.testing.assert_allclose(found.kernels[name], raw, rtol=1e-5, atol=2e-6)
-        single = device_field(device, of, config, (name,), is_single=True).query(of.points.relative(points))
+        single = device_field(device, of, config, (name,), is_single=True).query(points, of.points.anchor)
         clear = np.abs(raw - hard) > 1e-5
         assert single.gradient is not None
         assert away(single.gradient[clear], raw_slope[clear]) < 3e-4
@@ -201,11 +201,11 @@ def test_planes_in_parts_have_the_bytes_of_the_whole(device: Memory) -> None:
 
 def test_the_order_of_threads_changes_no_byte() -> None:
     of = spheres(5000)
-    points = of.points.relative(queries(50))
+    points = queries(50)
     answers = []
     for backwards in (False, True):
         field = device_field(EmulatedDevice(backwards=backwards), of)
-        answers += [(field.bake(span_of(of, NEAR, 0.03)[0], ALL), field.query(points, ALL))]
+        answers += [(field.bake(span_of(of, NEAR, 0.03)[0], ALL), field.query(points, of.points.anchor, ALL))]
     for one, other in zip(*answers, strict=True):
         for name in ("hard", "distance", "gradient", "entry"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -216,8 +216,8 @@ def test_memory_is_given_back() -> None:
     memory = EmulatedDevice()
     of = spheres()
     field = device_field(memory, of)
-    field.query(of.points.relative(queries(10)))
-    field.query(of.points.relative(queries(30)))
+    field.query(queries(10), of.points.anchor)
+    field.query(queries(30), of.points.anchor)
     field.close()
     assert not memory.held
 

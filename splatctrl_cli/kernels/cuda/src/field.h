@@ -15,8 +15,8 @@ namespace splatctrl {
 constexpr int kWarp = 32, kWarps = 4;  // lanes of a warp, warps of a block
 constexpr float kLog2e = 1.44269504f;
 
-// One field, and what is asked of it. At points: (Q, 3) relative to the spheres' anchor, answers (Q) and (Q, 3). On a
-// grid the answers are (X, Y, Z) and (X, Y, Z, 3) of the span. What is not wanted is null.
+// One field, and what is asked of it. At points: (Q, 3) in the frame that the spheres' anchor is in, answers (Q) and
+// (Q, 3). On a grid the answers are (X, Y, Z) and (X, Y, Z, 3) of the span. What is not wanted is null.
 struct FieldTask {
   Clusters spheres;
   Offsets offsets;      // radii, or o or b of the scores: for the kernel fields they only cull
@@ -27,7 +27,8 @@ struct FieldTask {
   float largest_radius;     // a mean radius beyond it has no distance
   float log_count;          // of the entries
   GridSpan grid;
-  const float* points;
+  double anchor[3];
+  const double* points;
   int num_points;
   float *distance, *gradient;
   std::int32_t* entry;

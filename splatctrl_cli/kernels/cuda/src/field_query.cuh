@@ -6,7 +6,9 @@
 namespace splatctrl {
 
 __device__ inline Point point_of(const FieldTask& task, int q) {
-  return {task.points[3 * q], task.points[3 * q + 1], task.points[3 * q + 2]};
+  const double* x = task.points + 3 * static_cast<long>(q);
+  return {static_cast<float>(x[0] - task.anchor[0]), static_cast<float>(x[1] - task.anchor[1]),
+          static_cast<float>(x[2] - task.anchor[2])};
 }
 
 extern "C" __global__ __launch_bounds__(kWarp* kWarps) void query_hard(const FieldTask* given) {
