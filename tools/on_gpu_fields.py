@@ -42,12 +42,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     parser.add_argument("-o", "--out", type=Path, help="Markdown")
     parser.add_argument("--small", action="store_true", help="little of it, once: for compute-sanitizer")
+    parser.add_argument("--only", choices=("commands", "grids", "points"))
     given = parser.parse_args()
     device = CudaDevice(source=FIELD)
     if given.small:
         return small(device)
     lines = [f"{device.name}, {os.cpu_count()} cores beside it"]
-    for part in (commands, lambda: grids(device), lambda: points(device)):
+    parts: dict[str, Callable[[], list[str]]] = {
+        "commands": commands,
+        "grids": lambda: grids(device),
+        "points": lambda: points(device),
+    }
+    for name, part in parts.items():
+        if given.only not in (None, name):
+            continue
         rows = part()
         print("\n".join(["", *rows]), flush=True)
         lines += ["", *rows]
