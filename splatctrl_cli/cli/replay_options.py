@@ -8,6 +8,7 @@ from splatctrl_cli.cli.options import (
     POSE,
     add_config,
     add_declare,
+    add_device,
     add_disagreement,
     add_gates,
     add_lock,
@@ -40,6 +41,7 @@ def replay_options(add: Options, parser: Parser) -> None:
     add("--truth FILE", "truth.json of a simulated log", Path)
     add_output(add, "folder to write", default="replay")
     add_config(add, parser)
+    add_device(parser)
     add_gates(add)
     add_source(add)
     _add_robot(add.group("robot"))

@@ -13,6 +13,7 @@ from splatctrl_cli.control.audit import Observed
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import Stopwatch, write_run
+from splatctrl_cli.jobs.device import CUDA, TO_CPU, FitDevice
 from splatctrl_cli.jobs.open_recording import check_pose_jumps
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstruction import Reconstruction, ReconstructRequest
@@ -46,6 +47,8 @@ def check_lockstep(request: ReplayRequest) -> None:
         raise UsageError("--latency: a baked field is one scene for all times", remedy="give --scene or --lockstep")
     if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != POSE_JUMP):
         raise UsageError("--allow-disagreement, --max-pose-jump: expected --lockstep", remedy="leave them out")
+    if not request.lockstep and request.device.startswith(CUDA):
+        raise UsageError(f"--device {request.device}: expected --lockstep: only a fit is worth a card", remedy=TO_CPU)
 
 
 def opened_scene(
@@ -108,7 +111,13 @@ def from_log(
         allow_disagreement=request.allow_disagreement,
     )
     fitted = Reconstruction(
-        asked, model, place, identity={"command": "replay --lockstep"}, declared=declared, observe=observe
+        asked,
+        model,
+        place,
+        identity={"command": "replay --lockstep"},
+        declared=declared,
+        observe=observe,
+        device=FitDevice(request.device),
     )
     lockstep = Lockstep(
         fitted,
@@ -189,7 +198,7 @@ class Lockstep:
     def _take(self) -> None:
         step, fitted = self._next, self._fitted
         assert step is not None
-        with self._stopwatch.stage("fit"):
+        with self._stopwatch.stage("fit"), fitted.device.told_how_to_go_on(Path()):
             fitted.take(step, self._console)
         with self._stopwatch.stage("read"):
             self._next = next(self._steps, None)
@@ -235,6 +244,7 @@ class Lockstep:
             stopwatch=self._stopwatch,
             seed=fitted.request.seed,
         )
+        fitted.device.close()
         num, seconds = len(fitted.rows), self._stopwatch.seconds["fit"]
         self._console.log(f"lockstep: {num} frame sets, {seconds / num:.3g} s each; their maps are in {FOLDER}/")
 

@@ -28,9 +28,9 @@ class ReplayRequest:
     """One replay: the options of ``splatctrl replay``, by their names.
 
     log: a log or capture with joint states, read as `options` say. urdf: the robot, None for the one that the log
-    describes itself. One of `scene` (a reconstruction), `field` (a
-    baked grid) and `lockstep` (reconstruct the log on the way) says what is known of the scene. base: pose of the
-    URDF's root in world, x, y, z, qx, qy, qz, qw; locked: values [rad or m] of joints that no log moves. Times in
+    describes itself. One of `scene` (a reconstruction), `field` (a baked grid) and `lockstep` (reconstruct the log on
+    the way, on `device`) says what is known of the scene. base: pose of the URDF's root in world, x, y, z, qx, qy,
+    qz, qw; locked: values [rad or m] of joints that no log moves. Times in
     seconds; start_time may be FIRST_MAP. evidence: a camera, or every how many frame sets, that did not train the
     scene and bounds its error; with require_evidence no verdict passes without. controller: a user's own class,
     ``module:Class``, or controller_command: a program (docs/controllers.md). report_only: the verdict alone does
@@ -45,6 +45,7 @@ class ReplayRequest:
     scene: Path | None = None
     field: Path | None = None
     lockstep: bool = False
+    device: str = "auto"
     latency: float = 0.0
     allow_disagreement: bool = False
     max_pose_jump: float = POSE_JUMP
