@@ -14,16 +14,18 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.raw_log import Damage, RawMessage
-from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.jobs import replay as job
 from splatctrl_cli.jobs.progress import SILENT
 from splatctrl_cli.jobs.replays import known_scene
 from splatctrl_cli.jobs.replays.known_scene import KnownFields, from_splats
-from splatctrl_cli.jobs.replays.lockstep import from_log
+from splatctrl_cli.jobs.replays.lockstep import check_lockstep, from_log
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene
+from tests.jobs.test_device import cards, run_of
+from tests.kernels.cuda.emulator import EmulatedDevice
 
 SETTINGS = ["scene.max_splats=600", "scene.first_iterations=15", "scene.iterations_per_step=3"]
 pytestmark = pytest.mark.usefixtures("coverage_once", "without_plots")
@@ -134,13 +136,29 @@ def test_the_clock_is_estimated_from_every_frame_also_where_the_arm_stops_before
     assert all(found == stamps[0] for found in stamps) and {len(s) for s in stamps[0].values()} == {5}
 
 
-def opened(recording: Path, folder: Path, arm: RobotModel, *, latency: float) -> known_scene.KnownScene:
+def test_the_fit_of_a_lockstep_computes_where_it_is_told_to(
+    recording: Path, tmp_path: Path, arm: RobotModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = EmulatedDevice()
+    cards(monkeypatch, memory)
+    scene = opened(recording, tmp_path, arm, latency=0.0, device="cuda")
+    scene.finish()
+    assert [each["device"] for each in run_of(tmp_path / "scene")["metrics"]["devices"]] == ["cuda:0"]
+    assert not memory.sizes  # given back
+    with pytest.raises(UsageError, match="--device cuda: expected --lockstep"):
+        check_lockstep(ReplayRequest(log=recording, out=tmp_path, scene=tmp_path, device="cuda"))
+
+
+def opened(
+    recording: Path, folder: Path, arm: RobotModel, *, latency: float, device: str = "auto"
+) -> known_scene.KnownScene:
     request = ReplayRequest(
         log=recording / "log.mcap",
         urdf=recording / "robot.urdf",
         out=folder,
         options=SourceOptions(cameras=("cam0", "cam1")),
         lockstep=True,
+        device=device,
         latency=latency,
         mode="closed-loop",
         threads=1,
