@@ -29,6 +29,7 @@ from splatctrl_cli.scene.posture import RobotPosture, posture_of
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask, self_mask_metrics
 from splatctrl_cli.voxels import Balls, OccupancyGrid, VoxelState
 
+TSDF_BLOCKS = 20_000  # of 8 voxels along each edge, to begin with
 TSDF_VOXEL, TSDF_BAND = 0.01, 0.04  # [m] edge of a voxel, and how far from a surface the TSDF reaches
 UNSEEN_NEAR = 0.08  # [m] about the arm at its start, which it hides, and at the goal, which it is given
 START_GAP = 2e-3  # [m] that an obstacle of the map is from the arm at its start, or it is the arm's own
@@ -166,33 +167,34 @@ def tsdf_map(problem: Problem, views: Views, config: Config) -> Map:
     extra.
     """
     o3d = of_extra("open3d", "open3d", "a TSDF")
-    volume = o3d.pipelines.integration.ScalableTSDFVolume(
-        voxel_length=TSDF_VOXEL,
-        sdf_trunc=TSDF_BAND,
-        color_type=o3d.pipelines.integration.TSDFVolumeColorType.NoColor,
+    tensor, far, band = o3d.core.Tensor, config.occupancy.max_range, TSDF_BAND / TSDF_VOXEL
+    volume = o3d.t.geometry.VoxelBlockGrid(
+        attr_names=("tsdf", "weight"),
+        attr_dtypes=(o3d.core.float32, o3d.core.float32),
+        attr_channels=((1), (1)),
+        voxel_size=TSDF_VOXEL,
+        block_resolution=8,
+        block_count=TSDF_BLOCKS,
     )
     for frame in without_robot(problem, views, config):
         k = frame.intrinsics
-        pinhole = o3d.camera.PinholeCameraIntrinsic(k.width, k.height, k.fx, k.fy, k.cx, k.cy)
-        image = o3d.geometry.RGBDImage.create_from_color_and_depth(
-            o3d.geometry.Image(np.ascontiguousarray(frame.color)),
-            o3d.geometry.Image(np.ascontiguousarray(frame.depth, np.float32)),
-            depth_scale=1.0,
-            depth_trunc=config.occupancy.max_range,
-            convert_rgb_to_intensity=False,
-        )
-        volume.integrate(image, pinhole, np.linalg.inv(frame.T_world_camera))
+        pinhole = tensor(np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]]))
+        pose = tensor(np.linalg.inv(frame.T_world_camera))
+        depth = o3d.t.geometry.Image(tensor(np.ascontiguousarray(frame.depth[..., None], np.float32)))
+        blocks = volume.compute_unique_block_coordinates(depth, pinhole, pose, 1.0, far, band)
+        volume.integrate(blocks, depth, pinhole, pose, 1.0, far, band)
     mesh = volume.extract_triangle_mesh()
-    if not len(mesh.triangles):
+    num_triangles = len(mesh.triangle.indices) if "indices" in mesh.triangle else 0
+    if not num_triangles:
         raise NotEvaluableError("TSDF: no surface was found")
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+    scene.add_triangles(mesh)
 
     def distance(points: Float64) -> Float64:
-        asked = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))
+        asked = tensor(np.ascontiguousarray(points, np.float32))
         return np.asarray(scene.compute_distance(asked).numpy(), np.float64) - ROUNDING
 
-    return Map(scene=Asked(distance=distance), num_parts=len(mesh.triangles))
+    return Map(scene=Asked(distance=distance), num_parts=num_triangles)
 
 
 def without_robot(problem: Problem, views: Views, config: Config) -> list[RgbdFrame]:
