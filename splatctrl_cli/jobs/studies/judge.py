@@ -38,13 +38,15 @@ HIT_SEEN, HIT_UNSEEN = "collision with seen surface", "collision with unseen sur
 HIT_SELF = "collision with itself"
 GOAL_MISSED, STALLED, NOT_EVALUABLE = "goal missed", "stalled before the goal", "not evaluable"
 CAUSES = (NO_PLAN, START_BLOCKED, GOAL_BLOCKED, HIT_SEEN, HIT_UNSEEN, HIT_SELF, GOAL_MISSED, STALLED, NOT_EVALUABLE)
+NO_PAIRS = np.empty((0, 2), np.int64)
 REQUEST = ReplayRequest(log=Path("trial"), out=Path("trial"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Execution:
     """A motion against the truth. cause: of `CAUSES`, empty for a success by the paper's rule; clearance [m]: the
-    least true one on the whole way, negative in collision; position_error [m], rotation_error [rad] at its end.
+    least true one of the arm to things on the whole way, at most 0 in collision with one; position_error [m],
+    rotation_error [rad] at its end.
     """
 
     cause: str
@@ -69,10 +71,11 @@ def against_truth(problem: Problem, position: Float64, views: Views) -> Executio
     is_free = check_edges(room, position[:-1], position[1:], contact=TOUCH).is_free
     if not is_free.all():
         cause = _what_is_hit(problem, room, position, views)
-    clearance = least_clearance(room, position, tolerance=5e-4)
+    alone = Clearance.of(problem.model.with_self_pairs(NO_PAIRS), problem.solids)
+    clearance = least_clearance(alone, position, tolerance=5e-4)
     return Execution(
         cause=cause,
-        clearance=clearance.upper if is_free.all() else min(clearance.upper, 0.0),
+        clearance=min(clearance.upper, 0.0) if cause in (HIT_SEEN, HIT_UNSEEN) else clearance.upper,
         position_error=moved,
         rotation_error=turned,
     )
