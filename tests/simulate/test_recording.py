@@ -1,6 +1,7 @@
 """The recording: images that agree with the truth, noise as stated, motion within limits, truth that reads back."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -301,3 +302,15 @@ def test_fewer_rays_change_colours_alone(exact: Recording) -> None:
     np.testing.assert_array_equal(few.image(moving)[1], many.image(moving)[1])
     np.testing.assert_array_equal(few.depth(moving), many.image(moving)[1])
     assert 0 < np.abs(few.image(moving)[0].astype(float) - many.image(moving)[0]).mean() < 10
+
+
+def test_what_the_second_imager_does_not_see_has_no_depth() -> None:
+    """A plate at 1 m before a wall at 2 m hides as much of it, left of itself, as their disparities differ by."""
+    exact = np.full((20, 200), 2.0, np.float32)
+    exact[:, 100:140] = 1.0
+    plain = DepthNoise(dropout=0.0, edge=10.0, spread=0.0)
+    shadowed = replace(plain, baseline=0.05).applied(exact, np.random.default_rng(0), focal=300.0)
+    assert (plain.applied(exact, np.random.default_rng(0)) > 0).all()
+    hidden = np.flatnonzero(shadowed[10] == 0)
+    width = 300.0 * 0.05 * (1 / 1.0 - 1 / 2.0)
+    assert hidden.max() == 99 and abs(len(hidden) - width) <= 1.5
