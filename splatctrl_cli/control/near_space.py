@@ -35,8 +35,8 @@ class NearFigures:
     blind, the share of the moving spheres about which nearly all (`NEAR_BLIND`) of that space was never seen; age [s]
     within which `NEAR_FRESH_SHARE` of the seen points were last seen; ahead [s] by which the last of them was seen
     after the state. NaN where there are too few points. unanswered [m]: the distance of the nearest voxel that
-    cameras looked at without an answer, and its place (3,) [m]; hidden [m]: how near a point of that new space that
-    was never seen is to the map's surfaces, and its place (3,) [m]; infinite and NaN where there is none.
+    cameras looked at without an answer, and its place (3,) [m]; hidden [m]: how near a point that was never seen, of
+    new space or not, is to the map's surfaces, and its place (3,) [m]; infinite and NaN where there is none.
     """
 
     unseen: float
@@ -96,7 +96,6 @@ class NearSpace:
         hidden, hidden_place = np.inf, np.full(3, np.nan)
         if distance is not None:
             fine, _ = self._shell(centers, FINE)
-            fine = fine[self._is_new(fine)]
             hidden, hidden_place = _nearest_of(fine[known.last_ns(fine) < 0], distance)
         return NearFigures(
             unseen=unseen,

@@ -75,15 +75,14 @@ def blind_share(
 def hidden(
     arm: ArmModel,
     q: Float64,
-    q_first: Float64,
     margin: float,
     last_seen: Callable[[Float64], NDArray[np.int64]],
     distance: Callable[[Float64], Float64],
 ) -> float:
-    """The least distance [m] to surfaces of the points on the shells in new space that were never seen."""
+    """The least distance [m] to surfaces of the points on the shells that were never seen."""
     found = [np.inf]
     for _, point in _shells(arm, q, margin, _spiral(200)):
-        if min(_gaps(arm, q_first, point)) > 0.05 and int(last_seen(point[None])[0]) < 0:
+        if int(last_seen(point[None])[0]) < 0:
             found.append(float(distance(point[None])[0]))
     return min(found)
 

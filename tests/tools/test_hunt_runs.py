@@ -73,6 +73,7 @@ FOUND = {  # runs that were once called safe, by what was wrong with that
     "edges-behind-which-the-arm-passes": (0, 936),
     "a-dark-ball-of-which-patches-alone-return-depth": (89, 36),
     "depth-of-its-own-time-that-a-late-map-did-not-have": (101, 219),
+    "the-unseen-side-of-a-box-that-the-arm-touches-from-the-start": (103, 320),
     "the-side-of-a-box-that-a-lone-camera-never-saw": (101, 309),
     "a-thing-in-the-hand-that-a-wide-tolerance-took-for-the-robot": (101, 359),
     "a-voxel-without-an-answer-whose-face-is-nearer-than-its-centre": (47, 6),
