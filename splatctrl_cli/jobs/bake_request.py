@@ -255,5 +255,4 @@ def device_for(request: BakeRequest, layout: GridLayout, num_splats: int, progre
         return Device()
     is_matern = KERNEL_OF[request.config.field.distance] == "gpdf"
     is_enough = layout.num_cells * (num_splats if is_matern else CARD_SPLATS) >= CARD_LEAST_BAKE
-    cells = f"{layout.num_cells} cells of {num_splats} splats"
-    return chosen(request.device, "" if is_enough else f"{cells} are too little work for a card", progress)
+    return chosen(request.device, is_enough, progress)

@@ -80,10 +80,15 @@ def automatic(
     return device
 
 
-def chosen(name: str, too_little: str, progress: Progress) -> Device:
-    """The device of a --device that fields are computed on. Raises UsageError where it cannot be used."""
+def chosen(name: str, is_enough: bool, progress: Progress) -> Device:
+    """The device of a --device that fields are computed on; auto asks for a card where the work is enough.
+
+    Raises UsageError where it cannot be used.
+    """
     device = demanded(name, FIELD)
-    return automatic(progress, too_little, source=FIELD) if device is None else device
+    if device is None:
+        device = automatic(progress, source=FIELD) if is_enough else Device()
+    return device
 
 
 class FitDevice:

@@ -128,7 +128,7 @@ def _asked(request: QueryRequest, progress: Progress) -> _Asked:
                 f"--scene: belongs to a field, and {request.source} is a scene", remedy="leave --scene out"
             )
         source = read_bake_source(request.source, request.at)
-        device = chosen(request.device, _too_little(request.points), progress)
+        device = chosen(request.device, _is_enough(request.points), progress)
         scene = _scene(source, request, request.labels, request.config, device)
         return _Asked(kind="scene", at=scene.at, box=source.workspace, device=device)
     if request.at is not None:
@@ -142,7 +142,7 @@ def _asked(request: QueryRequest, progress: Progress) -> _Asked:
         return _Asked(kind="field", at=of_grid.at, box=of_grid.box, is_grid=True)
     where = str(request.source)
     labels, config = _labels_of(grid, where), _config_of(grid, request.config, where)
-    device = chosen(request.device, _too_little(request.points), progress)
+    device = chosen(request.device, _is_enough(request.points), progress)
     both = _scene(source_of_grid(where, grid, request.scene), request, labels, config, device)
 
     def at(points: Float64) -> Answers:
@@ -151,10 +151,9 @@ def _asked(request: QueryRequest, progress: Progress) -> _Asked:
     return _Asked(kind="field and scene", at=at, box=of_grid.box, is_grid=True, device=device)
 
 
-def _too_little(points: Path | TextIO) -> str:
-    """Why a card would not pay, if it would not."""
-    size = points.stat().st_size if isinstance(points, Path) and points.is_file() else 0
-    return "" if size >= CARD_LEAST_TABLE else "too few points are known of for a card"
+def _is_enough(points: Path | TextIO) -> bool:
+    """Whether as many points are known of as a card pays for."""
+    return isinstance(points, Path) and points.is_file() and points.stat().st_size >= CARD_LEAST_TABLE
 
 
 def _grid_file(source: Path) -> Path | None:

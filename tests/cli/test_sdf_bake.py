@@ -108,7 +108,7 @@ def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path:
     assert result.returncode == 0, result.stderr
     accuracy = json.loads((tmp_path / "field" / "field.json").read_text())["accuracy"]["truth"]
     metrics = json.loads((tmp_path / "field" / "run.json").read_text())["metrics"]
-    assert sorted(metrics) == sorted((*SUMMARY_METRICS, *metric_names(FIELDS))), "as checked before baking"
+    assert sorted(set(metrics) - {"devices"}) == sorted((*SUMMARY_METRICS, *metric_names(FIELDS))), "as checked"
     assert accuracy["num_seen"] > 50
     assert accuracy["holds"] is True
     assert f"of {accuracy['num_seen']} seen cells" in result.stdout

@@ -71,7 +71,7 @@ def test_auto_bakes_on_a_card_where_its_work_is_worth_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert bake(splats, tmp_path / "small") == 0
-    assert "computes on cpu: 4693 cells of 300 splats are too little work for a card" in capsys.readouterr().err
+    assert "computes on" not in capsys.readouterr().err
     monkeypatch.setattr(bake_request, "CARD_LEAST_BAKE", 4693 * bake_request.CARD_SPLATS)
     assert bake(splats, tmp_path / "large") == 0
     assert f"computes on {NAME}" in capsys.readouterr().err
@@ -79,7 +79,7 @@ def test_auto_bakes_on_a_card_where_its_work_is_worth_it(
     assert run_of(tmp_path / "updated")["metrics"]["devices"] == [PROCESSOR]
     assert "computes on" not in capsys.readouterr().err
     assert bake(splats, tmp_path / "matern", "--distance", "gpdf") == 0  # fewer splats
-    assert "computes on cpu: 4693 cells" in capsys.readouterr().err
+    assert run_of(tmp_path / "matern")["metrics"]["devices"] == [PROCESSOR]
 
 
 def test_a_card_that_cannot_be_used_is_refused_by_name(
@@ -125,7 +125,7 @@ def test_a_query_on_a_card_has_the_answers_of_the_processor(
     for name in ("cpu", "cuda", "auto"):
         assert main(["query", str(splats), str(points), "-o", str(tmp_path / name), "--device", name]) == 0
         answers[name] = list(csv.DictReader((tmp_path / name).read_text().splitlines()))
-    assert "computes on cpu: too few points" in capsys.readouterr().err
+    assert capsys.readouterr().err.count("computes on") == 0
     assert answers["auto"] == answers["cpu"]
     for mine, theirs in zip(answers["cuda"], answers["cpu"], strict=True):
         assert mine["splat"] == theirs["splat"]
