@@ -128,6 +128,17 @@ def test_rows_that_a_flickering_light_exposes_differently_are_named(
     assert all(finding.value == pytest.approx(45.0, abs=15.0) for finding in found)
 
 
+def test_brightness_that_changes_slowly_over_an_image_is_gloss_and_no_flicker(table: Table) -> None:
+    stamps = sorted({frame.stamp_ns for frame in table.few})
+    off = []
+    for frame in table.few:
+        slope = 0.3 * (stamps.index(frame.stamp_ns) / (len(stamps) - 1) - 0.5)
+        rows = 1 + slope * np.linspace(-1, 1, len(frame.color))
+        shown = np.clip(frame.color * rows[:, None, None], 0, 255).astype(np.uint8)
+        off.append(replace(frame, color=shown) if frame.camera == "cam1" else frame)
+    assert "exposure-rows" not in {finding.code for finding in exposure_findings(off)}
+
+
 def test_a_flat_wall_says_nothing_of_its_scale(table: Table) -> None:
     walls = []
     for index in range(4):

@@ -77,7 +77,7 @@ def slanted(noise: float, seed: int = 0) -> Float32:
     """Depth (240, 320) of a floor seen from the side, with a box on it; noise [1/m]."""
     v, u = np.mgrid[0:240, 0:320]
     inverse = 0.6 + 0.9 * v / 240 + 0.2 * u / 320
-    inverse[60:160, 100:220] = 1.4
+    inverse[60:160, 100:220] += 0.4
     return (1 / (inverse + np.random.default_rng(seed).normal(0, noise, inverse.shape))).astype(np.float32)
 
 
