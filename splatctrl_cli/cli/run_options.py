@@ -70,7 +70,7 @@ def study_options(add: Options, parser: Parser) -> None:
     add("--trials N", "problems of each environment (default: as many as the paper's)", whole(1, 100_000))
     add("--methods A,B", "ours, tsdf, truth, ... (docs/study.md; default: all that are installed)", _names)
     add("--problems DIR", "MotionBenchMaker's problems of the Panda (default: as SPLATCTRL_REAL_DATA has them)", Path)
-    add("--width PX", "of the cameras' images", whole(32, 1280), 320)
+    add("--width PX", "of the cameras' images (default: 320)", whole(32, 1280))
     add("--workers N", "problems that run at once (default: one per core)", whole(1, 256))
     add("--shard I/N", "only every N-th problem, from the I-th on", _shard)
     add("--problem NAME", "run one problem alone, such as cubby-0007")

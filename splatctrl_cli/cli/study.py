@@ -8,8 +8,10 @@ from pathlib import Path
 from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of
-from splatctrl_cli.jobs.studies.problem_run import TRIALS, ProblemRequest, run_problem, told
-from splatctrl_cli.jobs.studies.study import StudyRequest, StudyResult, methods_of, run_study
+from splatctrl_cli.jobs.studies.experiments import STUDIES, ProblemRequest
+from splatctrl_cli.jobs.studies.problem_run import run_problem
+from splatctrl_cli.jobs.studies.rows import TRIALS
+from splatctrl_cli.jobs.studies.study import StudyRequest, StudyResult, run_study
 
 
 def run(args: argparse.Namespace) -> int:
@@ -37,11 +39,15 @@ def _lines(result: StudyResult) -> Iterator[str]:
 
 def _one(args: argparse.Namespace) -> int:
     """One problem alone, as the nodes of a study run it."""
-    console = Console(args)
+    console, study = Console(args), STUDIES[args.study]
     request = request_of(
-        ProblemRequest, args, out=args.out or Path(args.problem), methods=methods_of(args.methods or ())
+        ProblemRequest,
+        args,
+        out=args.out or Path(args.problem),
+        methods=study.methods_of(args.methods or ()),
+        width=args.width or study.width,
     )
     result = run_problem(request, console)
-    lines = [told(trial) for trial in result.trials]
+    lines = [trial.told for trial in result.trials]
     found = {"out": str(result.out), "trials": len(lines)}
     return console.concluded(result.verdict, found, [*lines, f"every figure is in {result.out / TRIALS}"])

@@ -1,12 +1,12 @@
 """A study from its request to its table: its problems are nodes of a batch, each made once."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.files.output import check_can_be_written, write_durably, write_json
 from splatctrl_cli.jobs.batches.batch import check_same_asked, scheduling, write_batch
@@ -17,48 +17,22 @@ from splatctrl_cli.jobs.batches.run import DONE, FAILED
 from splatctrl_cli.jobs.batches.suite import Job, Recording, Suite
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.report import WriteReportRequest, write_report
-from splatctrl_cli.jobs.studies import table2
-from splatctrl_cli.jobs.studies.problem_run import TRIALS, read_trials, verdict_on_trials, write_trials
-from splatctrl_cli.jobs.studies.problems import ARCHIVE, FAMILIES, ROBOT, name_of
-from splatctrl_cli.jobs.studies.trial import METHODS, TSDF, Trial
-from splatctrl_cli.libraries import is_installed
+from splatctrl_cli.jobs.studies.experiments import STUDIES, Section, Study
+from splatctrl_cli.jobs.studies.problems import ARCHIVE, ROBOT, name_of
+from splatctrl_cli.jobs.studies.rows import TRIALS, Row, read_trials, verdict_on_trials, write_trials
 
 FILE, FORMAT = "study.json", "splatctrl-study"
 DATA = "SPLATCTRL_REAL_DATA"  # the folder that may hold vamp_panda
 DRAWN, ARCHIVED = "drawn", "archive"  # jobs: of environments by their seed, of MotionBenchMaker
 MOST_NAMED = 5  # problems that lack
 
-Section = tuple[str, Sequence[str], Sequence[Sequence[str]]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Study:
-    """An experiment of the paper. problems: environment and number, of at most so many of each (None: all), with the
-    archive's or without; sections: tables of its trials; notes: sentences below them.
-    """
-
-    summary: str
-    problems: Callable[[int | None, bool], list[tuple[str, int]]]
-    sections: Callable[[Sequence[Trial]], Iterable[Section]]
-    notes: Callable[[Sequence[Trial]], Iterable[str]]
-
-
-STUDIES: Mapping[str, Study] = {
-    "table2": Study(
-        summary="Table II (IV-B): success of a planner in reconstructed scenes, with 2, 4 and 6 cameras",
-        problems=table2.problems,
-        sections=table2.sections,
-        notes=table2.notes,
-    )
-}
-
 
 @dataclass(frozen=True, kw_only=True)
 class StudyRequest:
     """Run a study into the folder `out`, in which it goes on. trials: problems of each environment at most (None: as
     many as the paper's); problems: MotionBenchMaker's folder (None: what SPLATCTRL_REAL_DATA has, if anything);
-    methods: of `METHODS`, none for all that are installed; shard: (i, n), every n-th problem from the i-th on;
-    width [px] of the images.
+    methods: of the study, none for all that are installed; shard: (i, n), every n-th problem from the i-th on;
+    width [px] of the images (None: the study's own).
     """
 
     study: str
@@ -66,7 +40,7 @@ class StudyRequest:
     trials: int | None = None
     problems: Path | None = None
     methods: tuple[str, ...] = ()
-    width: int = 320
+    width: int | None = None
     workers: int = 1
     shard: tuple[int, int] = (1, 1)
 
@@ -78,7 +52,7 @@ class StudyResult:
     """
 
     out: Path
-    trials: Sequence[Trial]
+    trials: Sequence[Row]
     sections: Sequence[Section]
     notes: Sequence[str]
     lacking: Sequence[str]
@@ -91,12 +65,16 @@ def run_study(request: StudyRequest, command_line: CommandLine, progress: Progre
 
     Raises UsageError for an output of another study or of other settings, InputError for problems that lack.
     """
-    study, out, archive = STUDIES[request.study], request.out.absolute(), archive_of(request.problems)
-    methods = methods_of(request.methods)
+    study, out = STUDIES[request.study], request.out.absolute()
+    archive = archive_of(request.problems) if study.archived else None
     wanted = study.problems(request.trials, archive is not None)
-    suite = _suite(request, wanted, out, archive, methods)
+    asked: dict[str, Any] = {
+        "study": request.study,
+        "methods": list(study.methods_of(request.methods)),
+        "width": request.width or study.width,
+    }
+    suite = _suite(study, asked, wanted, out, archive)
     nodes = nodes_of(suite, out, command_line)
-    asked = {"study": request.study, "methods": list(methods), "width": request.width}
     check_can_be_written(out)
     check_same_asked(out, FILE, asked, what="study")
     with (
@@ -114,9 +92,11 @@ def run_study(request: StudyRequest, command_line: CommandLine, progress: Progre
                 write_batch(out, suite, nodes, ledger.latest(), scheduler.keys)
         latest, keys = ledger.latest(), keys_of(nodes, ledger, command_line.entry)
     lacking = [node.name for node in nodes if not _is_done(latest.get(node.name), keys[node.name])]
-    trials = [] if lacking else [trial for node in nodes for trial in _trials_in(node)]
+    trials = [] if lacking else [trial for node in nodes for trial in _trials_in(node, study)]
     if not lacking:
-        write_durably(out / TRIALS, lambda path: write_trials(path, trials))
+        write_durably(out / TRIALS, lambda path: write_trials(path, trials, study.row))
+        if study.draw is not None:
+            study.draw(trials, out.with_name(f"{out.name}.png"))
         page = out.with_name(f"{out.name}.html")
         write_report(WriteReportRequest(path=out, out=page, force=True), progress)
     return StudyResult(
@@ -144,44 +124,33 @@ def archive_of(given: Path | None) -> Path | None:
     return given.absolute()
 
 
-def methods_of(given: Sequence[str]) -> tuple[str, ...]:
-    """The methods that are asked for, or all that are installed. Raises UsageError for one that is none."""
-    for name in given:
-        if name not in METHODS:
-            raise UsageError(f"--methods {name}: expected some of {', '.join(METHODS)}")
-    return tuple(n for n in METHODS if (n in given if given else n != TSDF or is_installed("open3d")))
-
-
 def _suite(
-    request: StudyRequest, wanted: Sequence[tuple[str, int]], out: Path, archive: Path | None, methods: Sequence[str]
+    study: Study[Any],
+    asked: Mapping[str, Any],
+    wanted: Sequence[tuple[str, int]],
+    out: Path,
+    archive: Path | None,
 ) -> Suite:
-    options: dict[str, Any] = {
-        "study": request.study,
-        "problem": "{name}",
-        "methods": list(methods),
-        "width": request.width,
-    }
+    options: dict[str, Any] = {**asked, "problem": "{name}"}
     jobs = [Job(name=DRAWN, command="study", options=options)]
     if archive is not None:
         jobs.append(Job(name=ARCHIVED, command="study", options={**options, "problems": str(archive)}))
     recordings = [
-        Recording(name=name_of(e, n), paths=(), only=(ARCHIVED if e in FAMILIES else DRAWN,)) for e, n in wanted
+        Recording(name=name_of(e, n), paths=(), only=(ARCHIVED if e in study.archived else DRAWN,)) for e, n in wanted
     ]
-    return Suite(name=request.study, folder=Path.cwd(), out=out, recordings=tuple(recordings), jobs=tuple(jobs))
+    return Suite(name=asked["study"], folder=Path.cwd(), out=out, recordings=tuple(recordings), jobs=tuple(jobs))
 
 
 def _is_done(run: Run | None, key: str) -> bool:
     return run is not None and run.key == key and run.state in (DONE, FAILED)
 
 
-def _trials_in(node: Node) -> list[Trial]:
+def _trials_in(node: Node, study: Study[Any]) -> list[Row]:
     assert node.out is not None
-    return read_trials(node.out / TRIALS)
+    return list[Row](read_trials(node.out / TRIALS, study.row))
 
 
-def _verdict(
-    trials: Sequence[Trial], lacking: Sequence[str], latest: Mapping[str, Run], num_problems: int
-) -> Verdict:
+def _verdict(trials: Sequence[Row], lacking: Sequence[str], latest: Mapping[str, Run], num_problems: int) -> Verdict:
     if not lacking:
         return verdict_on_trials(trials)
     errors = [name for name in lacking if name in latest and latest[name].state not in (DONE, FAILED)]

@@ -1,7 +1,7 @@
 """One problem of a study through its methods: what each knew, planned and drove, and what that came to."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -73,10 +73,17 @@ class Trial:
     joint_path_rad: float | None = None
     num_parts: int | None = None
 
-    @classmethod
-    def columns(cls) -> list[str]:
-        """Names of its fields."""
-        return [column.name for column in fields(cls)]
+    @property
+    def label(self) -> str:
+        """Which trial it is."""
+        return f"{self.environment} {self.number}, {self.cameras} cameras, {self.method}"
+
+    @property
+    def told(self) -> str:
+        """What came of it, in a few words."""
+        cameras = f"{self.cameras} cameras, " if self.cameras else ""
+        verdict = f"; {self.verdict.upper()}" if self.verdict else ""
+        return f"{cameras}{self.method}: {self.cause or 'success'}{verdict}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,8 +10,8 @@ from splatctrl_cli.evaluate.verdict import Outcome, Verdict, held, verdict_of
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.studies import judge, trial
 from splatctrl_cli.jobs.studies.maps import Map
-from splatctrl_cli.jobs.studies.problem_run import FALSE_GREEN, verdict_on_trials
 from splatctrl_cli.jobs.studies.problems import Problem, simulated_arm
+from splatctrl_cli.jobs.studies.rows import FALSE_GREEN, verdict_on_trials
 from splatctrl_cli.jobs.studies.trial import OURS, Attempt, Rig, Trial, trial_of
 from splatctrl_cli.jobs.studies.views import Views, views_of
 from splatctrl_cli.planner.configuration_clearance import Clearance

@@ -10,9 +10,9 @@ import pytest
 from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome
-from splatctrl_cli.jobs.studies.problem_run import TRIALS, read_trials
+from splatctrl_cli.jobs.studies.rows import TRIALS, read_trials
 from splatctrl_cli.jobs.studies.study import FILE, StudyRequest, StudyResult, archive_of, run_study
-from splatctrl_cli.jobs.studies.trial import CAMERAS, OURS, TRUTH
+from splatctrl_cli.jobs.studies.trial import CAMERAS, OURS, TRUTH, Trial
 from splatctrl_cli.simulate.environments import ENVIRONMENTS
 
 
@@ -51,7 +51,7 @@ def test_every_cell_has_a_trial_and_those_of_before_are_kept(whole: tuple[Path, 
     assert cells == ours | {(e, 0, TRUTH) for e in ENVIRONMENTS}
     assert all(trial.success for trial in result.trials if trial.method == TRUTH)
     assert all(bool(trial.cause) is not trial.success for trial in result.trials)
-    assert read_trials(out / TRIALS) == list(result.trials)
+    assert read_trials(out / TRIALS, Trial) == list(result.trials)
     assert len(json.loads((out / "batch.json").read_text())["nodes"]) == 3
     assert out.with_name(f"{out.name}.html").is_file()
     assert [title.split(" (")[0] for title, _, _ in result.sections[:3]] == ["Tabletop", "Cubby", "Merged cubby"]
@@ -78,7 +78,7 @@ def test_a_table_that_is_not_as_its_problem_left_it_is_refused(
     changed = copy / "cubby-0000" / "drawn" / TRIALS
     changed.write_text(changed.read_text().replace("False", "True", 1))
     with pytest.raises(InputError, match=TRIALS):
-        read_trials(changed)
+        read_trials(changed, Trial)
     assert (copy / FILE).is_file()
 
 

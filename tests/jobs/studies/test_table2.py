@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.jobs.studies.problem_run import read_trials, write_trials
+from splatctrl_cli.jobs.studies.rows import read_trials, write_trials
 from splatctrl_cli.jobs.studies.table2 import NUM_PROBLEMS, PAPER, notes, problems, sections
 from splatctrl_cli.jobs.studies.trial import CAMERAS, OURS, TRUTH, Trial
 from splatctrl_cli.simulate.environments import ENVIRONMENTS
@@ -91,17 +91,17 @@ def test_problems_are_those_of_the_paper_or_so_many_of_each_environment() -> Non
 
 def test_trials_read_back_as_they_were_written(tmp_path: Path) -> None:
     found = [replace(trials()[1], margin=0.0125, in_known_space=False, reason='a "word", and more', num_parts=7)]
-    write_trials(tmp_path / "trials.csv", found)
-    assert read_trials(tmp_path / "trials.csv") == found
+    write_trials(tmp_path / "trials.csv", found, Trial)
+    assert read_trials(tmp_path / "trials.csv", Trial) == found
 
 
 @pytest.mark.parametrize(
     ("old", "new"), [("success", "luck"), ("True", "perhaps"), (",safe", ""), ("tabletop,0", "tabletop,zero")]
 )
 def test_a_table_of_trials_that_is_damaged_is_refused(tmp_path: Path, old: str, new: str) -> None:
-    write_trials(tmp_path / "trials.csv", trials()[1:2])
+    write_trials(tmp_path / "trials.csv", trials()[1:2], Trial)
     text = (tmp_path / "trials.csv").read_text()
     assert old in text
     (tmp_path / "trials.csv").write_text(text.replace(old, new))
     with pytest.raises(InputError, match="is not a table of trials"):
-        read_trials(tmp_path / "trials.csv")
+        read_trials(tmp_path / "trials.csv", Trial)
