@@ -43,16 +43,13 @@ class OccupancyGrid:
     def states(self, free_below: float, occupied_above: float) -> UInt8:
         """`VoxelState` (X, Y, Z) by these thresholds of occupancy."""
         low, high = (float(np.log(p / (1.0 - p))) for p in (free_below, occupied_above))
-        free, occupied, uncertain, never_seen, swept = (
-            np.uint8(state)
-            for state in (
-                *(VoxelState.FREE, VoxelState.OCCUPIED, VoxelState.UNCERTAIN),
-                *(VoxelState.NEVER_SEEN, VoxelState.SWEPT_BY_ROBOT),
-            )
-        )
-        seen = np.where(self.log_odds < low, free, np.where(self.log_odds > high, occupied, uncertain))
-        unseen = np.where(self.entity & SWEPT > 0, swept, never_seen)
-        return np.where(self.num_updates == 0, unseen, seen)
+        states = np.full(self.log_odds.shape, np.uint8(VoxelState.UNCERTAIN))
+        states[self.log_odds < low] = VoxelState.FREE
+        states[self.log_odds > high] = VoxelState.OCCUPIED
+        is_unseen = self.num_updates == 0
+        states[is_unseen] = VoxelState.NEVER_SEEN
+        states[is_unseen & (self.entity & SWEPT > 0)] = VoxelState.SWEPT_BY_ROBOT
+        return states
 
     @classmethod
     def from_states(cls, origin: Float64, voxel: float, states: UInt8) -> "OccupancyGrid":

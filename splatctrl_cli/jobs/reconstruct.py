@@ -65,10 +65,11 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         )
         if goes_on:
             progress.log(f"{partial}: continues after {fitted.num_read} time steps")
-        with stopwatch.stage("fit_since_resume" if goes_on else "fit"):
-            fitted.run(progress)
-        with stopwatch.stage("write"):
-            fitted.finish()
+        with closing(fitted.writer):
+            with stopwatch.stage("fit_since_resume" if goes_on else "fit"):
+                fitted.run(progress)
+            with stopwatch.stage("write"):
+                fitted.finish()
         for table, index in declared.unused():
             if table == "carried":
                 progress.log(

@@ -7,7 +7,6 @@ left is where the thing may be.
 """
 
 from collections.abc import Iterator
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -87,18 +86,23 @@ def _gaps(is_blank: Bool, is_end: Bool) -> Bool:
     and down, and the diagonals.
     """
     kinds = np.pad(np.where(is_end, NOTHING, np.where(is_blank, BLANK, OBJECT)).astype(np.uint8), 1)
-    sees = [_sees_object(kinds, shift) & _sees_object(kinds[::-1, ::-1], shift)[::-1, ::-1] for shift in (-1, 0, 1)]
-    sees.append((_sees_object(kinds.T, 0) & _sees_object(kinds.T[::-1], 0)[::-1]).T)
-    is_between = np.sum(sees, axis=0) >= GAP_DIRECTIONS
-    return np.ascontiguousarray((is_between & (kinds == BLANK))[1:-1, 1:-1])
+    flat, width = kinds.ravel(), kinds.shape[1]
+    between = np.zeros(len(flat), np.uint8)
+    for step in (1, width - 1, width, width + 1):
+        between += _sees_object(flat, step) & _sees_object(flat[::-1], step)[::-1]
+    is_gap = (between >= GAP_DIRECTIONS) & (flat == BLANK)
+    return np.ascontiguousarray(is_gap.reshape(kinds.shape)[1:-1, 1:-1])
 
 
-def _sees_object(kinds: UInt8, shift: int) -> Bool:
-    """Pixels (H, W) that show an object, or do so where a path up, by -shift columns a row, first meets depth."""
-    met = kinds.copy()
-    for above, row in pairwise(met):
-        np.copyto(row, np.roll(above, shift), where=row == BLANK)
-    return np.asarray(met == OBJECT)
+def _sees_object(flat: UInt8, step: int) -> Bool:
+    """Pixels (N,) of a flattened image with a border of `NOTHING` that first meet depth at an object, or are one, on
+    the path back to its start, `step` pixels at a time.
+    """
+    num = len(flat)
+    last = np.zeros((-(-num // step), step), np.int32)  # a path is a column
+    last.ravel()[:num] = np.where(flat == BLANK, 0, np.arange(num, dtype=np.int32))
+    np.maximum.accumulate(last, axis=0, out=last)
+    return np.asarray(flat[last.ravel()[:num]] == OBJECT)
 
 
 def _nearest_depth(depth: Float32) -> Float32:

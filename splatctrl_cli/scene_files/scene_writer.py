@@ -2,7 +2,9 @@
 
 import csv
 import json
+from collections import deque
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -59,13 +61,17 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 class SceneWriter:
-    """Writes a scene into a folder as the fitter goes: an empty folder, or one with the checkpoint to go on from."""
+    """Writes a scene into a folder as the fitter goes: an empty folder, or one with the checkpoint to go on from.
+
+    Snapshots are written while the fitter goes on; what goes wrong with one is raised by the next call.
+    """
 
     def __init__(self, folder: Path, comments: Mapping[str, str], checkpoint: Checkpoint | None = None) -> None:
         self.folder = folder
         self.comments = dict(comments)
         self.snapshots: list[Snapshot] = []
         self._audit = folder / AUDIT
+        self._thread, self._unwritten = ThreadPoolExecutor(1), deque[Future[None]]()
         self._num_flushed = 0  # snapshots that are known to be on disk
         self._digests: dict[str, str] = {}  # of their files, by name
         if checkpoint is None:
@@ -116,12 +122,29 @@ class SceneWriter:
     def snapshot(
         self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, states: UInt8, shell: SplatSet | None = None
     ) -> None:
-        """Write the splats and the shell as they are at `stamp_ns`, and the `states` (X, Y, Z) of the voxels then."""
+        """Write the splats and the shell as they are at `stamp_ns`, and the `states` (X, Y, Z) of the voxels then.
+
+        The arrays are the writer's from now on. `settle` says when they are in the files.
+        """
         snapshot = Snapshot(stamp_ns=stamp_ns, path=self._place(len(self.snapshots)), num_splats=len(splats))
-        write_ply(snapshot.path, splats, self.comments | {"stamp_ns": str(stamp_ns)})
-        write_states(snapshot.occupancy_path, known, states)
-        self._write_shell(snapshot.shell_path, stamp_ns, shell)
+
+        def write() -> None:
+            write_ply(snapshot.path, splats, self.comments | {"stamp_ns": str(stamp_ns)})
+            write_states(snapshot.occupancy_path, known, states)
+            self._write_shell(snapshot.shell_path, stamp_ns, shell)
+
+        self.settle(but=1)
+        self._unwritten.append(self._thread.submit(write))
         self.snapshots.append(snapshot)
+
+    def settle(self, *, but: int = 0) -> None:
+        """Wait until all snapshots, or all but the last so many, are written. Raises what went wrong with one."""
+        while len(self._unwritten) > but:
+            self._unwritten.popleft().result()
+
+    def close(self) -> None:
+        """Wait for the snapshot that is being written, whatever comes of it."""
+        self._thread.shutdown()
 
     def _write_shell(self, path: Path, stamp_ns: int, shell: SplatSet | None) -> None:
         """A file of its own: what reads splats does not meet it."""
@@ -130,6 +153,7 @@ class SceneWriter:
 
     def checkpoint(self, progress: Mapping[str, Any], state: State, *, is_last: bool = False) -> None:
         """Replace the checkpoint in one step, when all that it counts on is on disk; the last is compressed."""
+        self.settle()
         flush(self._audit)
         for snapshot in self.snapshots[self._num_flushed :]:
             for path in filter(Path.is_file, (snapshot.path, snapshot.occupancy_path, snapshot.shell_path)):
@@ -147,6 +171,7 @@ class SceneWriter:
 
     def finish(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, shell: SplatSet | None = None) -> None:
         """Write the final splats and shell, the occupancy grid and the index of snapshots."""
+        self.settle()
         write_ply(self.folder / "splats.ply", splats, self.comments | {"stamp_ns": str(stamp_ns)})
         self._write_shell(self.folder / SHELL_FILE, stamp_ns, shell)
         write_occupancy(self.folder / "occupancy.npz", known)

@@ -205,6 +205,7 @@ class Lockstep:
         taken = fitted.writer.snapshots
         if self._next is None and fitted.rows and taken[-1].stamp_ns < step.stamp_ns:
             fitted.snapshot(step.stamp_ns)  # the log's last map, due or not
+        fitted.writer.settle()
         for snapshot in taken[len(self._files) :]:
             self._stamps_ns.append(snapshot.stamp_ns)
             self._files.append(snapshot.path)
