@@ -15,7 +15,7 @@ from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.labels import Seen, shown_kinds
 from splatctrl_cli.scene.posture import RobotPosture
-from splatctrl_cli.scene.seeding import gap_seeds, world_points_at
+from splatctrl_cli.scene.seeding import Each, gap_seeds, world_points_at
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, farthest_within, nearest_within, pixels_of
 
 
@@ -59,6 +59,7 @@ def contact_seeds(
     config: SceneConfig,
     *,
     num_threads: int = 1,
+    each: Each = map,
 ) -> Seeds:
     """Seeds of `contact_radius` wherever an object beside the robot has no splat's centre so near; mappable: pixels
     (H, W) of each frame.
@@ -67,18 +68,16 @@ def contact_seeds(
     measured is taken to be there.
     """
     radius = config.contact_radius
-    views = [
-        (frame, contact_pixels(frame, mask, robot) & pixels)
-        for (frame, mask), pixels in zip(seen, mappable, strict=True)
-    ]
+    beside = each(lambda one, pixels: contact_pixels(one[0], one[1], robot) & pixels, seen, mappable)
     return gap_seeds(
-        views,
+        [(frame, pixels) for (frame, _), pixels in zip(seen, beside, strict=True)],
         np.zeros((0, 3), np.float32),
         radius,
         replace(objects, radii=np.full(len(objects), radius, np.float32)),
         replace(config, max_gap=0.0, max_radius=radius, radius_per_edge=1.0),
         stride=1,
         num_threads=num_threads,
+        each=each,
     )
 
 

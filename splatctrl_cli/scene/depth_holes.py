@@ -7,6 +7,7 @@ left is where the thing may be.
 """
 
 from collections.abc import Iterator
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -22,7 +23,7 @@ MOST_POINTS = 1 << 18  # at a time: fine voxels and a large hole come to a hundr
 
 def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Iterator[Float64]:
     """Points (K, 3) [m], world, on the rays of a frame's holes and gaps, half a voxel [m] apart along each; some at a
-    time, some of them twice.
+    time, some of them twice. The holes are found at once, the points when they are asked for.
 
     From `min_range` before the camera to the depth that is seen nearest to the pixel, on rays about a voxel apart;
     holes up to `NARROW_HOLE` and gaps up to `NARROW_GAP` voxels wide do not count. robot_depth (H, W) [m]: of the
@@ -30,22 +31,23 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
-        return
+        return iter(())
     behind = _nearest_depth(frame.depth)
     is_end = cv2.dilate(robot_depth, np.ones((5, 5), np.uint8)) > 0
     if frame.valid is not None:
         is_end |= ~frame.valid
-    holes = _holes(is_blank, is_end)
+    holes, parts = _holes(is_blank, is_end), []
     if holes.any():
         width = _voxel_width(frame, behind[holes], config)
-        yield from _on_rays(frame, _wide(holes, NARROW_HOLE * width), behind, max(int(width), 1), config)
+        parts.append((_wide(holes, NARROW_HOLE * width), max(int(width), 1)))
     width = _voxel_width(frame, behind[is_blank], config)
     step = max(int(0.5 * width), 1)  # as fine as is needed for something so wide
     every = slice(None, None, step)
     is_end = cv2.dilate(is_end.view(np.uint8), np.ones((step, step), np.uint8)) > 0  # narrow parts too
     gaps = np.zeros_like(is_blank)
     gaps[every, every] = _wide(_gaps(is_blank[every, every], is_end[every, every]), NARROW_GAP * width / step)
-    yield from _on_rays(frame, gaps, behind, step, config)
+    parts.append((gaps, step))
+    return chain.from_iterable(_on_rays(frame, pixels, behind, apart, config) for pixels, apart in parts)
 
 
 def _voxel_width(frame: RgbdFrame, depths: Float32, config: OccupancyConfig) -> float:

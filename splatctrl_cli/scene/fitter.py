@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
 from splatctrl_cli.scene.posture import RobotPosture, carried
-from splatctrl_cli.scene.relocation import clone, detail_seeds
+from splatctrl_cli.scene.relocation import use_idle
 from splatctrl_cli.scene.removal import REASONS, removals
 from splatctrl_cli.scene.render import BLACK, Color, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import (
@@ -83,7 +84,7 @@ class SceneFitter:
         self.workspace = workspace
         self.seed = seed
         self.num_threads = num_threads(threads)
-        self._pool = ThreadPoolExecutor(self.num_threads)
+        self._each = ThreadPoolExecutor(self.num_threads).map  # what is asked of each view, of all of them at once
         self.buffer = SplatBuffer(config.max_splats)
         self.descent = Descent(config, self.buffer, seed, self.num_threads, device)
         self.occupancy = OccupancyMap(workspace, occupancy, self.num_threads)
@@ -102,17 +103,17 @@ class SceneFitter:
         rng = np.random.default_rng([self.seed, self.num_steps])
         robot = robot and replace(robot, num_threads=self.num_threads)
         self._find_mounted(frames)
-        config, each = self.occupancy.config, self._pool.map
-        masks = list(each(lambda f: object_mask(f) if robot is None else self_mask(f, robot, config), frames))
+        config = self.occupancy.config
+        masks = list(self._each(lambda f: object_mask(f) if robot is None else self_mask(f, robot, config), frames))
         frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
-        views = list(each(self.view, frames))
+        views = list(self._each(self.view, frames))
         seen = list(zip(frames, masks, strict=True))
         if self.descent.background is None:
             self.descent.background = self._behind(views)
         self.people.take_in(self.occupancy, frames)
-        for frame, mask in seen:
-            for points in unanswered_points(frame, mask.robot_depth, self.occupancy.config):
-                self.occupancy.mark_unanswered(points)
+        unanswered = self._each(lambda one: unanswered_points(one[0], one[1].robot_depth, config), seen)
+        for points in chain.from_iterable(unanswered):
+            self.occupancy.mark_unanswered(points)
         self._carry(robot)
         if robot is not None:
             pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]
@@ -275,13 +276,17 @@ class SceneFitter:
         found: dict[Label, list[Candidates]] = {Label.OBJECT: [], Label.ROBOT: []}
         added = [add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config) for view in views]
         every = thinning(added)
-        for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
-            others = [views[(index + k) % len(views)] for k in spread(range(len(views)), SEED_ASKED_VIEWS)]
-            for label, sources in found.items():
-                source = candidates(
-                    view.frame, thinned(added[index] & of_label(mask, label), every), self.num_threads
-                )
-                sources.append(source.select(self._is_grounded(source.points, others)))
+
+        def offered(index: int) -> list[Candidates]:
+            view, others = views[index], spread(range(len(views)), SEED_ASKED_VIEWS)
+            asked = [views[(index + k) % len(views)] for k in others]
+            wanted = (thinned(added[index] & of_label(masks[index], label), every) for label in found)
+            sources = (candidates(view.frame, pixels, self.num_threads) for pixels in wanted)
+            return [source.select(self._is_grounded(source.points, asked)) for source in sources]
+
+        for offers in self._each(offered, range(len(views))):
+            for sources, source in zip(found.values(), offers, strict=True):
+                sources.append(source)
         everything = [source for sources in found.values() for source in sources]
         num_candidates = sum(len(source) for source in everything)
         if not num_candidates:
@@ -323,6 +328,7 @@ class SceneFitter:
                 self.config,
                 half=half,
                 num_threads=self.num_threads,
+                each=self._each,
             )
             seeds = seeds.select(self._is_grounded(seeds.centers, views))
             num_missing = len(seeds) - int((~self.buffer.is_alive).sum())
@@ -348,26 +354,16 @@ class SceneFitter:
         self.buffer.set_radius(slots[is_in_contact(self.buffer.centers[slots], robot)], radius)
         splats = self.splats().select(is_object[self.buffer.is_alive])
         mappable = [view.mappable for view in views]
-        seeds = contact_seeds(seen, mappable, robot, splats, self.config, num_threads=self.num_threads)
+        seeds = contact_seeds(
+            seen, mappable, robot, splats, self.config, num_threads=self.num_threads, each=self._each
+        )
         return self.buffer.fill(seeds.select(self._is_grounded(seeds.centers, views)), self.config.initial_opacity)
 
     def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
         """Put dead slots, beyond the reserve for gaps, to use where nothing asks for them; counts in `removed`."""
-        is_alive, reserve = self.buffer.is_alive, int(self.config.gap_reserve * self.config.max_splats)
-        if self.config.when_idle == "leave" or not is_alive.any():
-            return Filled()
-        if self.config.when_idle == "clone":
-            return clone(self.buffer, int((~is_alive).sum()) - reserve, rng)
-        misfits, shown = self.descent.misfits(views)
-        if not any(misfit.error.any() for misfit in misfits):
-            return clone(self.buffer, int((~is_alive).sum()) - reserve, rng)  # no depth says where detail would be
-        weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
-        is_weak = np.zeros(len(is_alive), bool)
-        is_weak[weakest[: int(self.config.weak_share * is_alive.sum())]] = True
-        self.buffer.kill(is_weak)
-        removed["weak"] += int(is_weak.sum())
-        seeds = detail_seeds(misfits, int((~is_alive).sum()) - reserve, self.config, rng)
-        return self.buffer.fill(seeds, self.config.initial_opacity)
+        filled, num_weak = use_idle(self.buffer, lambda: self.descent.misfits(views), self.config, rng)
+        removed["weak"] += num_weak
+        return filled
 
     def _is_grounded(self, points: Float32, views: Sequence[View]) -> Bool:
         """Points (K,) that no view sees through: what one sensor measured and another looks past was noise."""

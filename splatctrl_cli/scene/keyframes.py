@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,22 +18,17 @@ from splatctrl_cli.scene.render import camera_array
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A frame as the optimiser takes it; `reach` [m] is that of `nearest`."""
+    """A frame as the optimiser takes it; `nearest` (H, W) [m] is its `nearest_depth`."""
 
     frame: RgbdFrame
     camera: Float64
     target: TargetView
-    reach: float
+    nearest: Float32
 
     @property
     def mappable(self) -> Bool:
         """Pixels (H, W) whose depth the map has to explain."""
         return np.asarray((self.target.counted != 0) & (self.target.depth > 0))
-
-    @cached_property
-    def nearest(self) -> Float32:
-        """`nearest_depth` of the frame."""
-        return nearest_depth(self.frame, self.reach)
 
 
 def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None, *, reach: float = NEAREST_REACH) -> View:
@@ -54,7 +48,7 @@ def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None, *, 
         counted=counted.astype(np.uint8),
     )
     camera = camera_array(frame.intrinsics, frame.T_world_camera)
-    return View(frame=frame, camera=camera, target=target, reach=reach)
+    return View(frame=frame, camera=camera, target=target, nearest=nearest_depth(frame, reach))
 
 
 def seen_through(centers: Float32, views: Sequence[View], tolerance: float, num_threads: int = 1) -> Bool:
@@ -83,7 +77,7 @@ def halved(view: View) -> View:
         depth=np.where(np.isfinite(nearest), nearest, np.float32(0.0)),
         counted=_quads(target.counted).min(axis=(-3, -1)).astype(np.uint8),
     )
-    return View(frame=view.frame, camera=camera, target=halved_target, reach=view.reach)
+    return View(frame=view.frame, camera=camera, target=halved_target, nearest=view.nearest)
 
 
 def all_halved(views: Sequence[View]) -> list[View]:

@@ -1,6 +1,6 @@
 """What to do with splats that nothing needs: clones of opaque ones (3DGS-MCMC), or detail where colours are wrong."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,6 +52,30 @@ class Misfit:
 
     frame: RgbdFrame
     error: Float32
+
+
+def use_idle(
+    buffer: SplatBuffer,
+    misfits: Callable[[], tuple[list[Misfit], Float64]],
+    config: SceneConfig,
+    rng: np.random.Generator,
+) -> tuple[Filled, int]:
+    """Put dead slots, beyond the reserve for gaps, to use as `when_idle` says; also how many weak splats gave theirs.
+
+    misfits: those of the views, and how much each slot (M,) shows in them.
+    """
+    is_alive, reserve = buffer.is_alive, int(config.gap_reserve * config.max_splats)
+    if config.when_idle == "leave" or not is_alive.any():
+        return Filled(), 0
+    found, shown = ([], None) if config.when_idle == "clone" else misfits()
+    if shown is None or not any(misfit.error.any() for misfit in found):  # no depth says where detail would be
+        return clone(buffer, int((~is_alive).sum()) - reserve, rng), 0
+    weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
+    is_weak = np.zeros(len(is_alive), bool)
+    is_weak[weakest[: int(config.weak_share * is_alive.sum())]] = True
+    buffer.kill(is_weak)
+    seeds = detail_seeds(found, int((~is_alive).sum()) - reserve, config, rng)
+    return buffer.fill(seeds, config.initial_opacity), int(is_weak.sum())
 
 
 def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:

@@ -1,8 +1,9 @@
 """Where new splats come from: the first frames, and pixels that the map does not explain (M_add, eq. 5)."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,6 +16,8 @@ from splatctrl_cli.records import Bool, Box, Columns, Float32, Float64, RgbdFram
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seed_octree import CubeLevel, cube_levels, leaves, tolerance_for
+
+Each = Callable[..., Iterable[Any]]  # `map`, or one that asks all at once
 
 NO_SEEDS = Seeds(
     centers=np.zeros((0, 3), np.float32), radii=np.zeros(0, np.float32), colors=np.zeros((0, 3), np.float32)
@@ -149,6 +152,7 @@ def gap_seeds(
     half: int | None = None,
     stride: int | None = None,
     num_threads: int = 1,
+    each: Each = map,
 ) -> Seeds:
     """Seeds where a measured surface lies further than `max_gap` [m] from every splat's sphere.
 
@@ -156,18 +160,20 @@ def gap_seeds(
     `stride`th pixel and row of the views (a frame and its mappable pixels (H, W)), by default every third or fewer,
     half of `max_gap` apart, and the centres (K, 3) of occupied voxels, which remember surfaces that nothing shows
     now; a centre may be half a voxel off its surface. With `half` 0 or 1 only every second of the rows: the other
-    half waits.
+    half waits. `each`: as `map`, for the views.
     """
-    sources, spheres = [], SplatTree(splats.centers, splats.radii, num_threads)
-    for frame, mappable in views:
-        mask = mappable.copy()
+    spheres = SplatTree(splats.centers, splats.radii, num_threads)
+
+    def bare(frame: RgbdFrame, mappable: Bool) -> Candidates:
         step = _gap_stride(frame, config.max_gap) if stride is None else stride
-        rows = np.arange(len(mask))
-        mask[(rows % step != 0) | ((rows // step) % 2 == (2 if half is None else 1 - half))] = False
-        mask[:, np.arange(mask.shape[1]) % step != 0] = False
+        rows = np.arange(len(mappable))
+        skipped = (rows % step != 0) | ((rows // step) % 2 == (2 if half is None else 1 - half))
+        mask = np.zeros_like(mappable)
+        mask[~skipped, ::step] = mappable[~skipped, ::step]
         mask[mask] = spheres.are_further(world_points_at(frame, mask, num_threads), config.max_gap)
-        if mask.any():
-            sources.append(candidates(frame, mask))
+        return candidates(frame, mask)
+
+    sources = [source for source in each(lambda view: bare(*view), views) if len(source)]
     forgotten = occupied[spheres.are_further(occupied, config.max_gap + 0.5 * voxel)]
     if len(forgotten):
         sources.append(_of_voxels(forgotten, splats))

@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("\n".join(f"{row.name}  {row.family}, {row.kind}" for row in border_of(read_rows(TABLE))))
         return 0
     wanted = args.only or [(args.seed, index) for index in range(args.first, args.first + args.runs)]
-    nodes = [_node(seed, index) for seed, index in wanted]
+    nodes = [_node(seed, index, args.device) for seed, index in wanted]
     with Ledger(args.out) as ledger, local_executor(args.jobs) as executor:
         places = {"executor": executor, "slots": args.jobs}
         runs = Scheduler(ledger=ledger, entry=ENTRY, progress=Lines(), **places).run(nodes)
@@ -41,8 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def one(words: list[str]) -> int:
-    """What a node runs: the run that its word names; its row and line go to stdout."""
-    row = run(*_run_name(words[0]))
+    """What a node runs: the run that its words name, and the device; its row and line go to stdout."""
+    row = run(*_run_name(words[0]), device=words[1])
     label = (
         ("false green" if row.observable else "false green, not observable") if row.is_false_green else row.outcome
     )
@@ -57,9 +57,9 @@ def preload() -> None:
     run(0, 0)
 
 
-def _node(seed: int, index: int) -> Node:
+def _node(seed: int, index: int, device: str) -> Node:
     name = f"{seed}/{index}"
-    return Node(name=name, recording=str(seed), job=str(index), command="hunt", words=(name,), inputs=_code())
+    return Node(name=name, recording=str(seed), job=str(index), command="hunt", words=(name, device), inputs=_code())
 
 
 def _code() -> tuple[Path, ...]:
@@ -99,6 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="of the campaign (default: 0)")
     parser.add_argument("--first", type=int, default=0, metavar="INDEX", help="the first run (default: 0)")
     parser.add_argument("--only", type=_run_name, nargs="+", metavar="SEED/INDEX", help="these runs alone")
+    parser.add_argument("--device", default="cpu", metavar="NAME", help="of the fits: cpu (default), cuda or cuda:N")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
     parser.add_argument(
         "--border", action="store_true", help=f"print runs of {TABLE.name} for tests/tools/border.txt"

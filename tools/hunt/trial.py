@@ -142,8 +142,8 @@ def draw(seed: int, index: int, model: RobotModel) -> Trial:
     raise RuntimeError(f"{seed}/{index}: no scene found")
 
 
-def run(seed: int, index: int) -> Row:
-    """Draw, record, judge, compare."""
+def run(seed: int, index: int, device: str = "cpu") -> Row:
+    """Draw, record, judge, compare; the fit on a `device`, as of --device."""
     with TemporaryDirectory(prefix="hunt") as name:
         folder = Path(name)
         model = true_robot(folder)
@@ -151,7 +151,7 @@ def run(seed: int, index: int) -> Row:
         arm = TrueArm(model, trial.world.tool)
         shown = record(trial, model, folder)
         evidence = _evidence(trial, arm, shown)
-        outcome, result = _judged(trial, folder)
+        outcome, result = _judged(trial, folder, device)
         clearance = _true_clearance(trial, arm, result)
     return Row(
         seed=seed,
@@ -207,7 +207,7 @@ def config_of(trial: Trial) -> Config:
     return config
 
 
-def _judged(trial: Trial, folder: Path) -> tuple[Word, ReplayResult | None]:
+def _judged(trial: Trial, folder: Path, device: str = "cpu") -> tuple[Word, ReplayResult | None]:
     """The chain's own word; None beside a refusal."""
     config, log, robot = config_of(trial), folder / "log.mcap", (folder / "robot.urdf", folder / "robot.yaml")
     try:
@@ -221,6 +221,7 @@ def _judged(trial: Trial, folder: Path) -> tuple[Word, ReplayResult | None]:
                     spheres=robot[1],
                     box=BOX,
                     threads=1,
+                    device=device,
                 )
             )
             request = ReplayRequest(
