@@ -161,6 +161,7 @@ NEAR_FEWEST = 5  # such points, at least
 UNWATCHED_NS = 500_000_000  # [ns] without depth from about the arm: two frame sets of a slow recording
 UNWATCHED_AFTER_NS = 10_000_000_000  # [ns] after a motion, in which the next depth is waited for
 UNWATCHED_APART_NS = 20_000_000  # [ns] between postures that are held against the next map
+NEWS_LEAST = 3  # spheres new to a map in what was free: fewer come from single pixels of noise at every time step
 NEAR_LEAST_SHARE = 0.05  # of the shell: fewer points say nothing
 MAX_RESUME = 100.0  # [m] a zone wider than any hall would hold the arm for ever
 ZONE_RESOLUTION = 0.01  # [m] a person this near to a box counts as inside

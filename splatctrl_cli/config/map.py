@@ -116,7 +116,9 @@ class SceneConfig(Section, section="scene"):
     window: Annotated[int, Within(0, 1000, "", "keyframes kept beside the newest frames; 1000 take 3 GB")] = 12
     keyframe_distance: Annotated[float, Within(0, 100, "m", "a camera that moved farther makes a keyframe")] = 0.05
     keyframe_angle: Annotated[float, Within(0, 180, "deg", "a camera that turned farther makes a keyframe")] = 5.0
-    snapshot_every: Annotated[int, Within(1, 1_000_000, "", "time steps between snapshots")] = 1
+    snapshot_every: Annotated[
+        int, Within(1, 1_000_000, "", "time steps between snapshots; what shows something new leaves one, too")
+    ] = 1
     snapshot_period: Annotated[
         float, Within(0, 86_400, "s", "least time of the log between snapshots; 0: only snapshot_every counts")
     ] = 0.0

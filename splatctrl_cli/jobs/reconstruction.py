@@ -9,12 +9,12 @@ from typing import Any
 from tqdm import tqdm
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import SAME_MOMENT_NS
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.files.ply import read_points
 from splatctrl_cli.jobs.correct_views import Corrections
 from splatctrl_cli.jobs.device import CPU, Device, FitDevice
+from splatctrl_cli.jobs.kept_maps import KeptMaps
 from splatctrl_cli.jobs.open_recording import CameraAgreement, guessed_unit
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
@@ -112,6 +112,7 @@ class Reconstruction:
         self.cameras = training_cameras(self.source)
         comments = {"format": FORMAT, "frame": "world", "units": "m", "source": self.source.name}
         self.writer = SceneWriter(folder, comments, checkpoint)
+        self._kept = KeptMaps(self.writer, self.config)
         self.fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []
         self.stamps: list[int] = []
@@ -206,7 +207,7 @@ class Reconstruction:
         self._record(row)
         if self.fitter.num_steps == 1:
             self._warn_of_small_budget(row, console)
-        if self.source.has_clock and self._is_snapshot_due(index, step.stamp_ns):
+        if self.source.has_clock and (self._kept.is_due(index, step.stamp_ns) or self._kept.shows_news(self.fitter)):
             self.snapshot(step.stamp_ns)
         return row
 
@@ -276,17 +277,6 @@ class Reconstruction:
     def _record(self, row: AuditRow) -> None:
         self.rows.append(row)
         self.writer.audit(row)
-
-    def _is_snapshot_due(self, index: int, stamp_ns: int) -> bool:
-        """Every `snapshot_every` time steps, and then only if a multiple of `snapshot_period` has passed since."""
-        scene, taken = self.config.scene, self.writer.snapshots
-        if index % scene.snapshot_every:
-            return False
-        period_ns = round(scene.snapshot_period * 1e9)
-        if not taken or period_ns == 0:
-            return True
-        first, last = taken[0].stamp_ns - SAME_MOMENT_NS, taken[-1].stamp_ns
-        return (stamp_ns - first) // period_ns > (last - first) // period_ns
 
     def snapshot(self, stamp_ns: int) -> None:
         """Write the map as it is."""
