@@ -11,7 +11,7 @@ from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.jobs.studies.experiments import STUDIES, ProblemRequest
 from splatctrl_cli.jobs.studies.problem_run import run_problem
 from splatctrl_cli.jobs.studies.rows import TRIALS
-from splatctrl_cli.jobs.studies.study import StudyRequest, StudyResult, run_study
+from splatctrl_cli.jobs.studies.study import StudyRequest, StudyResult, merged_study, run_study
 
 
 def run(args: argparse.Namespace) -> int:
@@ -20,7 +20,10 @@ def run(args: argparse.Namespace) -> int:
         return _one(args)
     console, workers = Console(args, is_step=True), args.workers or os.cpu_count() or 1
     request = request_of(StudyRequest, args, out=args.out or Path(args.study), workers=workers)
-    result = run_study(request, OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1)), console)
+    if request.made:
+        result = merged_study(request)
+    else:
+        result = run_study(request, OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1)), console)
     sections = {title: {"header": header, "rows": rows} for title, header, rows in result.sections}
     found = {"out": str(result.out), "trials": len(result.trials), "lacking": result.lacking, "tables": sections}
     return console.concluded(result.verdict, found, _lines(result))

@@ -7,67 +7,65 @@ edge holds of it.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.field.baker import Baker, Planes
+from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, GridLayout
+from splatctrl_cli.field.grid_cells import GridLayout
 from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
 from splatctrl_cli.jobs.replays.compare import ROUNDING
 from splatctrl_cli.jobs.replays.known_scene import KnownScene, known_space, seen_of, splat_fields
 from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.jobs.studies.views import Step, Views
+from splatctrl_cli.jobs.studies.ways import Asked, Surroundings, Ways, beside_the_start
 from splatctrl_cli.libraries import of_extra
 from splatctrl_cli.planner.configuration_clearance import HasDistance, OnlyDistance
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.lost_edges import LostEdges, lost_edges
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask, self_mask_metrics
-from splatctrl_cli.voxels import Balls, OccupancyGrid, VoxelState
+from splatctrl_cli.voxels import Balls, VoxelState
 
 TSDF_BLOCKS = 20_000  # of 8 voxels along each edge, to begin with
 TSDF_VOXEL, TSDF_BAND = 0.01, 0.04  # [m] edge of a voxel, and how far from a surface the TSDF reaches
-UNSEEN_NEAR = 0.08  # [m] about the arm at its start, which it hides, and at the goal, which it is given
-START_GAP = 2e-3  # [m] that an obstacle of the map is from the arm at its start, or it is the arm's own
-
-
-@dataclass(frozen=True, kw_only=True)
-class Asked:
-    """A distance as a scene to plan in."""
-
-    distance: DistanceFunction
 
 
 @dataclass(frozen=True, kw_only=True)
 class Map:
-    """scene: what the method takes for things; unseen: the distance to space that no camera saw, None where the
-    method does not tell it from free space. known: what a verdict and a controller look at, None without. num_parts:
-    splats, voxels or triangles.
+    """scene: what the method takes for things; ways: where a planner may go in it, None for anywhere outside of
+    things. known: what a verdict and a controller look at, None without. num_parts: splats, voxels or triangles.
     """
 
     scene: HasDistance
-    unseen: DistanceFunction | None = None
+    ways: Ways | None = None
     known: KnownScene | None = None
     num_parts: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """A reconstruction of views: its fitter and the residuals of its self-mask."""
+    """A reconstruction of views: its fitter, the residuals of its self-mask, and where the last images lost edges."""
 
     fitter: SceneFitter
     figures: dict[str, object]
+    edges: LostEdges
 
 
 def fitted(problem: Problem, views: Views, config: Config, threads: int) -> Fitted:
     """The map after all time steps, the arm at the start in each."""
     fitter = SceneFitter(config.scene, config.occupancy, workspace_of(problem), seed=problem.number, threads=threads)
     rows = [fitter.step(step, _posture(problem, step)) for step in views.steps]
-    return Fitted(fitter=fitter, figures={"voxel": config.occupancy.voxel, **self_mask_metrics(rows)})
+    last = views.steps[-1]
+    masks = [self_mask(frame, _posture(problem, last), config.occupancy) for frame in last]
+    return Fitted(
+        fitter=fitter,
+        figures={"voxel": config.occupancy.voxel, **self_mask_metrics(rows)},
+        edges=lost_edges(last, masks, config.occupancy),
+    )
 
 
 def workspace_of(problem: Problem) -> Box:
@@ -80,7 +78,8 @@ def splat_map(problem: Problem, made: Fitted, config: Config, threads: int) -> M
     """Ours: the exact distance to splats and to occupied voxels without one, and what was never seen.
 
     The planner's scene is without those that reach into the arm where it stands: what is there is the arm, and a few
-    of its pixels that were taken for something else. The verdict's has them.
+    of its pixels that were taken for something else. The verdict's has them. Where a planner may go, lost edges of
+    surfaces count, too.
     """
     fitter = made.fitter
     fields, voxels = splat_fields(fitter.splats(), config, threads, fitter.unrepresented), fitter.known_voxels()
@@ -95,46 +94,28 @@ def splat_map(problem: Problem, made: Fitted, config: Config, threads: int) -> M
         cameras=None,
         digests={},
     )
+    spheres, edges = obstacle_spheres(fitter.splats(), fitter.unrepresented).splats, made.edges
+    centers, radii = beside_the_start(problem, spheres.centers, spheres.radii)
+    edge_centers, edge_radii = beside_the_start(problem, edges.centers, edges.radii)
+    surroundings = Surroundings(
+        problem=problem,
+        centers=np.concatenate([centers, edge_centers]),
+        radii=np.concatenate([radii, edge_radii]),
+        num_known=len(radii),
+        grid=voxels.grid,
+        config=config,
+        threads=threads,
+    )
     return Map(
-        scene=Asked(distance=_less_rounding(_beside_the_start(problem, fitter, threads))),
-        unseen=unseen_distance(problem, voxels.grid, config),
+        scene=Asked(distance=_less_rounding(SphereField(centers, radii, threads=threads))),
+        ways=surroundings.ways,
         known=known,
         num_parts=len(fitter.splats()),
     )
 
 
-def _beside_the_start(problem: Problem, fitter: SceneFitter, threads: int) -> SphereField:
-    """The spheres of the map but those that reach into the arm's moving spheres at its start."""
-    spheres = obstacle_spheres(fitter.splats(), fitter.unrepresented).splats
-    moving = problem.model.moving_spheres
-    body = SphereField(problem.model.sphere_centers(problem.start)[moving], problem.model.sphere_set.radii[moving])
-    kept = body.query(spheres.centers.astype(np.float64))[0] - spheres.radii > START_GAP
-    return SphereField(spheres.centers[kept], spheres.radii[kept], threads=threads)
-
-
 def _less_rounding(field: SphereField) -> DistanceFunction:
     return lambda points: field.query(points)[0] - ROUNDING
-
-
-def unseen_distance(problem: Problem, grid: OccupancyGrid, config: Config) -> DistanceFunction | None:
-    """A lower bound of the distance to voxels that no camera saw and the arm was not in, as balls of their width;
-    None without any. Those `UNSEEN_NEAR` the arm's start and goal are left out.
-    """
-    states = grid.states(config.occupancy.free_below, config.occupancy.occupied_above)
-    is_unseen = states == VoxelState.NEVER_SEEN
-    centers = np.concatenate([problem.model.sphere_centers(q) for q in (problem.start, problem.goal)])
-    radii = np.tile(problem.model.sphere_set.radii, 2)
-    ends = [(centers + side * (radii + UNSEEN_NEAR)[:, None] - grid.origin) / grid.voxel for side in (-1, 1)]
-    low = np.maximum(np.floor(ends[0].min(axis=0)).astype(np.int64), 0)
-    window = tuple(slice(a, b) for a, b in zip(low, np.ceil(ends[1].max(axis=0)).astype(np.int64) + 1, strict=True))
-    cells = low + np.argwhere(is_unseen[window])
-    near = SphereField(centers, radii).query(grid.origin + grid.voxel * cells)[0] < UNSEEN_NEAR
-    is_unseen[tuple(cells[near].T)] = False
-    if not is_unseen.any() or is_unseen.all():
-        return None
-    away = (grid.voxel * (distance_transform_edt(~is_unseen) - 0.5)).astype(np.float32)
-    channels: Planes = {"sdf": away, "bound": away - np.float32(HALF_DIAGONAL * grid.voxel)}
-    return GridField(DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header={})).certified
 
 
 def printed_map(problem: Problem, made: Fitted, config: Config, threads: int) -> Map:

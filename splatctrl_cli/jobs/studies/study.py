@@ -1,6 +1,7 @@
 """A study from its request to its table: its problems are nodes of a batch, each made once."""
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,8 @@ class StudyRequest:
     """Run a study into the folder `out`, in which it goes on. trials: problems of each environment at most (None: as
     many as the paper's); problems: MotionBenchMaker's folder (None: what SPLATCTRL_REAL_DATA has, if anything);
     methods: of the study, none for all that are installed; shard: (i, n), every n-th problem from the i-th on;
-    width [px] of the images (None: the study's own).
+    width [px] of the images (None: the study's own). made: tables of trials or folders of studies, of which the table
+    is made instead of running a problem.
     """
 
     study: str
@@ -43,6 +45,7 @@ class StudyRequest:
     width: int | None = None
     workers: int = 1
     shard: tuple[int, int] = (1, 1)
+    made: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,9 +97,7 @@ def run_study(request: StudyRequest, command_line: CommandLine, progress: Progre
     lacking = [node.name for node in nodes if not _is_done(latest.get(node.name), keys[node.name])]
     trials = [] if lacking else [trial for node in nodes for trial in _trials_in(node, study)]
     if not lacking:
-        write_durably(out / TRIALS, lambda path: write_trials(path, trials, study.row))
-        if study.draw is not None:
-            study.draw(trials, out.with_name(f"{out.name}.png"))
+        _write(out, study, trials)
         page = out.with_name(f"{out.name}.html")
         write_report(WriteReportRequest(path=out, out=page, force=True), progress)
     return StudyResult(
@@ -108,6 +109,54 @@ def run_study(request: StudyRequest, command_line: CommandLine, progress: Progre
         verdict=_verdict(trials, lacking, latest, len(nodes)),
         num_kept=scheduler.num_kept,
     )
+
+
+def merged_study(request: StudyRequest) -> StudyResult:
+    """The table of the trials that `made` has: they may be of several machines, and some of each problem.
+
+    Raises InputError for what is no table of trials, and for a trial that is there twice; UsageError for an output
+    that is something else.
+    """
+    study, out = STUDIES[request.study], request.out.absolute()
+    found = {path: read_trials(path, study.row) for given in request.made for path in _tables(given)}
+    labels = Counter(trial.label for rows in found.values() for trial in rows)
+    for path, rows in found.items():
+        for trial in rows:
+            if labels[trial.label] > 1:
+                raise InputError(f"{path}: {trial.label}: is there twice", remedy="give each trial once")
+    trials = [trial for rows in found.values() for trial in rows]
+    asked = {"study": request.study, "is_merged": True}
+    check_can_be_written(out)
+    check_same_asked(out, FILE, asked, what="study")
+    out.mkdir(parents=True, exist_ok=True)
+    write_durably(out / FILE, lambda path: write_json(path, {"format": FORMAT, "version": 1, "asked": asked}))
+    _write(out, study, trials)
+    return StudyResult(
+        out=request.out,
+        trials=trials,
+        sections=list(study.sections(trials)),
+        notes=list(study.notes(trials)),
+        lacking=[],
+        verdict=verdict_on_trials(trials),
+        num_kept=0,
+    )
+
+
+def _tables(given: Path) -> list[Path]:
+    """A table of trials, that of a folder, or where it has none those of its problems."""
+    if not given.is_dir() or (given / TRIALS).is_file():
+        return [given / TRIALS if given.is_dir() else given]
+    found = sorted(given.glob(f"*/*/{TRIALS}"))
+    if not found:
+        raise InputError(f"{given}: has no {TRIALS}", remedy="give the folder of a study, or a table of its trials")
+    return found
+
+
+def _write(out: Path, study: Study[Any], trials: Sequence[Row]) -> None:
+    """The table of trials, and the figure of a study that has one."""
+    write_durably(out / TRIALS, lambda path: write_trials(path, trials, study.row))
+    if study.draw is not None:
+        study.draw(trials, out.with_name(f"{out.name}.png"))
 
 
 def archive_of(given: Path | None) -> Path | None:

@@ -14,7 +14,6 @@ from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.replays.inputs import MeasuredRobot
 from splatctrl_cli.jobs.studies import judge
 from splatctrl_cli.jobs.studies.maps import (
-    Asked,
     Fitted,
     Map,
     fitted,
@@ -25,6 +24,7 @@ from splatctrl_cli.jobs.studies.maps import (
 )
 from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.jobs.studies.views import Views, views_of
+from splatctrl_cli.jobs.studies.ways import plain_ways
 from splatctrl_cli.planner.configuration_clearance import HasDistance
 from splatctrl_cli.planner.path import joint_length
 from splatctrl_cli.planner.planned import GOAL_BLOCKED, START_BLOCKED, planned_detours, planned_path
@@ -40,7 +40,7 @@ SUBSET = 20  # problems of each drawn environment that go through every method
 CAMERAS = (2, 4, 6)
 DETOURS = 3
 NO_MARGIN = 1e-4  # [m]
-FIRST = 1500  # iterations of the search through seen space alone, before that through any
+SEARCH = 1500  # iterations for each of a map's ways
 BLOCKED = {START_BLOCKED: judge.START_BLOCKED, GOAL_BLOCKED: judge.GOAL_BLOCKED}
 NUM_STEPS = 5  # of each camera, the arm at rest
 
@@ -222,17 +222,18 @@ def _judged(rig: Rig, trial: Trial, attempt: Attempt, known: Map, robot: Measure
 
 
 def by_planner(rig: Rig, known: Map) -> Attempt:
-    """A planned path, followed in joint space: through space that cameras saw, or where there is none through any."""
-    unseen, scene = known.unseen, known.scene
-    if unseen is None:
-        return _planned(rig, scene, rig.config)
-    seen_alone = Asked(distance=lambda points: np.minimum(scene.distance(points), unseen(points)))
-    attempt = _planned(
-        rig, seen_alone, replace(rig.config, planner=replace(rig.config.planner, max_iterations=FIRST))
-    )
-    if attempt.position is not None:
-        return replace(attempt, in_known_space=True)
-    return replace(_planned(rig, scene, rig.config), in_known_space=False)
+    """A planned path, followed in joint space: the first of the map's ways that leads to the goal."""
+    attempt = Attempt(position=None, cause=judge.NO_PLAN)
+    for way in known.ways() if known.ways is not None else plain_ways(known.scene, rig.config):
+        config = replace(
+            rig.config,
+            planner=replace(rig.config.planner, max_iterations=SEARCH),
+            control=replace(rig.config.control, margin=way.margin),
+        )
+        attempt = replace(_planned(rig, way.scene, config), in_known_space=way.in_known_space)
+        if attempt.position is not None:
+            break
+    return attempt
 
 
 def as_printed(rig: Rig, known: Map) -> Attempt:

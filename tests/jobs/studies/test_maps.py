@@ -1,21 +1,17 @@
-"""Maps of one simulated problem: unseen space is kept out of first, the arm's own pixels do not block its start."""
-
-from dataclasses import replace
-from types import SimpleNamespace
+"""Maps of one simulated problem, and which of their ways a planner takes."""
 
 import numpy as np
 import pytest
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.files.output import Stopwatch
-from splatctrl_cli.jobs.studies import maps, trial
-from splatctrl_cli.jobs.studies.maps import Asked, Map
+from splatctrl_cli.jobs.studies import judge, maps, trial
+from splatctrl_cli.jobs.studies.maps import Map
 from splatctrl_cli.jobs.studies.problems import Problem, read_problem
 from splatctrl_cli.jobs.studies.trial import Rig
 from splatctrl_cli.jobs.studies.views import Views, views_of
-from splatctrl_cli.records import Float64, SplatSet
+from splatctrl_cli.jobs.studies.ways import Asked, Way, Ways
 from splatctrl_cli.simulate.truth import distance_to
-from splatctrl_cli.voxels import Balls, OccupancyGrid, VoxelState
 
 
 @pytest.fixture(scope="module")
@@ -28,55 +24,28 @@ def views(problem: Problem) -> Views:
     return views_of(problem, 2, width=96, num_steps=3)
 
 
-def splats_at(centers: Float64, radius: float) -> SplatSet:
-    num = len(centers)
-    return SplatSet(
-        centers=np.asarray(centers, np.float32),
-        radii=np.full(num, radius, np.float32),
-        colors=np.zeros((num, 3), np.float32),
-        opacities=np.ones(num, np.float32),
-        labels=np.zeros(num, np.uint8),
-        density=np.zeros(num, np.float32),
-    )
-
-
-def test_what_reaches_into_the_arm_at_its_start_is_not_in_the_planners_way(problem: Problem) -> None:
-    hand = problem.model.sphere_centers(problem.start)[problem.model.moving_spheres][-1]
-    far = hand + np.array([0.0, 0.0, 0.4])
-    nothing = Balls(centers=np.empty((0, 3), np.float32), radius=0.01, labels=np.empty(0, np.uint8))
-    fitter = SimpleNamespace(splats=lambda: splats_at(np.array([hand, far]), 0.01), unrepresented=nothing)
-    field = maps._beside_the_start(problem, fitter, 1)  # type: ignore[arg-type]
-    assert field.query(far[None])[0][0] == pytest.approx(-0.01, abs=1e-6)  # another thing stays
-    assert field.query(hand[None])[0][0] > 0.3
-
-
-def test_unseen_voxels_are_balls_but_beside_the_arms_start_and_goal(problem: Problem) -> None:
-    states = np.full((90, 90, 90), VoxelState.FREE, np.uint8)
-    hand = problem.model.sphere_centers(problem.start)[-1]
-    origin = hand - 0.02 * np.array([45.0, 45.0, 45.0])
-    states[45, 45, 45] = states[45, 45, 85] = VoxelState.NEVER_SEEN  # in the hand, and 80 cm above it
-    grid = OccupancyGrid.from_states(origin, 0.02, states)
-    unseen = maps.unseen_distance(problem, grid, Config())
-    assert unseen is not None
-    above = hand + np.array([0.0, 0.0, 0.8])
-    found = unseen(np.array([above, above - [0.0, 0.0, 0.1], hand]))
-    np.testing.assert_allclose(found, [-0.01, 0.09, 0.79], atol=1e-5)
-    assert maps.unseen_distance(problem, OccupancyGrid.from_states(origin, 0.02, 0 * states + 1), Config()) is None
-
-
 def rig(problem: Problem, views: Views) -> Rig:
     return Rig(problem=problem, views=views, config=Config(), threads=1, stopwatch=Stopwatch())
 
 
-def test_a_way_through_seen_space_is_taken_where_there_is_one(problem: Problem, views: Views) -> None:
+def ways_of(*clear: float) -> Ways:
+    """Ways in which everything is so far [m] from everything; the first is in known space."""
+    known = (True, False)
+    return lambda: (
+        Way(scene=Asked(distance=lambda points, d=d: np.full(len(points), d)), margin=0.02, in_known_space=k)
+        for d, k in zip(clear, known, strict=True)
+    )
+
+
+def test_the_first_way_that_leads_to_the_goal_is_taken(problem: Problem, views: Views) -> None:
     asked = rig(problem, views)
-    free = Map(scene=problem.solids, unseen=lambda points: np.full(len(points), 1.0))
-    assert trial.by_planner(asked, free).in_known_space is True
-    none = Map(scene=problem.solids, unseen=lambda points: np.full(len(points), -1.0))
-    attempt = trial.by_planner(asked, none)
-    assert attempt.in_known_space is False and attempt.position is not None
-    blocked = replace(none, scene=Asked(distance=lambda points: np.full(len(points), -1.0)))
-    assert trial.by_planner(asked, blocked).position is None
+    taken = [
+        trial.by_planner(asked, Map(scene=problem.solids, ways=ways_of(*clear)))
+        for clear in ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0))
+    ]
+    assert [attempt.in_known_space for attempt in taken] == [True, False, False]
+    assert [attempt.position is not None for attempt in taken] == [True, True, False]
+    assert taken[2].cause == judge.GOAL_BLOCKED
 
 
 def test_the_tsdfs_surfaces_are_those_of_the_things_without_the_arm(problem: Problem) -> None:

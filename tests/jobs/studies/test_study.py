@@ -11,7 +11,7 @@ from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome
 from splatctrl_cli.jobs.studies.rows import TRIALS, read_trials
-from splatctrl_cli.jobs.studies.study import FILE, StudyRequest, StudyResult, archive_of, run_study
+from splatctrl_cli.jobs.studies.study import FILE, StudyRequest, StudyResult, archive_of, merged_study, run_study
 from splatctrl_cli.jobs.studies.trial import CAMERAS, OURS, TRUTH, Trial
 from splatctrl_cli.simulate.environments import ENVIRONMENTS
 
@@ -80,6 +80,29 @@ def test_a_table_that_is_not_as_its_problem_left_it_is_refused(
     with pytest.raises(InputError, match=TRIALS):
         read_trials(changed, Trial)
     assert (copy / FILE).is_file()
+
+
+def test_trials_made_elsewhere_come_to_the_same_table(
+    whole: tuple[Path, StudyResult, StudyResult], tmp_path: Path
+) -> None:
+    out, _, result = whole
+    lines = (out / TRIALS).read_text().splitlines(keepends=True)
+    for name, part in (("a.csv", lines[1:5]), ("b.csv", lines[5:])):
+        (tmp_path / name).write_text("".join([lines[0], *part]))
+    files = (tmp_path / "a.csv", tmp_path / "b.csv")
+    merged = merged_study(replace(request(tmp_path / "table2"), made=files))
+    assert merged.sections == result.sections and merged.verdict == result.verdict
+    assert (tmp_path / "table2" / TRIALS).read_bytes() == (out / TRIALS).read_bytes()
+    unfinished = tmp_path / "unfinished"
+    shutil.copytree(out, unfinished)
+    (unfinished / TRIALS).unlink()
+    assert len(merged_study(replace(request(tmp_path / "again"), made=(unfinished,))).trials) == len(result.trials)
+    with pytest.raises(InputError, match=r"csv: cubby 0, 2 cameras, ours: is there twice"):
+        merged_study(replace(request(tmp_path / "twice"), made=(out, files[0])))
+    with pytest.raises(InputError, match=rf"has no {TRIALS}"):
+        merged_study(replace(request(tmp_path / "none"), made=(tmp_path / "table2" / "..",)))
+    with pytest.raises(UsageError, match="was begun with other settings"):
+        merged_study(replace(request(out), made=files))
 
 
 def test_a_method_and_an_archive_that_are_none_are_refused_by_name(tmp_path: Path) -> None:

@@ -1,0 +1,159 @@
+"""Where a planner may go in our map, the safest first: through space that cameras saw, then through any that is away
+from surfaces, then through any; in each with the margin asked for, and where that leaves no way with less.
+
+Q points, world frame, metres. A distance is a lower bound of a 1-Lipschitz one, so that what a planner proves of an
+edge holds of it.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import START_ROOM
+from splatctrl_cli.control.audit import DistanceFunction
+from splatctrl_cli.field.baker import Planes
+from splatctrl_cli.field.distance import SphereField
+from splatctrl_cli.field.grid_cells import HALF_DIAGONAL
+from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.jobs.replays.compare import ROUNDING
+from splatctrl_cli.jobs.studies.problems import Problem
+from splatctrl_cli.planner.configuration_clearance import HasDistance
+from splatctrl_cli.records import Bool, DistanceGrid, Float32, Float64
+from splatctrl_cli.voxels import OccupancyGrid, VoxelState
+
+UNSEEN_NEAR = 0.08  # [m] about the arm at its start, which it hides, and at the goal, which it is given
+START_GAP = 2e-3  # [m] that an obstacle of the map is from the arm at its start, or it is the arm's own
+BEHIND = 0.06  # [m] from a surface of the map, within which unseen space is likely the rest of the thing
+SHARES = (1.0, 0.4)  # of the margin asked for, as long as unseen space is avoided
+LEAST_SHARE = 0.15  # of it, where nothing else leaves a way
+ENDS_ROOM = 2 * START_ROOM + 1e-4  # [m] more than the margin, which a start or a goal has to keep
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """A distance as a scene to plan in."""
+
+    distance: DistanceFunction
+
+
+@dataclass(frozen=True, kw_only=True)
+class Way:
+    """A scene to plan in with a margin [m]. in_known_space: it keeps out of what no camera saw; None where the
+    method does not tell that from free space.
+    """
+
+    scene: HasDistance
+    margin: float
+    in_known_space: bool | None = None
+
+
+Ways = Callable[[], Iterator[Way]]
+
+
+def plain_ways(scene: HasDistance, config: Config) -> Iterator[Way]:
+    """Of a map that does not tell unseen space from free space: by the margin alone."""
+    return (Way(scene=scene, margin=share * config.control.margin) for share in (*SHARES, LEAST_SHARE))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surroundings:
+    """What there is for a planner of a problem: balls, centers (N, 3) and radii (N,) float32 [m], that stand for
+    things, those from num_known on for lost edges; and the grid of what cameras saw.
+    """
+
+    problem: Problem
+    centers: Float32
+    radii: Float32
+    num_known: int
+    grid: OccupancyGrid
+    config: Config
+    threads: int = 1
+
+    def ways(self) -> Iterator[Way]:
+        """The safest first; each distance is made when it is asked for."""
+        margin = self.config.control.margin
+        things = [self.things(share * margin) for share in SHARES]
+        for unseen, is_known in ((self.unseen, True), (self.unseen_behind, False)):
+            if unseen is not None:
+                for share, thing in zip(SHARES, things, strict=True):
+                    scene = Asked(distance=_least_of(thing, unseen))
+                    yield Way(scene=scene, margin=share * margin, in_known_space=is_known)
+        for share in (*SHARES, LEAST_SHARE):
+            scene = Asked(distance=self.things(share * margin, has_edges=share > LEAST_SHARE))
+            yield Way(scene=scene, margin=share * margin, in_known_space=self.unseen is None)
+
+    def things(self, margin: float, *, has_edges: bool = True) -> DistanceFunction:
+        """The distance to the balls, those smaller that the start or the goal is nearer to than the margin [m]: a
+        ball may be as much too large, and what is given is as near as it is. The centre of a ball yields as far as
+        the arm's surface, and not inside it.
+        """
+        least, num = -margin, len(self.radii) if has_edges else self.num_known
+        centers, radii = self.centers[:num], self.radii[:num]
+        for q in (self.problem.start, self.problem.goal):
+            away = _body(self.problem, q).query(centers.astype(np.float64))[0]
+            radii = np.minimum(radii, np.maximum(away - margin - ENDS_ROOM, least).astype(np.float32))
+        field = SphereField(centers, radii + np.float32(margin), threads=self.threads)  # no radius below 0
+        return lambda points: field.query(points)[0] + (margin - ROUNDING)
+
+    @cached_property
+    def unseen(self) -> DistanceFunction | None:
+        """A lower bound of the distance to space that no camera saw and the arm was not in; None without any."""
+        return self._distance_to(self._is_unseen)
+
+    @cached_property
+    def unseen_behind(self) -> DistanceFunction | None:
+        """The same of what is `BEHIND` a surface of the map alone."""
+        grid, is_behind = self.grid, self._is_unseen.copy()
+        cells = np.argwhere(is_behind)
+        if not len(cells) or not len(self.centers):
+            return None
+        away = cKDTree(self.centers).query(grid.origin + grid.voxel * cells, distance_upper_bound=BEHIND)[0]
+        is_behind[tuple(cells[~np.isfinite(away)].T)] = False
+        return self._distance_to(is_behind)
+
+    @cached_property
+    def _is_unseen(self) -> Bool:
+        """Voxels (X, Y, Z), without those `UNSEEN_NEAR` the arm's start and goal."""
+        grid, problem, occupancy = self.grid, self.problem, self.config.occupancy
+        states = grid.states(occupancy.free_below, occupancy.occupied_above)
+        is_unseen: Bool = states == VoxelState.NEVER_SEEN
+        centers = np.concatenate([problem.model.sphere_centers(q) for q in (problem.start, problem.goal)])
+        radii = np.tile(problem.model.sphere_set.radii, 2)
+        ends = [(centers + side * (radii + UNSEEN_NEAR)[:, None] - grid.origin) / grid.voxel for side in (-1, 1)]
+        low = np.maximum(np.floor(ends[0].min(axis=0)).astype(np.int64), 0)
+        high = np.ceil(ends[1].max(axis=0)).astype(np.int64) + 1
+        window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        cells = low + np.argwhere(is_unseen[window])
+        near = SphereField(centers, radii).query(grid.origin + grid.voxel * cells)[0] < UNSEEN_NEAR
+        is_unseen[tuple(cells[near].T)] = False
+        return is_unseen
+
+    def _distance_to(self, chosen: Bool) -> DistanceFunction | None:
+        """Voxels (X, Y, Z) as balls of their width; None for none or all."""
+        grid = self.grid
+        if not chosen.any() or chosen.all():
+            return None
+        away = (grid.voxel * (distance_transform_edt(~chosen) - 0.5)).astype(np.float32)
+        channels: Planes = {"sdf": away, "bound": away - np.float32(HALF_DIAGONAL * grid.voxel)}
+        return GridField(DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header={})).certified
+
+
+def _body(problem: Problem, q: Float64) -> SphereField:
+    """The arm's moving spheres at a posture (J,)."""
+    moving = problem.model.moving_spheres
+    return SphereField(problem.model.sphere_centers(q)[moving], problem.model.sphere_set.radii[moving])
+
+
+def beside_the_start(problem: Problem, centers: Float32, radii: Float32) -> tuple[Float32, Float32]:
+    """The balls (N, 3), (N,) that are farther than `START_GAP` from the arm's moving spheres at its start."""
+    is_kept = _body(problem, problem.start).query(centers.astype(np.float64))[0] - radii > START_GAP
+    return centers[is_kept], radii[is_kept]
+
+
+def _least_of(first: DistanceFunction, second: DistanceFunction) -> DistanceFunction:
+    return lambda points: np.minimum(first(points), second(points))
