@@ -281,7 +281,11 @@ COMMANDS = {
     ),
     "study": Command(
         summary="repeat an experiment of the paper, trial by trial",
-        examples=("study table2 --trials 20 -o out/table2", "study table2 --problem cubby-0007 -o out/one"),
+        examples=(
+            "study table2 --trials 20 -o out/table2",
+            "study table2 --problem cubby-0007 -o out/one",
+            "study ablation --trials 4",
+        ),
         run="study:run",
         options=study_options,
         judges=True,

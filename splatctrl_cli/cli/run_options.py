@@ -65,7 +65,7 @@ def sweep_options(add: Options, parser: Parser) -> None:
 
 def study_options(add: Options, parser: Parser) -> None:
     """Of ``splatctrl study``."""
-    add("STUDY", "which experiment of the paper", ("table2",))
+    add("STUDY", "which experiment of the paper", ("table2", "ablation"))
     add("-o/--out DIR", "folder of the study, where it goes on (default: STUDY)", Path)
     add("--trials N", "problems of each environment (default: as many as the paper's)", whole(1, 100_000))
     add("--methods A,B", "ours, tsdf, truth, ... (docs/study.md; default: all that are installed)", _names)

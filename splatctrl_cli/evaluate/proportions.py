@@ -1,10 +1,12 @@
-"""Shares of trials that succeed: intervals, and whether two methods differ on the same trials."""
+"""Shares of trials that succeed, means of figures of trials: intervals, and whether two methods differ in pairs."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from scipy.stats import binom, norm
+import numpy as np
+from scipy.stats import binom, norm, wilcoxon
+from scipy.stats import t as student
 
 CONFIDENCE = 0.95
 
@@ -56,3 +58,24 @@ def paired(outcomes: Sequence[tuple[bool, bool]]) -> Paired:
     second = sum(b and not a for a, b in outcomes)
     p_value = min(1.0, 2.0 * float(binom.cdf(min(first, second), first + second, 0.5))) if first + second else 1.0
     return Paired(num=len(outcomes), only_first=first, only_second=second, p_value=p_value)
+
+
+def mean_between(values: Sequence[float]) -> tuple[float, float, float]:
+    """The mean, and the interval that has the true one with `CONFIDENCE` by Student's t; NaN of too few."""
+    if not values:
+        return math.nan, math.nan, math.nan
+    mean, num = float(np.mean(values)), len(values)
+    if num == 1:
+        return mean, math.nan, math.nan
+    half = float(student.ppf(0.5 + CONFIDENCE / 2, num - 1) * np.std(values, ddof=1)) / math.sqrt(num)
+    return mean, mean - half, mean + half
+
+
+def signed_rank(differences: Sequence[float]) -> tuple[str, str, str, str]:
+    """Of differences within pairs, in words: the mean, its interval, how many are above 0, and the p of Wilcoxon's
+    signed ranks (two-sided; NaN of fewer than five, or where none differs).
+    """
+    mean, low, high = mean_between(differences)
+    p = float(wilcoxon(differences).pvalue) if len(differences) > 4 and np.any(differences) else math.nan
+    above = sum(value > 0 for value in differences)
+    return f"{mean:+.2f}", f"{low:+.2f} to {high:+.2f}", f"{above}/{len(differences)}", f"{p:.2g}"

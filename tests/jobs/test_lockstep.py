@@ -1,6 +1,7 @@
 """``splatctrl replay --lockstep`` and ``--latency``: what is known of the scene at each time, and since when."""
 
 import csv
+import re
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.raw_log import Damage, RawMessage
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.jobs import replay as job
-from splatctrl_cli.jobs.progress import SILENT
+from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.replays import known_scene
 from splatctrl_cli.jobs.replays.known_scene import KnownFields, from_splats
 from splatctrl_cli.jobs.replays.lockstep import check_lockstep, from_log
@@ -24,6 +25,7 @@ from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene
+from tests.jobs.bakes import Said
 from tests.jobs.test_device import cards, run_of
 from tests.kernels.cuda.emulator import EmulatedDevice
 
@@ -149,8 +151,26 @@ def test_the_fit_of_a_lockstep_computes_where_it_is_told_to(
         check_lockstep(ReplayRequest(log=recording, out=tmp_path, scene=tmp_path, device="cuda"))
 
 
+def test_it_says_how_long_a_frame_set_took(recording: Path, tmp_path: Path, arm: RobotModel) -> None:
+    said = Said()
+    scene = opened(recording, tmp_path, arm, latency=0.0, console=said)
+    scene.advance(scene.stamps_ns[0] + SECOND)
+    scene.finish()
+    found = re.search(
+        r"lockstep: 5 frame sets, recorded 200 ms apart, took (\d+) ms each in the median, (\d+) ms at",
+        said.lines[-1],
+    )
+    assert found is not None and 0 < int(found[1]) <= int(found[2])
+
+
 def opened(
-    recording: Path, folder: Path, arm: RobotModel, *, latency: float, device: str = "auto"
+    recording: Path,
+    folder: Path,
+    arm: RobotModel,
+    *,
+    latency: float,
+    device: str = "auto",
+    console: Progress = SILENT,
 ) -> known_scene.KnownScene:
     request = ReplayRequest(
         log=recording / "log.mcap",
@@ -164,7 +184,7 @@ def opened(
         threads=1,
         config=load_config(None, SETTINGS),
     )
-    return from_log(request, arm, folder, SILENT)
+    return from_log(request, arm, folder, console)
 
 
 def test_a_map_is_known_only_after_the_latency(desk: Desk, arm: RobotModel) -> None:

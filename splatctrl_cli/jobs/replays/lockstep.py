@@ -1,5 +1,6 @@
 """A log's reconstruction in lockstep with its replay: frame sets are taken in as the replay's clock passes them."""
 
+import time
 from bisect import bisect_right
 from collections.abc import Callable
 from functools import lru_cache
@@ -150,6 +151,7 @@ class Lockstep:
         self._fitted, self._config, self._console = fitted, config, console
         self._latency_ns, self._ends_with_log = latency_ns, ends_with_log
         self._stopwatch = Stopwatch()
+        self._taking: list[tuple[int, float]] = []  # of each frame set, its stamp [ns] and the time [s] that it took
         self._held_out_every = held_out_every
         self._steps = trained(fitted.time_steps(), held_out_every)
         self._next = next(self._steps, None)
@@ -196,7 +198,7 @@ class Lockstep:
             self._take()
 
     def _take(self) -> None:
-        step, fitted = self._next, self._fitted
+        step, fitted, start = self._next, self._fitted, time.perf_counter()
         assert step is not None
         with self._stopwatch.stage("fit"), fitted.device.told_how_to_go_on(Path()):
             fitted.take(step, self._console)
@@ -206,6 +208,7 @@ class Lockstep:
         if self._next is None and fitted.rows and taken[-1].stamp_ns < step.stamp_ns:
             fitted.snapshot(step.stamp_ns)  # the log's last map, due or not
         fitted.writer.settle()
+        self._taking.append((step.stamp_ns, time.perf_counter() - start))
         for snapshot in taken[len(self._files) :]:
             self._stamps_ns.append(snapshot.stamp_ns)
             self._files.append(snapshot.path)
@@ -246,8 +249,17 @@ class Lockstep:
             seed=fitted.request.seed,
         )
         fitted.device.close()
-        num, seconds = len(fitted.rows), self._stopwatch.seconds["fit"]
-        self._console.log(f"lockstep: {num} frame sets, {seconds / num:.3g} s each; their maps are in {FOLDER}/")
+        self._console.log(self._speed())
+
+    def _speed(self) -> str:
+        """How long a frame set takes from its frames to its map, and how far apart they were recorded."""
+        stamps_ns, seconds = zip(*self._taking, strict=True)
+        middle, most = (f"{1e3 * float(t):.0f} ms" for t in np.percentile(seconds, [50, 99]))
+        apart = f", recorded {1e-6 * float(np.median(np.diff(stamps_ns))):.0f} ms apart" if len(stamps_ns) > 1 else ""
+        return (
+            f"lockstep: {len(seconds)} frame sets{apart}, took {middle} each in the median, {most} at 99 %; their"
+            f" maps are in {FOLDER}/"
+        )
 
 
 def _training_source(request: ReplayRequest, model: RobotModel, source: RecordSource | None) -> FrameSource:

@@ -8,7 +8,7 @@ from typing import Any, Generic
 from splatctrl_cli.config import Config, PlannerConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.output import Stopwatch
-from splatctrl_cli.jobs.studies import table2, trial
+from splatctrl_cli.jobs.studies import ablation, ablation_table, table2, trial
 from splatctrl_cli.jobs.studies.problems import FAMILIES, read_problem
 from splatctrl_cli.jobs.studies.rows import R
 from splatctrl_cli.libraries import is_installed
@@ -70,7 +70,23 @@ def _planned(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> I
     )
 
 
+def _ablated(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[ablation.Measured]:
+    """A recording with each mechanism off in turn; `config` is that of each."""
+    del config
+    yield from ablation.measured(
+        request.problem, request.methods, width=request.width, threads=request.threads, stopwatch=stopwatch
+    )
+
+
 STUDIES: Mapping[str, Study[Any]] = {
+    "ablation": Study(
+        row=ablation.Measured,
+        methods=tuple(ablation.OFF),
+        problems=ablation.problems,
+        trials=_ablated,
+        sections=ablation_table.sections,
+        notes=ablation_table.notes,
+    ),
     "table2": Study(
         row=trial.Trial,
         methods=trial.METHODS,

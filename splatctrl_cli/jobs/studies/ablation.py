@@ -1,0 +1,224 @@
+"""What each mechanism is worth: a recording whose truth is known, with each of them off, one at a time."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.errors import SplatCtrlError
+from splatctrl_cli.evaluate.verdict import verdict_of
+from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
+from splatctrl_cli.jobs.reconstruct import reconstruct
+from splatctrl_cli.jobs.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.replay import ReplayResult, replay
+from splatctrl_cli.jobs.replays.request import ReplayRequest
+from splatctrl_cli.jobs.score import ScoreRequest, score
+from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
+from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.simulate.recording import RecordingOptions
+
+TABLE, SCAN = "table", "scan"
+NUM_PROBLEMS = {TABLE: 20, SCAN: 5}  # motions past a visitor whose place is drawn; fits of the still scan by seed
+ALL = "all"
+OFF: Mapping[str, tuple[str, ...]] = {  # the settings that take a mechanism out
+    ALL: (),
+    "occupancy-rule": ("occupancy.rule=literal",),
+    "seen-through": ("occupancy.see_through=1e9",),
+    "uncertain": ("occupancy.uncertain_patience=1000000",),
+    "gap-filling": ("scene.max_gap=1e9",),
+    "hole-term": ("scene.hole_opacity=0",),
+    "add-thresholds": ("scene.min_depth_error=0", "scene.max_depth_error=1e9"),
+    "contact-splats": ("scene.contact_radius=0.02",),
+    "depth-normalisation": ("scene.depth_loss=printed",),
+    "opacity-term": ("scene.lambda_opacity=0",),
+    "low-regulariser": ("scene.lambda_reg=0.02",),
+    "noise": ("scene.noise=0",),
+    "background": ("scene.background=black",),
+    "shell": ("scene.shell=0",),
+    "scale": ("scene.scale=1",),
+    "idle-detail": ("scene.when_idle=leave",),
+    "end-depth": ("scene.refine_depth=1",),
+    "least-range": ("occupancy.min_range=0",),
+    "safe-minimum": ("field.distance=gpdf",),
+    "distance-rate": ("control.distance_rate=none",),
+    "barrier-gain": ("control.barrier_gain=1",),
+    "second-look": ("control.max_cuts=0",),
+    "reduced-program": ("control.program=printed", "control.max_cuts=0"),
+}
+STILL_ALONE = ("scale", "idle-detail", "end-depth")  # of fits without a clock, or without a robot
+OF_MOTION = ("safe-minimum", "distance-rate", "barrier-gain", "second-look", "reduced-program")  # the same map
+TRAINING, SCORED = ("cam0", "cam1", "cam2"), ("cam3",)
+HELD_OUT = "holdout:1,4"
+START_S = 1.6  # of the closed loop, before the visitor comes
+SAFE = "safe"
+TOLERATED = 0.005  # [m] below the margin that is no false green
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """A recording without a mechanism; what does not apply is None. psnr [dB], depth [m], in_front: of held-out
+    pixels that a training view saw; fit_s [s]. audit, loop: labels of the verdicts by the map alone, on the recorded
+    motion and on that which the controller drives; with the least clearance [m] of each, true_clearance and
+    loop_clearance. margin [m].
+    """
+
+    environment: str
+    number: int
+    method: str
+    error: str = ""
+    psnr: float | None = None
+    depth: float | None = None
+    in_front: float | None = None
+    splats: int | None = None
+    fit_s: float | None = None
+    audit: str = ""
+    map_clearance: float | None = None
+    true_clearance: float | None = None
+    loop: str = ""
+    reached: bool | None = None
+    loop_clearance: float | None = None
+    loop_s: float | None = None
+    margin: float = 0.0
+
+    @property
+    def verdict(self) -> str:
+        """Of the audit."""
+        return self.audit
+
+    def false_greens(self) -> int:
+        """Of the two motions, those that were called safe nearer to something than the margin."""
+        judged = ((self.audit, self.true_clearance), (self.loop, self.loop_clearance))
+        return sum(word == SAFE and d is not None and d < self.margin - TOLERATED for word, d in judged)
+
+    def false_collisions(self) -> int:
+        """Of the two motions, those that were called contact or too near and kept the margin."""
+        judged = ((self.audit, self.true_clearance), (self.loop, self.loop_clearance))
+        return sum(word in ("contact", "margin broken") and d is not None and d >= self.margin for word, d in judged)
+
+    @property
+    def is_false_green(self) -> bool:
+        """With every mechanism on: without one it is what the study looks for."""
+        return self.method == ALL and self.false_greens() > 0
+
+    @property
+    def success(self) -> bool:
+        """Whether it ran, and the closed loop, where there is one, reached its goal without touching anything."""
+        touched = self.loop_clearance is not None and self.loop_clearance < 0.0
+        return not self.error and self.reached is not False and not touched
+
+    @property
+    def cause(self) -> str:
+        """Of no success."""
+        return "" if self.success else self.error or ("collision" if self.reached else "goal not reached")
+
+    @property
+    def label(self) -> str:
+        """Which it is."""
+        return f"{self.environment}-{self.number:04d}, without {self.method}"
+
+    @property
+    def told(self) -> str:
+        """In a few words."""
+        if self.error:
+            return f"{self.label}: {self.error}"
+        words = f"audit {self.audit}, loop {self.loop}" if self.audit else "no robot"
+        return f"{self.label}: {self.psnr or 0.0:.2f} dB, {words}"
+
+
+def problems(trials: int | None, has_archive: bool) -> list[tuple[str, int]]:
+    """Environment and number of all, or of at most `trials` of each."""
+    del has_archive
+    return [(name, n) for name, most in NUM_PROBLEMS.items() for n in range(min(most, trials or most))]
+
+
+def measured(
+    problem: str, methods: Sequence[str], *, width: int, threads: int, stopwatch: Stopwatch
+) -> Iterator[Measured]:
+    """The recording of a name through the mechanisms, each off in turn."""
+    environment, _, digits = problem.rpartition("-")
+    number = int(digits)
+    elsewhere = OF_MOTION if environment == SCAN else STILL_ALONE
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        with stopwatch.stage("recording"):
+            _record(folder / "recording", environment, number, width)
+        for method in (name for name in methods if name not in elsewhere):
+            config = load_config(None, OFF[method])
+            row = Measured(environment=environment, number=number, method=method, margin=config.control.margin)
+            with stopwatch.stage(method):
+                try:
+                    yield _run(row, folder, config, threads)
+                except SplatCtrlError as error:
+                    yield replace(row, error=str(error))
+
+
+def _record(out: Path, environment: str, number: int, width: int) -> None:
+    """A table with a visitor whose place and time the number draws, or a scan."""
+    options = RecordingOptions(width=width, height=width * 3 // 4, seed=number)
+    if environment == SCAN:
+        simulate(SimulateRequest(out=out, options=replace(options, duration_s=0.6), dtu=True))
+        return
+    rng = np.random.default_rng([number, 19])
+    place = (float(rng.uniform(0.34, 0.5)), float(rng.uniform(-0.15, 0.2)), float(rng.uniform(0.03, 0.07)))
+    simulate(SimulateRequest(out=out, options=replace(options, visitor=place)))
+
+
+def _run(row: Measured, folder: Path, config: Config, threads: int) -> Measured:
+    """Reconstruct, score, audit and drive as `row` says."""
+    given, scene = folder / "recording", folder / (ALL if row.method in OF_MOTION else row.method)
+    is_scan = row.environment == SCAN
+    urdf, spheres = (None, None) if is_scan else (given / "robot.urdf", given / "robot_spheres.yaml")
+    if is_scan:
+        seen = held_out = RecordingRequest(path=given / "dtu", is_dtu=True, protocol=HELD_OUT)
+    else:
+        seen = RecordingRequest(path=given / "log.mcap", options=SourceOptions(cameras=TRAINING))
+        held_out = replace(seen, options=SourceOptions(cameras=SCORED))
+    if not scene.exists():
+        made = reconstruct(
+            ReconstructRequest(
+                source=open_to_train(seen),
+                out=scene,
+                config=config,
+                seed=row.number,
+                threads=threads,
+                urdf=urdf,
+                spheres=spheres,
+            )
+        )
+        figures = score(ScoreRequest(scene=scene, recording=held_out, threads=threads)).metrics
+        row = replace(
+            row,
+            psnr=figures.get("psnr_seen"),
+            depth=figures.get("depth_median_seen"),
+            in_front=figures.get("in_front_seen"),
+            splats=int(made.metrics["splats"]),
+            fit_s=round(made.seconds["fit"], 3),
+        )
+    if is_scan:
+        return row
+    asked = ReplayRequest(
+        log=given / "log.mcap", scene=scene, truth=given / "truth.json", out=folder / f"{row.method}-audit",
+        config=config, threads=threads, worst_frames=0, urdf=urdf, spheres=spheres,
+    )  # fmt: skip
+    audit = replay(asked)
+    driven = replay(replace(asked, out=folder / f"{row.method}-loop", mode="closed-loop", start_time=START_S))
+    return replace(
+        row,
+        audit=_by_the_map(audit),
+        map_clearance=audit.metrics["min_clearance"],
+        true_clearance=audit.metrics["min_clearance_true"],
+        loop=_by_the_map(driven),
+        reached=bool(driven.metrics["goal_reached"]),
+        loop_clearance=driven.metrics["min_clearance_true"],
+        loop_s=driven.metrics["duration_s"],
+    )
+
+
+def _by_the_map(result: ReplayResult) -> str:
+    """The label of the verdict without what it knows of the truth."""
+    reasons = [reason for reason in result.verdict.reasons if not reason.criterion.startswith("true ")]
+    return verdict_of("replay", reasons, passed=SAFE).label
