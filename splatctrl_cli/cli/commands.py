@@ -284,7 +284,6 @@ COMMANDS = {
         examples=(
             "study table2 --trials 20 -o out/table2",
             "study table2 --problem cubby-0007 -o out/one",
-            "study ablation --trials 4",
         ),
         run="study:run",
         options=study_options,
