@@ -1,5 +1,6 @@
 """Voxels: what is known of space, since when, and what is occupied without a splat."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -7,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.records import Float32, Float64, UInt8
+from splatctrl_cli.records import Bool, Float32, Float64, UInt8
 
 MOST_VOXELS = 400_000_000  # of a grid
 UNANSWERED = 0xFFFF  # in place of a time step: a camera looked at the voxel, and none ever got depth from it
@@ -88,18 +89,42 @@ class Balls:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LostEdges:
+    """Where surfaces may go on in pixels without depth: balls, centers (K, 3) [m], world, radii (K,) [m], float32."""
+
+    centers: Float32
+    radii: Float32
+
+    @classmethod
+    def joined(cls, parts: Sequence["LostEdges"]) -> "LostEdges":
+        """All of them, none of no parts."""
+        return cls(
+            centers=np.concatenate([np.zeros((0, 3), np.float32), *(part.centers for part in parts)]),
+            radii=np.concatenate([np.zeros(0, np.float32), *(part.radii for part in parts)]),
+        )
+
+    def select(self, which: Bool) -> "LostEdges":
+        """Some of them (K,)."""
+        return LostEdges(centers=self.centers[which], radii=self.radii[which])
+
+
+NO_EDGES = LostEdges.joined([])
+
+
+@dataclass(frozen=True, kw_only=True)
 class SeenVoxels:
     """When cameras last saw each voxel: its centre is `origin` [m] + its index times the edge `voxel` [m].
 
     last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last time step in which
     a camera returned depth through or on the voxel, 0 never, the type's largest number (`UNANSWERED` in uint16) never
-    although one looked at it.
+    although one looked at it. edges: of the newest images.
     """
 
     origin: Float64
     voxel: float
     last_seen: NDArray[np.uint8] | NDArray[np.uint16]
     step_stamps_ns: NDArray[np.int64]
+    edges: LostEdges = NO_EDGES
 
     def last_seen_ns(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
         """points (Q, 3) [m], world -> stamps (Q,) [ns] at which their voxels were last seen; -1 never, or outside."""
@@ -125,17 +150,24 @@ class SeenVoxels:
 class KnownVoxels:
     """What was known of space at one moment, and how old that evidence is.
 
-    last_seen, step_stamps_ns: as `SeenVoxels` has them. unrepresented: what is occupied, not the robot, and has no
-    splat.
+    last_seen, step_stamps_ns, edges: as `SeenVoxels` has them. unrepresented: what is occupied, not the robot, and
+    has no splat.
     """
 
     grid: OccupancyGrid
     last_seen: NDArray[np.uint16]
     step_stamps_ns: NDArray[np.int64]
     unrepresented: Balls
+    edges: LostEdges = NO_EDGES
 
     @property
     def seen(self) -> SeenVoxels:
         """When its voxels were last seen."""
-        grid, stamps_ns = self.grid, self.step_stamps_ns
-        return SeenVoxels(origin=grid.origin, voxel=grid.voxel, last_seen=self.last_seen, step_stamps_ns=stamps_ns)
+        grid = self.grid
+        return SeenVoxels(
+            origin=grid.origin,
+            voxel=grid.voxel,
+            last_seen=self.last_seen,
+            step_stamps_ns=self.step_stamps_ns,
+            edges=self.edges,
+        )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config import fixed
 from splatctrl_cli.control.arm import ArmModel
@@ -21,12 +21,14 @@ from splatctrl_cli.records import Bool, Float64
 class Seen:
     """What cameras had seen at one moment. last_ns: points (Q, 3) [m], world -> stamps (Q,) [ns] at which a camera
     last returned depth through or on them, -1 never; unanswered: centres (K, 3) [m], world, of the voxels, with edges
-    of `voxel` [m], that cameras looked at and got no depth from.
+    of `voxel` [m], that cameras looked at and got no depth from; edges: centre and radius (K, 4) [m], world, of balls
+    in which a surface may go on where its edge was lost.
     """
 
     last_ns: Callable[[Float64], NDArray[np.int64]]
     unanswered: Float64 = field(default_factory=lambda: np.empty((0, 3)))
     voxel: float = 0.0
+    edges: Float64 = field(default_factory=lambda: np.empty((0, 4)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +38,8 @@ class NearFigures:
     within which `NEAR_FRESH_SHARE` of the seen points were last seen; ahead [s] by which the last of them was seen
     after the state. NaN where there are too few points. unanswered [m]: the distance of the nearest voxel that
     cameras looked at without an answer, and its place (3,) [m]; hidden [m]: how near a point that was never seen, of
-    new space or not, is to the map's surfaces, and its place (3,) [m]; infinite and NaN where there is none.
+    new space or not, is to the map's surfaces, and its place (3,) [m]; edge [m]: the distance of the nearest lost
+    edge, and its place (3,) [m]; infinite and NaN where there is none.
     """
 
     unseen: float
@@ -47,6 +50,8 @@ class NearFigures:
     place: Float64
     hidden: float
     hidden_place: Float64
+    edge: float
+    edge_place: Float64
 
 
 class NearSpace:
@@ -91,8 +96,8 @@ class NearSpace:
         if (~is_never).sum() >= fewest:
             ages = (stamp_ns - seen[~is_never]) * 1e-9
             age, ahead = float(np.quantile(ages, fixed.NEAR_FRESH_SHARE)), max(-float(ages.min()), 0.0)
-        unanswered, place = self._nearest(known.unanswered, centers)
-        unanswered = max(unanswered - known.voxel / 2, 0.0)  # from its nearest face
+        unanswered, place = self._nearest(known.unanswered, centers, known.voxel / 2)  # from its nearest face
+        edge, edge_place = self._nearest(known.edges[:, :3], centers, known.edges[:, 3])
         hidden, hidden_place = np.inf, np.full(3, np.nan)
         if distance is not None:
             fine, _ = self._shell(centers, FINE)
@@ -106,6 +111,8 @@ class NearSpace:
             place=place,
             hidden=hidden,
             hidden_place=hidden_place,
+            edge=edge,
+            edge_place=edge_place,
         )
 
     def _shell(self, centers: Float64, directions: Float64) -> tuple[Float64, NDArray[np.int64]]:
@@ -121,16 +128,19 @@ class NearSpace:
         assert self._first is not None
         return _is_outside(points, self._first, self._radii + fixed.NEAR_NEW)
 
-    def _nearest(self, points: Float64, centers: Float64) -> tuple[float, Float64]:
-        """The least distance [m] of points (K, 3) near the arm to its moving spheres, and that point (3,)."""
+    def _nearest(self, points: Float64, centers: Float64, reach: float | Float64) -> tuple[float, Float64]:
+        """The least distance [m] of balls about points (K, 3), `reach` (K,) [m] large, near the arm to its moving
+        spheres, at least 0, and that point (3,).
+        """
         moving, radii = centers[self._moving], self._radii[self._moving]
-        reach = radii.max() + fixed.NEAR_NEW
-        points = points[np.all((points > moving.min(axis=0) - reach) & (points < moving.max(axis=0) + reach), axis=1)]
-        if not len(points):
+        around = radii.max() + fixed.NEAR_NEW
+        is_near = np.all((points > moving.min(axis=0) - around) & (points < moving.max(axis=0) + around), axis=1)
+        if not is_near.any():
             return np.inf, np.full(3, np.nan)
-        away, nearest = (np.asarray(found) for found in cKDTree(points).query(moving))
-        sphere = int(np.argmin(away - radii))
-        return float(away[sphere] - radii[sphere]), points[nearest[sphere]]
+        points, reach = points[is_near], np.broadcast_to(reach, len(is_near))[is_near]
+        away = (cdist(points, moving) - radii).min(axis=1) - reach
+        least = int(np.argmin(away))
+        return max(float(away[least]), 0.0), points[least]
 
 
 def _nearest_of(points: Float64, distance: Callable[[Float64], Float64]) -> tuple[float, Float64]:

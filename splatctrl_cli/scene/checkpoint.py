@@ -15,6 +15,7 @@ from splatctrl_cli.scene.keyframes import Window
 from splatctrl_cli.scene.posture import POSTURE_NAMES, RobotPosture
 from splatctrl_cli.scene.removal import REASONS
 from splatctrl_cli.scene.seeding import SeedDensity
+from splatctrl_cli.voxels import LostEdges
 
 Arrays = Mapping[str, NDArray[np.generic]]
 
@@ -36,6 +37,8 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
     arrays["workspace"] = np.array([fitter.workspace.lower, fitter.workspace.upper])
     arrays["counters"] = np.array([fitter.num_steps, fitter.descent.num_iterations], np.int64)
     arrays |= {"people/voxels": fitter.people.voxels, "people/stamps_ns": fitter.people.stamps_ns}
+    for camera, edges in fitter.occupancy.edges.items():
+        arrays[f"edges/{camera}"] = np.column_stack([edges.centers, edges.radii])
     arrays["refined"] = _refined_array(fitter.refined)
     arrays |= {f"mounted/{camera}": mask for camera, mask in fitter.mounted.items()}
     if fitter.shell is not None:
@@ -62,6 +65,13 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
     fitter.num_steps, fitter.descent.num_iterations = (int(n) for n in arrays["counters"])
     fitter.people.voxels = np.asarray(arrays["people/voxels"], np.int64)
     fitter.people.stamps_ns = np.asarray(arrays["people/stamps_ns"], np.int64)
+    fitter.occupancy.edges = {
+        name.removeprefix("edges/"): LostEdges(
+            centers=np.asarray(a[:, :3], np.float32), radii=np.asarray(a[:, 3], np.float32)
+        )
+        for name, a in arrays.items()
+        if name.startswith("edges/")
+    }
     fitter.refined = _refined(arrays["refined"])
     masks = {name.removeprefix("mounted/"): array for name, array in arrays.items() if name.startswith("mounted/")}
     fitter.mounted = {camera: np.asarray(mask, bool) for camera, mask in masks.items()}

@@ -28,6 +28,7 @@ from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.eviction import room_for
 from splatctrl_cli.scene.keyframes import View, Window, all_halved, make_view, seen_through
 from splatctrl_cli.scene.labels import Seen, relabel
+from splatctrl_cli.scene.lost_edges import lost_edges
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
 from splatctrl_cli.scene.posture import RobotPosture, carried
@@ -114,13 +115,13 @@ class SceneFitter:
         unanswered = self._each(lambda one: unanswered_points(one[0], one[1].robot_depth, config), seen)
         for points in chain.from_iterable(unanswered):
             self.occupancy.mark_unanswered(points)
+        self.occupancy.keep_edges(lost_edges(seen, robot, config))
         self._carry(robot)
         if robot is not None:
             pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]
             self.occupancy.label_robot(robot.centers, robot.radii, pixels)
             self.occupancy.forget_hidden(robot.centers, robot.radii, robot.distance)
-        is_trail = relabel(self.buffer, self.occupancy, robot, seen)
-        removed = self._remove(is_trail, self._floating(views))
+        removed = self._remove(relabel(self.buffer, self.occupancy, robot, seen), self._floating(views))
         filled = self._seed(views, masks)
         is_first = self.descent.num_iterations == 0 and bool(self.buffer.is_alive.any())
         self.window.advance(views)

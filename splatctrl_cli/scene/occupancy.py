@@ -1,6 +1,6 @@
 """The occupancy grid of III-C: what the depth images have seen free, occupied, or never."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
-from splatctrl_cli.voxels import MOST_VOXELS, SOLID, SWEPT, UNANSWERED, Balls, KnownVoxels, OccupancyGrid
+from splatctrl_cli.voxels import MOST_VOXELS, SOLID, SWEPT, UNANSWERED, Balls, KnownVoxels, LostEdges, OccupancyGrid
 
 MAX_STEPS = UNANSWERED - 1  # time steps that `last_seen` tells apart
 
@@ -35,6 +35,7 @@ class OccupancyMap:
         self.entity: NDArray[np.uint8] = np.zeros(shape, np.uint8)
         self.last_seen: NDArray[np.uint16] = np.zeros(shape, np.uint16)
         self.step_stamps_ns: list[int] = []  # of the time steps that `last_seen` counts, from 1
+        self.edges: dict[str, LostEdges] = {}  # of the newest image of each camera
         self._hits: NDArray[np.uint8] = np.zeros(shape, np.uint8)
         self._packed = pack_grid(self.origin, config.voxel, shape)
 
@@ -100,6 +101,12 @@ class OccupancyMap:
         i, j, k = cells[np.all((cells >= 0) & (cells < self.last_seen.shape), axis=1)].T
         is_never = self.last_seen[i, j, k] == 0
         self.last_seen[i[is_never], j[is_never], k[is_never]] = UNANSWERED
+
+    def keep_edges(self, edges: Mapping[str, LostEdges]) -> None:
+        """By camera, instead of those of its image before; within the grid alone."""
+        upper = self.origin + self.config.voxel * (np.array(self.log_odds.shape) - 1)
+        for camera, each in edges.items():
+            self.edges[camera] = each.select(np.all((each.centers >= self.origin) & (each.centers <= upper), axis=1))
 
     def label_robot(self, centers: Float64, radii: Float64, seen: Sequence[tuple[RgbdFrame, Bool, Bool]]) -> None:
         """Set the robot bit where the robot is, by its spheres (S, 3), (S,) [m] and its pixels, and nowhere else.
@@ -230,6 +237,7 @@ class OccupancyMap:
             last_seen=self.last_seen.copy(),
             step_stamps_ns=np.array(self.step_stamps_ns, np.int64),
             unrepresented=unrepresented,
+            edges=LostEdges.joined([self.edges[camera] for camera in sorted(self.edges)]),
         )
 
 

@@ -13,9 +13,20 @@ from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
 from splatctrl_cli.records import Label, UInt8
-from splatctrl_cli.voxels import MOST_VOXELS, UNANSWERED, Balls, KnownVoxels, OccupancyGrid, SeenVoxels, VoxelState
+from splatctrl_cli.voxels import (
+    MOST_VOXELS,
+    NO_EDGES,
+    UNANSWERED,
+    Balls,
+    KnownVoxels,
+    LostEdges,
+    OccupancyGrid,
+    SeenVoxels,
+    VoxelState,
+)
 
 _HEADER = 1 << 22  # bytes
+_MOST_EDGES = 1 << 26  # bytes
 _SHORT = 0xFF  # `UNANSWERED` in one byte
 _GRID: Mapping[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": np.uint16, "entity": np.uint8}
 _EVIDENCE = ("last_seen", "unrepresented", "unrepresented_labels")
@@ -60,6 +71,7 @@ def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.gen
         "last_seen": "1 + index into step_stamps_ns of the last time step with depth through or on it, 0 never, "
         "the largest number: looked at in vain",
         "unrepresented": "centres (K, 3) [m] of voxels that are occupied, not the robot, and have no splat",
+        "edges": "centre and radius (K, 4) [m] of balls in which a surface may go on where its edge was lost",
         "step_stamps_ns": known.step_stamps_ns.tolist(),
     }
     return np.array(json.dumps({**special, **common}))
@@ -73,6 +85,7 @@ def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
         "last_seen": known.last_seen.astype(kind),
         "unrepresented": balls.centers,
         "unrepresented_labels": balls.labels,
+        "edges": np.column_stack([known.edges.centers, known.edges.radii]),
     }
 
 
@@ -101,14 +114,15 @@ def read_seen(path: Path) -> SeenVoxels | None:
     """
     try:
         with _refused(path, _OURS):
-            arrays = read_arrays(path, ("header", "last_seen"), most=_HEADER + 2 * MOST_VOXELS)
-            header = json.loads(str(arrays["header"]))
+            header = _read_header(path)
+            arrays = read_arrays(path, ("last_seen", *_edges_in(header)), most=2 * MOST_VOXELS + _MOST_EDGES)
             stamps_ns = np.array(header["step_stamps_ns"], np.int64)
             return SeenVoxels(
                 origin=np.array(header["origin"], np.float64),
                 voxel=float(header["voxel"]),
                 last_seen=_last_seen(arrays["last_seen"], header, len(stamps_ns)),
                 step_stamps_ns=stamps_ns,
+                edges=_edges(arrays),
             )
     except InputError:
         if _is_older(path):
@@ -165,12 +179,14 @@ def _read_known(
         header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
-        arrays = read_arrays(path, (*names, *_EVIDENCE), most=22 * MOST_VOXELS)
+        arrays = read_arrays(path, (*names, *_EVIDENCE, *_edges_in(header)), most=22 * MOST_VOXELS + _MOST_EDGES)
         grid = grid_of(arrays, header)
         stamps_ns = np.array(header["step_stamps_ns"], np.int64)
         last_seen = _widened(_last_seen(arrays["last_seen"], header, len(stamps_ns)))
         balls = _balls(arrays, grid.voxel)
-        return KnownVoxels(grid=grid, last_seen=last_seen, step_stamps_ns=stamps_ns, unrepresented=balls)
+        return KnownVoxels(
+            grid=grid, last_seen=last_seen, step_stamps_ns=stamps_ns, unrepresented=balls, edges=_edges(arrays)
+        )
 
 
 def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
@@ -220,6 +236,21 @@ def _balls(arrays: Arrays, voxel: float) -> Balls:
     if not np.isfinite(centers).all():
         raise ValueError("unrepresented: expected finite centres")
     return Balls.of_voxels(centers, voxel, labels)
+
+
+def _edges_in(header: Mapping[str, Any]) -> tuple[str, ...]:
+    """The array of lost edges, which older versions did not write."""
+    return ("edges",) if "edges" in header else ()
+
+
+def _edges(arrays: Arrays) -> LostEdges:
+    """Raises ValueError for other types or shapes."""
+    if "edges" not in arrays:
+        return NO_EDGES
+    edges = arrays["edges"]
+    if edges.dtype != np.float32 or edges.shape != (edges.size // 4, 4) or not np.isfinite(edges).all():
+        raise ValueError(f"edges: expected finite float32 (K, 4), got {edges.dtype} {edges.shape}")
+    return LostEdges(centers=edges[:, :3], radii=edges[:, 3])
 
 
 def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Mapping[str, Any]) -> NDArray[Any]:

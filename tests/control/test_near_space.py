@@ -97,6 +97,18 @@ def test_the_nearest_place_without_an_answer_is_told_with_its_distance() -> None
     assert nothing.unanswered == np.inf and np.isnan(nothing.place).all()
 
 
+def test_a_lost_edge_is_as_near_as_its_ball() -> None:
+    arm = PlanarArm()
+    centers, radii = arm.sphere_centers(LATER), np.asarray(arm.sphere_set.radii)
+    near = centers[-1] + np.array([0.0, 0.0, radii[-1] + 0.02])
+    large = centers[-1] + np.array([0.0, 0.0, radii[-1] + 0.03])
+    known = Seen(last_ns=half_seen, edges=np.array([[*near, 0.001], [*large, 0.015]]))
+    found = NearSpace(arm, 0.03).look(0, LATER, known)
+    assert (found.edge, found.edge_place.tolist()) == (pytest.approx(0.015), large.tolist())
+    nothing = NearSpace(arm, 0.03).look(0, LATER, Seen(last_ns=half_seen))
+    assert nothing.edge == np.inf and np.isnan(nothing.edge_place).all()
+
+
 def test_the_share_of_blind_spheres_is_that_of_the_reference() -> None:
     arm, space = PlanarArm(), NearSpace(PlanarArm(), 0.03)
     space.look(0, FIRST, Seen(last_ns=half_seen))

@@ -1,6 +1,7 @@
 """Runs in which one thing is broken, each made of the stage's safe one."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import yaml
 
 from splatctrl_cli.records import Float64, LossReport
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.voxels import UNANSWERED
+from splatctrl_cli.voxels import UNANSWERED, LostEdges
 from tests.cli.replay_desk import SECOND, START
 from tests.jobs.stage import FAR, QUARTER, Stage, ball_beside, passing, resting, states_on, unseen_about, voxels
 
@@ -126,6 +127,13 @@ def no_answer_beside_it(stage: Stage) -> None:
     stage.last_seen.last_seen[tuple(np.round((center - grid.origin) / grid.voxel).astype(int))] = UNANSWERED
 
 
+def beside_a_lost_edge(stage: Stage) -> None:
+    """A surface may go on in a pixel that the arm ends beside, as at the front edge of a board in a shelf."""
+    center, radius = stage.ball_at_the_end(0.011, radius=0.0065)
+    edge = LostEdges(centers=np.array([center], np.float32), radii=np.array([radius], np.float32))
+    stage.last_seen = replace(voxels(), edges=edge)
+
+
 def frames_that_renew_nothing(stage: Stage) -> None:
     stage.states = resting(num=21)
     stage.map_stamps = [i * QUARTER for i in range(9)]
@@ -229,6 +237,7 @@ ALONE: dict[str, Broken] = {
     ),
     "unseen side": (beside_an_unseen_side, (), "known space", "not evaluable", "mm from a surface of the map"),
     "no answer": (no_answer_beside_it, (), "known space", "not evaluable", "a place 10.0 mm from the arm"),
+    "lost edge": (beside_a_lost_edge, (), "known space", "not evaluable", "lost 11.0 mm from the arm"),
     "evidence age": (
         frames_that_renew_nothing,
         (),

@@ -17,7 +17,7 @@ from splatctrl_cli.jobs.replays.motion_criteria import surface_clearance
 
 NUM = 11
 UNKNOWN = np.full(NUM, np.nan)
-NOTHING_NEAR = dict.fromkeys(("unseen", "blind", "age", "ahead", "unanswered", "hidden"), UNKNOWN)
+NOTHING_NEAR = dict.fromkeys(("unseen", "blind", "age", "ahead", "unanswered", "hidden", "edge"), UNKNOWN)
 
 
 def judged(**replay: Any) -> Any:

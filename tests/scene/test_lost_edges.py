@@ -6,8 +6,9 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.scene.lost_edges import LostEdges, lost_edges
+from splatctrl_cli.scene.lost_edges import lost_edges
 from splatctrl_cli.scene.self_mask import PixelKind, object_mask
+from splatctrl_cli.voxels import LostEdges
 from tests.scene.wall import HEIGHT, INTRINSICS, frame
 
 CONFIG = OccupancyConfig()
@@ -24,7 +25,8 @@ def with_lost_edges(x: float = 0.0) -> RgbdFrame:
 
 
 def edges_of(*frames: RgbdFrame) -> LostEdges:
-    return lost_edges(frames, [object_mask(each) for each in frames], CONFIG)
+    named = [replace(each, camera=f"cam{number}") for number, each in enumerate(frames)]
+    return LostEdges.joined([*lost_edges([(each, object_mask(each)) for each in named], None, CONFIG).values()])
 
 
 def at_the_block(edges: LostEdges) -> np.ndarray:
@@ -58,5 +60,5 @@ def test_the_outline_of_the_robot_is_its_own() -> None:
     seen = with_lost_edges()
     kinds = object_mask(seen).kinds.copy()
     kinds[np.abs(seen.depth - DEPTH) < 0.01] = PixelKind.ROBOT
-    edges = lost_edges([seen], [replace(object_mask(seen), kinds=kinds)], CONFIG)
+    edges = lost_edges([(seen, replace(object_mask(seen), kinds=kinds))], None, CONFIG)["cam0"]
     assert not at_the_block(edges).any()

@@ -25,7 +25,7 @@ from splatctrl_cli.scene_files.voxel_file import (
     write_states,
 )
 from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.voxels import SWEPT, UNANSWERED, OccupancyGrid
+from splatctrl_cli.voxels import SWEPT, UNANSWERED, LostEdges, OccupancyGrid
 from tests.plain import known
 
 
@@ -175,6 +175,7 @@ def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_pa
         known(grid(), unrepresented=[[0.0, 0.25, 0.4]], label=Label.HUMAN),
         step_stamps_ns=np.arange(num_steps) * 10,
         last_seen=np.zeros((3, 4, 5), np.uint16),
+        edges=LostEdges(centers=np.array([[0.0, 0.5, 1.0]], np.float32), radii=np.array([0.25], np.float32)),
     )
     want.last_seen[1, 2, 3], want.last_seen[0, 0, 0], want.last_seen[2, 0, 1] = num_steps, 1, UNANSWERED
     points = want.grid.origin + 0.05 * np.array([[1.4, 1.6, 3.0], [0.0, 0.4, 0.0], [2.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
@@ -188,11 +189,13 @@ def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_pa
         assert again.unrepresented.labels.tolist() == [Label.HUMAN]
         assert again.unrepresented.radius == pytest.approx(0.025 * 3**0.5)
         assert again.unrepresented.volume == pytest.approx(0.05**3)
+        assert (again.edges.centers.tolist(), again.edges.radii.tolist()) == ([[0.0, 0.5, 1.0]], [0.25])
     for name in ("a.npz", "b.npz"):
         seen = read_seen(tmp_path / name)
         assert seen is not None and seen.last_seen.dtype == (np.uint8 if num_steps < 255 else np.uint16)
         assert seen.last_seen_ns(points).tolist() == [10 * (num_steps - 1), 0, -1, -1]
         assert seen.unanswered == pytest.approx(want.grid.origin + 0.05 * np.array([[2, 0, 1]]))
+        assert (seen.edges.centers.tolist(), seen.edges.radii.tolist()) == ([[0.0, 0.5, 1.0]], [0.25])
 
 
 def test_voxel_files_of_an_older_version_are_read_without_evidence(tmp_path: Path) -> None:
@@ -202,6 +205,16 @@ def test_voxel_files_of_an_older_version_are_read_without_evidence(tmp_path: Pat
     assert read_states(tmp_path / "a.npz").log_odds.item() == 20.0
 
 
+def test_a_voxel_file_without_lost_edges_is_read_as_with_none(tmp_path: Path) -> None:
+    write_occupancy(tmp_path / "a.npz", known(grid()))
+    arrays = {name: array for name, array in read_arrays(tmp_path / "a.npz", most=1 << 20).items() if name != "edges"}
+    header = json.loads(str(arrays["header"]))
+    del header["edges"]
+    savez(tmp_path / "a.npz", {**arrays, "header": np.array(json.dumps(header))})
+    for found in (read_seen(tmp_path / "a.npz"), read_known_occupancy(tmp_path / "a.npz")):
+        assert found is not None and len(found.edges.radii) == 0
+
+
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
@@ -209,6 +222,8 @@ def test_voxel_files_of_an_older_version_are_read_without_evidence(tmp_path: Pat
         ({"last_seen": np.zeros((3, 4), np.uint16)}, "last_seen: expected uint16"),
         ({"unrepresented": np.zeros((2, 3), np.float32)}, "unrepresented: expected"),
         ({"unrepresented": np.full((1, 3), np.nan, np.float32)}, "unrepresented: expected finite"),
+        ({"edges": np.zeros((2, 3), np.float32)}, "edges: expected"),
+        ({"edges": np.full((1, 4), np.inf, np.float32)}, "edges: expected finite"),
     ],
 )
 def test_evidence_that_is_none_is_named(tmp_path: Path, changed: dict[str, NDArray[Any]], said: str) -> None:
@@ -216,7 +231,7 @@ def test_evidence_that_is_none_is_named(tmp_path: Path, changed: dict[str, NDArr
     savez(tmp_path / "a.npz", {**read_arrays(tmp_path / "a.npz", most=1 << 20), **changed})
     with pytest.raises(InputError, match=said):
         read_known_occupancy(tmp_path / "a.npz")
-    if "last_seen" in changed:
+    if "unrepresented" not in changed:
         with pytest.raises(InputError, match=said):
             read_seen(tmp_path / "a.npz")
 

@@ -28,8 +28,9 @@ from splatctrl_cli.jobs.replays.time_criteria import clocks, evidence_age, judge
 def known_space(judged: Judged) -> Iterator[Reason]:
     """Cameras saw at least 53 % of the space around the moving arm; where they saw less than two thirds, at most 9 %
     of the moving spheres come to space of which less than a tenth was seen; at most `--max-unknown` of the sphere
-    centres are in space never seen; the margin about the arm reaches no unseen space within 30 mm of a surface, nor a
-    place where cameras looked and got no depth. A baked field needs its channel `observed`.
+    centres are in space never seen; the margin about the arm reaches no unseen space within 30 mm of a surface, no
+    place where cameras looked and got no depth, and no pixel without depth into which a surface beside it may go on.
+    A baked field needs its channel `observed`.
     """
     for column, allowed, least, words in (
         ("unseen", UNSEEN, 0.0, "of the space about the arm that the motion comes to was never seen by a camera"),
@@ -54,6 +55,7 @@ def known_space(judged: Judged) -> Iterator[Reason]:
             yield held(f"{100 * near[0]:.0f} % {words}", near[0], allowed, "", near[2])
     yield from _hidden(judged)
     yield from _unanswered(judged)
+    yield from _lost_edge(judged)
     yield from _unknown_share(judged)
 
 
@@ -116,6 +118,26 @@ def _unanswered(judged: Judged) -> Iterator[Reason]:
         place=tuple(judged.replay.near["place"][worst].tolist()),
         cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*judged.replay.near["place"][worst]),
         remedy="a dark, shiny or clear thing may stand there: add a camera that gets depth there",
+        count=int(np.isfinite(distance).sum()),
+    )
+
+
+def _lost_edge(judged: Judged) -> Iterator[Reason]:
+    """Where a surface may go on in a pixel without depth beside it, within the margin of the arm."""
+    distance, margin = judged.replay.near["edge"], judged.replay.margin
+    if not np.any(distance < margin):
+        return
+    worst = int(np.nanargmin(distance))
+    yield lacking(
+        sentence=f"the edge of a surface was lost {mm(distance[worst])} from the arm, margin {mm(margin)}: it may go "
+        "on for a pixel",
+        value=float(distance[worst]),
+        threshold=margin,
+        unit="m",
+        time_s=seconds_at(judged, worst),
+        place=tuple(judged.replay.near["edge_place"][worst].tolist()),
+        cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*judged.replay.near["edge_place"][worst]),
+        remedy="keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
         count=int(np.isfinite(distance).sum()),
     )
 

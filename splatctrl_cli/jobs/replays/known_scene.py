@@ -232,7 +232,12 @@ def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0
 
 def seen_of(voxels: SeenVoxels) -> Seen:
     """What the space about an arm is asked for."""
-    return Seen(last_ns=voxels.last_seen_ns, unanswered=voxels.unanswered, voxel=voxels.voxel)
+    return Seen(
+        last_ns=voxels.last_seen_ns,
+        unanswered=voxels.unanswered,
+        voxel=voxels.voxel,
+        edges=np.column_stack([voxels.edges.centers, voxels.edges.radii]).astype(np.float64),
+    )
 
 
 def known_space(occupancy: OccupancyGrid) -> Observed:

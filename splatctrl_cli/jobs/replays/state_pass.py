@@ -237,8 +237,8 @@ class ReplayRecord:
     def _look_around(self, part: AuditTrace) -> None:
         """What was known of the space about the arm, at some of the states."""
         num = len(part.stamp_ns)
-        unseen, blind, age, ahead, unanswered, hidden = np.full((6, num), np.nan)
-        place, hidden_place = np.full((2, num, 3), np.nan)
+        unseen, blind, age, ahead, unanswered, hidden, edge = np.full((7, num), np.nan)
+        place, hidden_place, edge_place = np.full((3, num, 3), np.nan)
         if self._scene.has_seen_times:
             self.hindsight.add(part.stamp_ns, part.position)
         for at in self._near.due(part.stamp_ns):
@@ -250,6 +250,7 @@ class ReplayRecord:
                 unseen[at], blind[at] = figures.unseen, figures.blind
                 unanswered[at], place[at] = figures.unanswered, figures.place
                 hidden[at], hidden_place[at] = figures.hidden, figures.hidden_place
+                edge[at], edge_place[at] = figures.edge, figures.edge_place
                 if self._scene.has_seen_times:
                     age[at], ahead[at] = figures.age, figures.ahead
                     self.hindsight.looked(stamp, figures.age)
@@ -262,6 +263,8 @@ class ReplayRecord:
             place=place,
             hidden=hidden,
             hidden_place=hidden_place,
+            edge=edge,
+            edge_place=edge_place,
         )
 
     def _tell_represented(self, part: AuditTrace) -> None:

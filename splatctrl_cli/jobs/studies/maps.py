@@ -25,7 +25,6 @@ from splatctrl_cli.libraries import of_extra
 from splatctrl_cli.planner.configuration_clearance import HasDistance, OnlyDistance
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.lost_edges import LostEdges, lost_edges
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask, self_mask_metrics
 from splatctrl_cli.voxels import Balls, VoxelState
@@ -48,24 +47,17 @@ class Map:
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """A reconstruction of views: its fitter, the residuals of its self-mask, and where the last images lost edges."""
+    """A reconstruction of views: its fitter and the residuals of its self-mask."""
 
     fitter: SceneFitter
     figures: dict[str, object]
-    edges: LostEdges
 
 
 def fitted(problem: Problem, views: Views, config: Config, threads: int) -> Fitted:
     """The map after all time steps, the arm at the start in each."""
     fitter = SceneFitter(config.scene, config.occupancy, workspace_of(problem), seed=problem.number, threads=threads)
     rows = [fitter.step(step, _posture(problem, step)) for step in views.steps]
-    last = views.steps[-1]
-    masks = [self_mask(frame, _posture(problem, last), config.occupancy) for frame in last]
-    return Fitted(
-        fitter=fitter,
-        figures={"voxel": config.occupancy.voxel, **self_mask_metrics(rows)},
-        edges=lost_edges(last, masks, config.occupancy),
-    )
+    return Fitted(fitter=fitter, figures={"voxel": config.occupancy.voxel, **self_mask_metrics(rows)})
 
 
 def workspace_of(problem: Problem) -> Box:
@@ -94,7 +86,7 @@ def splat_map(problem: Problem, made: Fitted, config: Config, threads: int) -> M
         cameras=None,
         digests={},
     )
-    spheres, edges = obstacle_spheres(fitter.splats(), fitter.unrepresented).splats, made.edges
+    spheres, edges = obstacle_spheres(fitter.splats(), fitter.unrepresented).splats, voxels.edges
     centers, radii = beside_the_start(problem, spheres.centers, spheres.radii)
     edge_centers, edge_radii = beside_the_start(problem, edges.centers, edges.radii)
     surroundings = Surroundings(
