@@ -1,5 +1,6 @@
 """Where a planner may go in our map, the safest first: through space that cameras saw, then through any that is away
-from surfaces, then through any; in each with the margin asked for, and where that leaves no way with less.
+from surfaces, then through any; in each with the margin asked for, and where that leaves no way with less; at last
+past thinner things.
 
 Q points, world frame, metres. A distance is a lower bound of a 1-Lipschitz one, so that what a planner proves of an
 edge holds of it.
@@ -29,8 +30,9 @@ from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 UNSEEN_NEAR = 0.08  # [m] about the arm at its start, which it hides, and at the goal, which it is given
 START_GAP = 2e-3  # [m] that an obstacle of the map is from the arm at its start, or it is the arm's own
 BEHIND = 0.06  # [m] from a surface of the map, within which unseen space is likely the rest of the thing
-SHARES = (1.0, 0.4)  # of the margin asked for, as long as unseen space is avoided
-LEAST_SHARE = 0.15  # of it, where nothing else leaves a way
+SHARES = (1.0, 0.4)  # of the margin asked for
+THIN = 0.008  # [m] radius of balls where nothing else leaves a way: surface is in their middle
+LEAST_SHARE = 0.15  # of the margin, where a method has no balls to make thin
 ENDS_ROOM = 2 * START_ROOM + 1e-4  # [m] more than the margin, which a start or a goal has to keep
 
 
@@ -83,21 +85,23 @@ class Surroundings:
                 for share, thing in zip(SHARES, things, strict=True):
                     scene = Asked(distance=_least_of(thing, unseen))
                     yield Way(scene=scene, margin=share * margin, in_known_space=is_known)
-        for share in (*SHARES, LEAST_SHARE):
-            scene = Asked(distance=self.things(share * margin, has_edges=share > LEAST_SHARE))
+        for share, is_thin in ((SHARES[0], False), (SHARES[1], False), (SHARES[1], True)):
+            scene = Asked(distance=self.things(share * margin, is_thin=is_thin))
             yield Way(scene=scene, margin=share * margin, in_known_space=self.unseen is None)
 
-    def things(self, margin: float, *, has_edges: bool = True) -> DistanceFunction:
+    def things(self, margin: float, *, is_thin: bool = False) -> DistanceFunction:
         """The distance to the balls, those smaller that the start or the goal is nearer to than the margin [m]: a
         ball may be as much too large, and what is given is as near as it is. The centre of a ball yields as far as
-        the arm's surface, and not inside it.
+        the arm's surface, and not inside it. is_thin: balls of at most `THIN`, and those of lost edges half as large.
         """
-        least, num = -margin, len(self.radii) if has_edges else self.num_known
-        centers, radii = self.centers[:num], self.radii[:num]
+        least, radii = -margin, self.radii.copy()
+        if is_thin:
+            radii[: self.num_known] = np.minimum(radii[: self.num_known], np.float32(THIN))
+            radii[self.num_known :] *= np.float32(0.5)
         for q in (self.problem.start, self.problem.goal):
-            away = _body(self.problem, q).query(centers.astype(np.float64))[0]
+            away = _body(self.problem, q).query(self.centers.astype(np.float64))[0]
             radii = np.minimum(radii, np.maximum(away - margin - ENDS_ROOM, least).astype(np.float32))
-        field = SphereField(centers, radii + np.float32(margin), threads=self.threads)  # no radius below 0
+        field = SphereField(self.centers, radii + np.float32(margin), threads=self.threads)  # no radius below 0
         return lambda points: field.query(points)[0] + (margin - ROUNDING)
 
     @cached_property
