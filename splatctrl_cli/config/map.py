@@ -99,9 +99,6 @@ class SceneConfig(Section, section="scene"):
     fill: Annotated[float, Within(1e-3, 1, "", "share of the budget for the first of several time steps")] = 0.85
     iterations_per_step: Annotated[int, Within(0, MOST_ITERATIONS, "", "K, optimiser steps per time step")] = 30
     first_iterations: Annotated[int, Within(0, MOST_ITERATIONS, "", "optimiser steps on the first time step")] = 300
-    coarse_share: Annotated[float, Within(0, 1, "", "share of the first steps that use images of half the size")] = (
-        0.0
-    )
     refine_iterations: Annotated[
         int, Within(0, MOST_ITERATIONS, "", "further steps, at falling rates, for recordings without a clock")
     ] = 2000

@@ -26,7 +26,7 @@ from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_con
 from splatctrl_cli.scene.depth_holes import unanswered_points
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.eviction import room_for
-from splatctrl_cli.scene.keyframes import View, Window, all_halved, make_view, seen_through
+from splatctrl_cli.scene.keyframes import View, Window, make_view, seen_through
 from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.lost_edges import lost_edges
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
@@ -129,9 +129,7 @@ class SceneFitter:
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
         hidden = hidden_objects(self.buffer, robot, seen, self.occupancy.config)
         as_they_were = self.buffer.parameters[hidden].copy()
-        num_coarse = round(self.config.coarse_share * num_iterations) if is_first else 0
-        self.descent.run(all_halved(self.window.schedule(num_coarse, rng)), self.descent.settings())
-        terms = self.descent.run(self.window.schedule(num_iterations - num_coarse, rng), self.descent.settings())
+        terms = self.descent.run(self.window.schedule(num_iterations, rng), self.descent.settings())
         self.buffer.parameters[hidden] = as_they_were
         self._prune(robot, views, seen, removed)
         filled += self._show_contact(robot, views, seen)

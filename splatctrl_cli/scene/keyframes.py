@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.config.fixed import NEAREST_REACH
@@ -60,37 +59,6 @@ def seen_through(centers: Float32, views: Sequence[View], tolerance: float, num_
     """
     cameras, nearest = [view.camera for view in views], [view.nearest for view in views]
     return points.seen_through(centers, cameras, nearest, tolerance, num_threads)
-
-
-def halved(view: View) -> View:
-    """The view at half its width and height: mean colours, the nearest of four depths, counted where all four are.
-
-    Pixel (0, 0) is then centred between four: u' = (u - 1/2) / 2. An odd last row or column is left out.
-    """
-    k, target = view.frame.intrinsics, view.target
-    height, width = k.height // 2, k.width // 2
-    camera = view.camera.copy()
-    camera[:6] = [k.fx / 2, k.fy / 2, (k.cx - 0.5) / 2, (k.cy - 0.5) / 2, width, height]
-    nearest = _quads(np.where(view.mappable, target.depth, np.float32(np.inf))).min(axis=(-3, -1))
-    halved_target = TargetView(
-        color=np.ascontiguousarray(np.rint(_quads(target.color).mean(axis=(-3, -1))).astype(np.uint8)),
-        depth=np.where(np.isfinite(nearest), nearest, np.float32(0.0)),
-        counted=_quads(target.counted).min(axis=(-3, -1)).astype(np.uint8),
-    )
-    return View(frame=view.frame, camera=camera, target=halved_target, nearest=view.nearest)
-
-
-def all_halved(views: Sequence[View]) -> list[View]:
-    """The views, with repetitions, each halved once."""
-    small = {id(view): halved(view) for view in views}
-    return [small[id(view)] for view in views]
-
-
-def _quads(image: NDArray[np.generic]) -> Float32:
-    """(..., H, W) -> (..., H / 2, 2, W / 2, 2) float32."""
-    height, width = image.shape[-2] // 2, image.shape[-1] // 2
-    cut = image[..., : 2 * height, : 2 * width].astype(np.float32)
-    return cut.reshape(*image.shape[:-2], height, 2, width, 2)
 
 
 class Window:

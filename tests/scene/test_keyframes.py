@@ -3,10 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.scene.keyframes import View, Window, halved, make_view
+from splatctrl_cli.scene.keyframes import View, Window, make_view
 from tests.scene.wall import frame
 
 CONFIG = SceneConfig(window=3)
@@ -73,19 +72,3 @@ def test_pixels_that_the_lens_did_not_see_count_neither_for_colour_nor_for_depth
     made = make_view(replace(seen, valid=valid), seen.depth > 0)
     assert np.array_equal(made.target.counted > 0, valid)
     assert np.array_equal(made.mappable, valid & (seen.depth > 0))
-
-
-def test_a_halved_view_looks_along_the_same_rays_with_mean_colours_and_nearest_depths() -> None:
-    seen = frame(0, block=0.2)
-    seen.depth[10, 10] = 0.0
-    whole = make_view(seen, seen.depth > 0)
-    half = halved(whole)
-    fx, _, cx, _, width, height = half.camera[:6]
-    assert (width, height) == (40, 30)
-    assert half.target.color.shape == (3, 30, 40)
-    assert half.target.color[:, 3, 4] == pytest.approx(whole.target.color[:, 6:8, 8:10].mean(axis=(1, 2)), abs=0.5)
-    quads = np.where(whole.target.depth > 0, whole.target.depth, np.inf).reshape(30, 2, 40, 2)
-    assert np.array_equal(half.target.depth, quads.min(axis=(1, 3)))
-    k = seen.intrinsics
-    assert (7 - cx) / fx == pytest.approx((14.5 - k.cx) / k.fx)  # pixel 7 is centred between 14 and 15
-    assert half.target.counted[5, 5] == whole.target.counted[10:12, 10:12].min()
