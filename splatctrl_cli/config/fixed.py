@@ -81,6 +81,7 @@ SPLIT_PARTS = 2  # Gaussians that a split one becomes (the baseline 3dgs)
 NARROW_HOLE = 2.0  # [voxels] holes that are not wider are common beside edges
 NARROW_GAP = 4.0  # [voxels] gaps between two objects before a far background that are not wider are common
 GAP_DIRECTIONS = 3  # of four in which a gap has an object on both sides: two are common above a horizon
+CARRIED_CELL = 0.03  # [m] edge at most of a cell of what is carried that has a sphere: sticks out 6 mm at most
 CONTACT_REACH = 0.02  # [m] an object so near to the robot may touch it where the robot hides it
 CONTACT_THICKNESS = 0.2  # [m] of a link at most: so far behind what a camera sees of it something may touch it
 WELL_INSIDE = 0.005  # [m] below the robot's surface; what nothing shows to be an object there is the robot's
@@ -179,6 +180,7 @@ GOAL_STEPS = 30  # of a guess: with 100, a fifth more guesses end at the pose, i
 GOAL_DAMPING = 1e-4  # of the squared Jacobian's diagonal, as it begins; grows where a step does not help
 GOAL_LONGEST_STEP = 0.3  # [rad] of a step, in any joint
 GOAL_SHARE = 0.1  # of the goal's tolerances that a posture keeps to
+NEAREST_ITERATIONS = 200  # of a search for a path to the nearest goal alone, before that to any
 GOAL_DISTINCT = 0.05  # [rad] that two postures differ by at least, in some joint
 
 # Simulation: how another arm is led through the scene

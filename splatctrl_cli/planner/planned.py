@@ -5,7 +5,7 @@ G goal postures, K guesses, J joints.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.goals import Detour, PlanDetour, pose_error
 from splatctrl_cli.control.replay import ReplayTask
-from splatctrl_cli.planner.birrt import PlanOutcome, plan
+from splatctrl_cli.planner.birrt import Plan, PlanOutcome, plan
 from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance
 from splatctrl_cli.planner.edges import check_edges
 from splatctrl_cli.planner.path import TimedPath, effector_rates, timed
@@ -64,7 +64,7 @@ def planned_path(
     path, num_proved, num_edges = None, 0, 0
     if min(margin, own) > 0:
         room = Clearance.of(model, scene, margin=margin + extra, self_margin=own)
-        found = plan(room, np.clip(start, model.lower, model.upper), goals, planner, seed=planner.seed)
+        found = path_to_nearest(room, np.clip(start, model.lower, model.upper), goals, planner)
         outcome = found.outcome
         if found.outcome is PlanOutcome.SOLVED:
             way = found.waypoints
@@ -84,6 +84,17 @@ def planned_path(
         num_proved=num_proved,
         seconds=time.perf_counter() - began,
     )
+
+
+def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: PlannerConfig) -> Plan:
+    """A path to the goal (G, J) nearest to the start, where `NEAREST_ITERATIONS` find one; else to any of them.
+
+    Two trees meet first at a goal with much free space about it, not at one that is near.
+    """
+    nearest = goals[np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")]
+    few = replace(planner, max_iterations=min(fixed.NEAREST_ITERATIONS, planner.max_iterations))
+    found = plan(room, start, nearest[:1], few, seed=planner.seed)
+    return found if found.is_solved else plan(room, start, nearest, planner, seed=planner.seed)
 
 
 def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlConfig) -> tuple[float, float, Float64]:

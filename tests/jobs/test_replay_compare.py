@@ -43,7 +43,7 @@ def test_every_method_has_every_figure_and_gates_can_name_them(
         assert metrics[f"{method}_min_clearance_proved"] < metrics[f"{method}_min_clearance"]
     straight = float(np.linalg.norm(MOVE))
     assert metrics["log_joint_path_rad"] == pytest.approx(straight)
-    assert metrics["birrt_joint_path_rad"] == pytest.approx(straight, abs=0.01)  # nothing is in the way
+    assert metrics["birrt_joint_path_rad"] <= straight + 0.01  # nothing is in the way, and another posture is nearer
     assert metrics["birrt_num_edges_proved"] == metrics["birrt_num_edges"] == 1
     assert metrics["birrt_planned_margin"] == Config().control.margin
     assert metrics["log_num_interventions"] is None and metrics["closed_loop_num_interventions"] >= 0

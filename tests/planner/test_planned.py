@@ -8,12 +8,15 @@ import pytest
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import ReplayTask, is_at_goal
+from splatctrl_cli.planner.birrt import plan
+from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.path import least_clearance
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     NO_POSTURE,
     START_BLOCKED,
     goal_postures,
+    path_to_nearest,
     planned_detours,
     planned_path,
 )
@@ -85,6 +88,25 @@ def test_a_start_and_a_goal_in_collision_are_named() -> None:
     for posture, outcome in ((START, START_BLOCKED), (GOAL, GOAL_BLOCKED)):
         found = planned_path(ARM, ball(*ARM.frame_pose(posture, "tip")[:2, 3]), task(), PLANNER, CONFIG)
         assert (found.outcome, found.path, found.num_edges) == (outcome, None, 0)
+
+
+def test_a_path_leads_to_the_nearest_goal_though_a_farther_one_is_found_at_once() -> None:
+    room = Clearance.of(ARM, one_wall(), margin=CONFIG.margin)
+    beyond = np.array([2.3, 0.5])
+    assert np.linalg.norm(beyond - START) > np.linalg.norm(GOAL - START)
+    at_once = plan(room, START, np.array([beyond, GOAL]), PLANNER)
+    assert at_once.goal == 0 and at_once.num_iterations == 0
+    found = path_to_nearest(room, START, np.array([beyond, GOAL]), PLANNER)
+    assert found.is_solved and found.num_iterations > 0
+    np.testing.assert_array_equal(found.waypoints[-1], GOAL)
+
+
+def test_where_the_nearest_goal_is_not_found_another_is() -> None:
+    room = Clearance.of(ARM, one_wall(), margin=CONFIG.margin)
+    hopeless, beyond = replace(PLANNER, max_iterations=0), np.array([2.3, 0.5])
+    assert not plan(room, START, GOAL[None], hopeless).is_solved
+    found = path_to_nearest(room, START, np.array([beyond, GOAL]), hopeless)
+    np.testing.assert_array_equal(found.waypoints[-1], beyond)
 
 
 def test_the_same_seed_plans_the_same_path() -> None:
