@@ -54,6 +54,8 @@ TOO_LONG = {  # for a test: minutes; the page has their figures
     "study table2 --problem cubby-0007 -o out/one",
     "study ablation --trials 12 -o out/ablation",
     "study ablation --trials 12 --width 160 -o out/ablation",
+    "study scenes -o out/scenes",
+    "study shared-workspace -o out/shared",
     "score shelf --reference docs/examples/apc_shelf.toml --root SCENE",
 }
 RUN_BY_GOLDEN = ("README.md", "start.md")  # all their commands: tests/tools/test_golden.py

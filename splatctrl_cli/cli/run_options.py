@@ -65,16 +65,20 @@ def sweep_options(add: Options, parser: Parser) -> None:
 
 def study_options(add: Options, parser: Parser) -> None:
     """Of ``splatctrl study``."""
-    add("STUDY", "which experiment of the paper", ("table2", "ablation"))
+    add("STUDY", "which experiment of the paper", ("table2", "ablation", "scenes", "shared-workspace"))
     add("-o/--out DIR", "folder of the study, where it goes on (default: STUDY)", Path)
-    add("--trials N", "problems of each environment (default: as many as the paper's)", whole(1, 100_000))
-    add("--methods A,B", "ours, tsdf, truth, ... (docs/study.md; default: all that are installed)", _names)
+    add(
+        "--trials N",
+        "problems of each kind (default: as many as the paper's)",
+        whole(1, 100_000),
+    )
+    add("--methods A,B", "some of the study's (docs/study.md; default: all that are installed)", _names)
     add("--problems DIR", "MotionBenchMaker's problems of the Panda (default: as SPLATCTRL_REAL_DATA has them)", Path)
-    add("--width PX", "of the cameras' images (default: 320)", whole(32, 1280))
+    add("--width PX", "of the cameras' images (default: 320; scenes 640, shared-workspace 160)", whole(32, 1280))
     add("--workers N", "problems that run at once (default: one per core)", whole(1, 256))
     add("--shard I/N", "only every N-th problem, from the I-th on", _shard)
     add("--made PATH ...", "make the table of these trials (trials.csv, or a study's folder), and run none", Path)
-    add("--problem NAME", "run one problem alone, such as cubby-0007")
+    add("--problem NAME", "run one problem alone, such as cubby-0007, wall-0002 or near-goal-0003")
     add("--force", "replace the output of --problem if it exists")
     add_threads(parser)
 

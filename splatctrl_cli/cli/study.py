@@ -8,8 +8,8 @@ from pathlib import Path
 from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of
-from splatctrl_cli.jobs.studies.experiments import STUDIES, ProblemRequest
-from splatctrl_cli.jobs.studies.problem_run import run_problem
+from splatctrl_cli.jobs.studies.experiments import STUDIES
+from splatctrl_cli.jobs.studies.problem_run import ProblemRequest, run_problem
 from splatctrl_cli.jobs.studies.rows import TRIALS
 from splatctrl_cli.jobs.studies.study import StudyRequest, StudyResult, merged_study, run_study
 
@@ -50,7 +50,7 @@ def _one(args: argparse.Namespace) -> int:
         methods=study.methods_of(args.methods or ()),
         width=args.width or study.width,
     )
-    result = run_problem(request, console)
+    result = run_problem(study, request, console)
     lines = [trial.told for trial in result.trials]
     found = {"out": str(result.out), "trials": len(lines)}
     return console.concluded(result.verdict, found, [*lines, f"every figure is in {result.out / TRIALS}"])

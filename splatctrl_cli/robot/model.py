@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
-from splatctrl_cli.records import Bool, Float64, SphereSet
+from splatctrl_cli.records import Bool, Box, Float64, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
 from splatctrl_cli.robot.sphere_files import (
     RENAMED,
@@ -21,6 +21,7 @@ from splatctrl_cli.robot.sphere_files import (
     matched_links,
     read_spheres,
     spheres_of,
+    with_boxes,
 )
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
@@ -135,6 +136,23 @@ class RobotModel:
             packages=self._packages,
             held={name: held[name] for name in self.joint_names if name in held},
         )
+
+    def carrying(self, boxes: Sequence[tuple[str, Box]]) -> "RobotModel":
+        """The same robot with what it carries: boxes in the frames of links, covered by spheres of their own, which
+        its surface has, too.
+        """
+        robot = RobotModel(
+            self.urdf,
+            self._model,
+            with_boxes(self.sphere_set, boxes),
+            self.T_world_base,
+            self.left_out,
+            are_links_renamed=self.are_links_renamed,
+            packages=self._packages,
+            held=self.held,
+        )
+        robot._surface = self.surface.with_boxes(boxes)
+        return robot
 
     def with_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
         """The same robot with its spheres' coverage measured; `unknown` says why there is no report."""

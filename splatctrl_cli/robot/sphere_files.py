@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from splatctrl_cli.config.fixed import CARRIED_CELL
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, Chain
-from splatctrl_cli.records import Float64, SphereSet
+from splatctrl_cli.records import Box, Float64, SphereSet
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 RENAMED = (
@@ -42,6 +43,19 @@ def spheres_of(urdf: UrdfFile) -> SphereSet:
         centers=np.array([shape.T_link_shape[:3, 3] for shape in urdf.shapes]),
         radii=np.array([shape.size[0] for shape in urdf.shapes]),
     )
+
+
+def with_boxes(spheres: SphereSet, boxes: Sequence[tuple[str, Box]]) -> SphereSet:
+    """`spheres`, and those that cover boxes in the frames of links: one for each `CARRIED_CELL`."""
+    links, centers, radii = [*spheres.links], [spheres.centers], [spheres.radii]
+    for link, box in boxes:
+        size = box.upper - box.lower
+        counts = np.ceil(size / CARRIED_CELL - 1e-9).astype(np.int64)
+        cells = np.argwhere(np.ones(counts, bool))
+        links += [link] * len(cells)
+        centers.append(box.lower + (cells + 0.5) * size / counts)
+        radii.append(np.full(len(cells), 0.5 * np.linalg.norm(size / counts)))
+    return SphereSet(links=tuple(links), centers=np.concatenate(centers), radii=np.concatenate(radii))
 
 
 def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[SphereSet, tuple[str, ...]]:

@@ -64,7 +64,7 @@ def _tabletop(rng: np.random.Generator) -> Environment:
         place = np.array([0.30, rng.choice([-0.60, 0.60])])
         tables.append((place, np.array([0.9, 0.4]), rng.uniform(0.05, 0.15)))
     solids = [
-        _box(f"table_{n}", (*size, 0.05 + top), (*middle, top - 0.5 * (0.05 + top)), drawn_texture(rng))
+        box(f"table_{n}", (*size, 0.05 + top), (*middle, top - 0.5 * (0.05 + top)), drawn_texture(rng))
         for n, (middle, size, top) in enumerate(tables)
     ]
     taken: list[tuple[Float64, float]] = [(np.zeros(2), BASE)]
@@ -85,14 +85,14 @@ def _tabletop(rng: np.random.Generator) -> Environment:
         taken.append((spot, radius))
         center = (*spot, top + 0.5 * size[2])
         if rng.random() < 0.5:
-            solids.append(_box(f"box_{number}", tuple(size), center, drawn_texture(rng), rng.uniform(0, np.pi)))
+            solids.append(box(f"box_{number}", tuple(size), center, drawn_texture(rng), rng.uniform(0, np.pi)))
         else:
-            solids.append(_cylinder(f"cylinder_{number}", 0.5 * size[0], size[2], center, drawn_texture(rng)))
+            solids.append(cylinder(f"cylinder_{number}", 0.5 * size[0], size[2], center, drawn_texture(rng)))
     places = []
     for _ in range(24):
         middle, extent, top = tables[int(rng.integers(len(tables)))]
         spot = middle + rng.uniform(-0.5, 0.5, 2) * np.minimum(extent, 1.1)
-        places.append(_down((*spot, top + rng.uniform(GRASP, 0.30)), rng.uniform(-np.pi, np.pi)))
+        places.append(tip_down((*spot, top + rng.uniform(GRASP, 0.30)), rng.uniform(-np.pi, np.pi)))
     return Environment(primitives=tuple(solids), places=tuple(places))
 
 
@@ -110,7 +110,7 @@ def _shelf(rng: np.random.Generator, *, is_merged: bool) -> Environment:
     dividers = [("upright", n, row) for n in range(1, columns) for row in range(rows)]
     dividers += [("board", n, column) for n in range(1, rows) for column in range(columns)]
     missing = dividers[int(rng.integers(len(dividers)))] if is_merged else None
-    texture, solids = drawn_texture(rng), [_box("table", (1.5, 1.5, 0.05), (0.4, 0.0, -0.025), drawn_texture(rng))]
+    texture, solids = drawn_texture(rng), [box("table", (1.5, 1.5, 0.05), (0.4, 0.0, -0.025), drawn_texture(rng))]
 
     def add(name: str, size: Sequence[float], middle: Sequence[float]) -> None:
         placed = T.copy()
@@ -142,7 +142,7 @@ def _shelf(rng: np.random.Generator, *, is_merged: bool) -> Environment:
     return Environment(primitives=tuple(solids), places=tuple(places[k] for k in order))
 
 
-def _down(position: Sequence[float], yaw: float) -> Float64:
+def tip_down(position: Sequence[float], yaw: float) -> Float64:
     """A tip that points down."""
     T = _turned(yaw)
     T[:3, :3] = T[:3, :3] @ np.diag([1.0, -1.0, -1.0])
@@ -173,15 +173,13 @@ def drawn_texture(rng: np.random.Generator) -> Texture:
     )
 
 
-def _box(
-    name: str, size: tuple[float, ...], middle: Sequence[float], texture: Texture, yaw: float = 0.0
-) -> Primitive:
+def box(name: str, size: tuple[float, ...], middle: Sequence[float], texture: Texture, yaw: float = 0.0) -> Primitive:
     T = _turned(yaw)
     T[:3, 3] = middle
     return Primitive(name=name, kind="box", size=size, T_world_shape=T, texture=texture)
 
 
-def _cylinder(name: str, radius: float, height: float, middle: Sequence[float], texture: Texture) -> Primitive:
+def cylinder(name: str, radius: float, height: float, middle: Sequence[float], texture: Texture) -> Primitive:
     T = np.eye(4)
     T[:3, 3] = middle
     return Primitive(name=name, kind="cylinder", size=(radius, height), T_world_shape=T, texture=texture)

@@ -14,6 +14,7 @@ from splatctrl_cli.records import DistanceGrid, UInt8
 from splatctrl_cli.report import replay_pictures
 from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
 from splatctrl_cli.report.pictures import (
+    CURVE_COLORS,
     ComparisonRow,
     comparison_picture,
     field_slice_picture,
@@ -31,6 +32,7 @@ from splatctrl_cli.report.replay_pictures import (
     open_loop_picture,
     spans,
 )
+from splatctrl_cli.report.study_pictures import Panel, trials_picture
 
 
 def row(depth_error: float) -> ComparisonRow:
@@ -338,3 +340,20 @@ def test_short_intervals_can_be_seen_and_those_that_touch_are_one() -> None:
     assert spans([], (0.0, 10.0)) == []
     many = [(t, t) for t in np.linspace(0, 10, 100_000)]
     assert spans(many, (0.0, 10.0)) == [(0.0, pytest.approx(10.0 + least))]
+
+
+def test_a_picture_of_trials_has_a_colour_for_each_group_and_leaves_out_what_a_method_lacks(tmp_path: Path) -> None:
+    values = np.array([[1.0, 2.0], [1.5, np.nan], [2.0, 3.0]])
+    panels = [Panel(title="time [s]", values=values, level=(1.2, "alone")), Panel(title="distance", values=values)]
+    trials_picture(tmp_path / "a.png", ["one", "other"], panels, ["near", "near", "far"], "Trials")
+    trials_picture(tmp_path / "b.png", ["one", "other"], panels, ["near", "near", "far"], "Trials")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    trials_picture(tmp_path / "c.png", ["one", "other"], panels, ["near"] * 3, "Trials")
+    for name, num in (("a", 2), ("c", 1)):  # without other groups there is no legend
+        image = cv2.imread(str(tmp_path / f"{name}.png"))
+        assert image is not None and image.shape[1] == 1200
+        for color in CURVE_COLORS[:num]:
+            ink = 255.0 - np.array([int(color[k : k + 2], 16) for k in (5, 3, 1)])
+            share = (255.0 - image) @ ink / (ink @ ink)  # of the colour on white: lines and marks let shine through
+            is_of_it = np.all(np.abs(255.0 - image - share[..., None] * ink) < 6, axis=2)
+            assert np.sum(is_of_it & (share > 0.4)) > 60, color

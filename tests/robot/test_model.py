@@ -8,6 +8,7 @@ import pytest
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import look_at
+from splatctrl_cli.records import Box
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
 
@@ -202,3 +203,23 @@ def test_batches_are_the_same_at_any_thread_count(arm_files: tuple[Path, Path]) 
     assert arm.sphere_centers_batch(q[:0]).shape == (0, len(arm.sphere_set.radii), 3)
     with pytest.raises(InputError, match=r"expected shape \(T, 7\), got \(7, 2\)"):
         arm.sphere_centers_batch(np.zeros((7, 2)))
+
+
+def test_what_a_robot_carries_is_part_of_it_and_moves_with_its_link(arm: RobotModel) -> None:
+    box = Box(lower=np.array([-0.02, -0.02, 0.12]), upper=np.array([0.02, 0.02, 0.20]))
+    carrying, num = arm.carrying([("hand", box)]), len(arm.sphere_set.radii)
+    assert carrying.joint_names == arm.joint_names and len(arm.sphere_set.radii) == num
+    assert carrying.moving_spheres[num:].all() and carrying.sphere_set.links[num:] == ("hand",) * 12
+    for q in (arm.middle, arm.middle + 0.4):
+        T = arm.frame_pose(q, "hand")
+        bottom = T[:3, :3] @ [0.0, 0.0, 0.20] + T[:3, 3]
+        for robot, is_in in ((arm, False), (carrying, True)):
+            away = np.linalg.norm(robot.sphere_centers(q) - bottom, axis=1) - robot.sphere_set.radii
+            assert bool(away.min() < 0.0) is is_in
+        surface = carrying.surface
+        poses = surface.poses({link: carrying.frame_pose(q, link) for link in surface.links})
+        assert surface.distance(poses, bottom[None])[0] == pytest.approx(0.0, abs=1e-9)
+    own = carrying.self_pairs()
+    links = np.array(carrying.sphere_set.links)
+    assert not np.any((own >= num) & np.isin(links[own[:, ::-1]], ["hand", "link7"]))
+    assert np.any(own >= num)

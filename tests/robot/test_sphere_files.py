@@ -2,6 +2,7 @@
 far a joint may move a sphere.
 """
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ import pytest
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
+from splatctrl_cli.records import Box, SphereSet
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.sphere_files import lever_arms, read_sphere_file, spheres_yaml
+from splatctrl_cli.robot.sphere_files import lever_arms, read_sphere_file, spheres_yaml, with_boxes
 from tests.robot.shapes import BALL, BOX, arm_of, written
 
 CUROBO = """robot_cfg:
@@ -155,3 +157,16 @@ def test_the_robot_knows_its_lever_arms(sample_data: Path) -> None:
     q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (100, arm.num_joints))
     travel = np.max([np.linalg.norm(arm.sphere_jacobians(row), axis=1) for row in q], axis=0)
     assert np.all(travel <= arm.lever_arms() + 1e-12)
+
+
+def test_spheres_of_a_carried_box_cover_it_and_stick_out_by_millimetres() -> None:
+    box = Box(lower=np.array([-0.025, -0.03, 0.07]), upper=np.array([0.025, 0.05, 0.12]))
+    alone = SphereSet(links=("arm",), centers=np.zeros((1, 3)), radii=np.array([0.1]))
+    spheres = with_boxes(alone, [("hand", box)])
+    assert spheres.links[0] == "arm" and set(spheres.links[1:]) == {"hand"}
+    centers, radii = spheres.centers[1:], spheres.radii[1:]
+    corners = np.array(list(product(*zip(box.lower, box.upper, strict=True))))
+    points = np.concatenate([np.random.default_rng(0).uniform(box.lower, box.upper, (2000, 3)), corners])
+    assert (np.linalg.norm(points[:, None] - centers, axis=2) - radii).min(axis=1).max() < 1e-12
+    out = np.maximum(box.lower - (centers - radii[:, None]), centers + radii[:, None] - box.upper)
+    assert 0.0 < out.max() < 0.012

@@ -1,64 +1,24 @@
-"""The experiments that a study repeats: of each its problems, what a trial is, and the tables made of them."""
+"""The experiments of the paper that a study repeats."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Generic
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
 
-from splatctrl_cli.config import Config, PlannerConfig
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.config import Config
 from splatctrl_cli.files.output import Stopwatch
-from splatctrl_cli.jobs.studies import ablation, ablation_table, table2, trial
+from splatctrl_cli.jobs.studies import (
+    ablation,
+    ablation_table,
+    scenes,
+    scenes_table,
+    scenes_trial,
+    table2,
+    trial,
+    workspace_table,
+    workspace_trial,
+)
+from splatctrl_cli.jobs.studies.problem_run import SETTINGS, ProblemRequest, Study
 from splatctrl_cli.jobs.studies.problems import FAMILIES, read_problem
-from splatctrl_cli.jobs.studies.rows import R
-from splatctrl_cli.libraries import is_installed
-
-MAX_TIME = 86_400.0  # [s] of a search: iterations bound it, which are the same on every machine
-SETTINGS = Config(planner=PlannerConfig(max_time=MAX_TIME))
-
-Section = tuple[str, Sequence[str], Sequence[Sequence[str]]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProblemRequest:
-    """Run the problem of a name into the folder `out`; problems: MotionBenchMaker's folder, for one of its own;
-    methods: of the study; width [px] of the images.
-    """
-
-    problem: str
-    out: Path
-    study: str = "table2"
-    problems: Path | None = None
-    methods: tuple[str, ...] = ()
-    width: int = 320
-    force: bool = False
-    threads: int = 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Study(Generic[R]):
-    """An experiment of the paper, whose trials are rows of a kind. problems: environment and number, of at most so
-    many of each (None: all), with the archive's or without; archived: environments of the archive; trials: those of a
-    problem; sections: tables of all trials; notes: sentences below them; draw: their figure, into a file.
-    """
-
-    row: type[R]
-    methods: tuple[str, ...]
-    problems: Callable[[int | None, bool], list[tuple[str, int]]]
-    trials: Callable[[ProblemRequest, Config, Stopwatch], Iterator[R]]
-    sections: Callable[[Sequence[R]], Iterable[Section]]
-    notes: Callable[[Sequence[R]], Iterable[str]]
-    config: Config = SETTINGS
-    width: int = 320
-    archived: tuple[str, ...] = ()
-    draw: Callable[[Sequence[R], Path], None] | None = None
-
-    def methods_of(self, given: Sequence[str]) -> tuple[str, ...]:
-        """The methods that are asked for, or all that are installed. Raises UsageError for one that is none."""
-        for name in given:
-            if name not in self.methods:
-                raise UsageError(f"--methods {name}: expected some of {', '.join(self.methods)}")
-        return tuple(n for n in self.methods if (n in given if given else n != trial.TSDF or is_installed("open3d")))
 
 
 def _planned(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[trial.Trial]:
@@ -67,6 +27,20 @@ def _planned(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> I
         problem = read_problem(request.problem, request.problems)
     yield from trial.trials_of(
         problem, config, request.methods, width=request.width, threads=request.threads, stopwatch=stopwatch
+    )
+
+
+def _carried(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[scenes_trial.Transport]:
+    """The trials of a scene with a cube."""
+    return scenes_trial.transports_of(
+        request.problem, request.methods, config, width=request.width, threads=request.threads, stopwatch=stopwatch
+    )
+
+
+def _visited(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[workspace_trial.Visit]:
+    """The trials of a visit of a person."""
+    return workspace_trial.visits_of(
+        request.problem, request.methods, config, width=request.width, stopwatch=stopwatch
     )
 
 
@@ -95,5 +69,26 @@ STUDIES: Mapping[str, Study[Any]] = {
         sections=table2.sections,
         notes=table2.notes,
         archived=FAMILIES,
+    ),
+    "scenes": Study(
+        row=scenes_trial.Transport,
+        methods=scenes_trial.METHODS,
+        problems=scenes.problems,
+        trials=_carried,
+        sections=scenes_table.sections,
+        notes=scenes_table.notes,
+        draw=scenes_table.draw,
+        width=640,
+    ),
+    "shared-workspace": Study(
+        row=workspace_trial.Visit,
+        methods=workspace_trial.METHODS,
+        problems=workspace_table.problems,
+        trials=_visited,
+        sections=workspace_table.sections,
+        notes=workspace_table.notes,
+        draw=workspace_table.draw,
+        config=replace(SETTINGS, scene=replace(SETTINGS.scene, iterations_per_step=15)),  # twice the usual frames
+        width=160,
     ),
 }

@@ -1,15 +1,66 @@
 """One problem of a study as a run of its own: its trials as a table, and the verdict that no green one was false."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic
 
+from splatctrl_cli.config import Config, PlannerConfig
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.jobs.studies.experiments import STUDIES, ProblemRequest
 from splatctrl_cli.jobs.studies.problems import ARCHIVE
-from splatctrl_cli.jobs.studies.rows import TRIALS, Row, verdict_on_trials, write_trials
+from splatctrl_cli.jobs.studies.rows import TRIALS, R, Row, verdict_on_trials, write_trials
+from splatctrl_cli.jobs.studies.trial import TSDF
+from splatctrl_cli.libraries import is_installed
+
+MAX_TIME = 86_400.0  # [s] of a search: iterations bound it, which are the same on every machine
+SETTINGS = Config(planner=PlannerConfig(max_time=MAX_TIME))
+
+Section = tuple[str, Sequence[str], Sequence[Sequence[str]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProblemRequest:
+    """Run the problem of a name into the folder `out`; problems: MotionBenchMaker's folder, for one of its own;
+    methods: of the study; width [px] of the images.
+    """
+
+    problem: str
+    out: Path
+    study: str = "table2"
+    problems: Path | None = None
+    methods: tuple[str, ...] = ()
+    width: int = 320
+    force: bool = False
+    threads: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study(Generic[R]):
+    """An experiment of the paper, whose trials are rows of a kind. problems: environment and number, of at most so
+    many of each (None: all), with the archive's or without; archived: environments of the archive; trials: those of a
+    problem; sections: tables of all trials; notes: sentences below them; draw: their figure, into a file.
+    """
+
+    row: type[R]
+    methods: tuple[str, ...]
+    problems: Callable[[int | None, bool], list[tuple[str, int]]]
+    trials: Callable[[ProblemRequest, Config, Stopwatch], Iterator[R]]
+    sections: Callable[[Sequence[R]], Iterable[Section]]
+    notes: Callable[[Sequence[R]], Iterable[str]]
+    config: Config = SETTINGS
+    width: int = 320
+    archived: tuple[str, ...] = ()
+    draw: Callable[[Sequence[R], Path], None] | None = None
+
+    def methods_of(self, given: Sequence[str]) -> tuple[str, ...]:
+        """The methods that are asked for, or all that are installed. Raises UsageError for one that is none."""
+        for name in given:
+            if name not in self.methods:
+                raise UsageError(f"--methods {name}: expected some of {', '.join(self.methods)}")
+        return tuple(n for n in self.methods if (n in given if given else n != TSDF or is_installed("open3d")))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,11 +72,11 @@ class ProblemResult:
     verdict: Verdict
 
 
-def run_problem(request: ProblemRequest, progress: Progress = SILENT) -> ProblemResult:
+def run_problem(study: Study[R], request: ProblemRequest, progress: Progress = SILENT) -> ProblemResult:
     """Run it; the same request leaves the same table. Raises InputError for one that its study does not have."""
-    study, stopwatch = STUDIES[request.study], Stopwatch()
+    stopwatch = Stopwatch()
     with output_path(request.out, force=request.force, is_folder=True) as folder:
-        trials = list[Row]()
+        trials = list[R]()
         for trial in study.trials(request, study.config, stopwatch):
             trials.append(trial)
             progress.log(f"study: {request.problem}: {trial.told}")

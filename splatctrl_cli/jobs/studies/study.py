@@ -18,7 +18,8 @@ from splatctrl_cli.jobs.batches.run import DONE, FAILED
 from splatctrl_cli.jobs.batches.suite import Job, Recording, Suite
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.report import WriteReportRequest, write_report
-from splatctrl_cli.jobs.studies.experiments import STUDIES, Section, Study
+from splatctrl_cli.jobs.studies.experiments import STUDIES
+from splatctrl_cli.jobs.studies.problem_run import Section, Study
 from splatctrl_cli.jobs.studies.problems import ARCHIVE, ROBOT, name_of
 from splatctrl_cli.jobs.studies.rows import TRIALS, Row, read_trials, verdict_on_trials, write_trials
 

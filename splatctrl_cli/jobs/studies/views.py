@@ -1,5 +1,6 @@
-"""What the cameras of a study see: the arm at its start, through depth cameras that stand nearly where they say."""
+"""What the cameras of a study see: an arm at rest, through depth cameras that stand nearly where they say."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +9,11 @@ from scipy.spatial import cKDTree
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.environments import ring_of_cameras
+from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.recording import START_NS
-from splatctrl_cli.simulate.render import DepthNoise, Renderer
+from splatctrl_cli.simulate.render import Camera, DepthNoise, Renderer
 from splatctrl_cli.simulate.tabletop import arm_solids
 from splatctrl_cli.sources.calibrated import Perturbation
 
@@ -46,10 +49,27 @@ class Views:
 
 def views_of(problem: Problem, num_cameras: int, *, width: int, num_steps: int) -> Views:
     """What the first cameras of the ring see, with noise, and poses as a calibration has them."""
-    model, seed = problem.model, problem.number
-    arm = arm_solids(model.urdf.shapes, {link: model.frame_pose(problem.start, link) for link in model.urdf.links})
     cameras = ring_of_cameras(num_cameras, width, 3 * width // 4)
-    images = [Renderer(camera, problem.primitives, color_rays=0).image(arm) for camera in cameras]
+    arm = solids_at(problem.model, problem.start)
+    return recorded(cameras, problem.primitives, arm, seed=problem.number, num_steps=num_steps)
+
+
+def solids_at(model: RobotModel, q: Float64) -> list[Primitive]:
+    """An arm's shapes as solids at joint positions q (J,)."""
+    return arm_solids(model.urdf.shapes, {link: model.frame_pose(q, link) for link in model.urdf.links})
+
+
+def recorded(
+    cameras: Sequence[Camera],
+    primitives: Sequence[Primitive],
+    arm: Sequence[Primitive],
+    *,
+    seed: int,
+    num_steps: int,
+    first: int = 0,
+) -> Views:
+    """Time steps of frames from the step `first` on, with the noise and the errors of the poses that a seed draws."""
+    images = [Renderer(camera, primitives, color_rays=0).image(arm) for camera in cameras]
     calibrated = Perturbation(pose_error=POSE_ERROR, pose_turn=POSE_TURN, seed=seed)
     poses = [calibrated.pose(camera.name, camera.T_world_camera) for camera in cameras]
 
@@ -65,7 +85,8 @@ def views_of(problem: Problem, num_cameras: int, *, width: int, num_steps: int) 
             T_world_camera=poses[number],
         )
 
-    return Views(steps=tuple(tuple(frame(step, n) for n in range(num_cameras)) for step in range(num_steps)))
+    steps = range(first, first + num_steps)
+    return Views(steps=tuple(tuple(frame(step, n) for n in range(len(cameras))) for step in steps))
 
 
 def _points(frame: RgbdFrame) -> Float64:
