@@ -53,6 +53,8 @@ TOO_LONG = {  # for a test: minutes; the page has their figures
     "study table2 --trials 4 --methods ours,tsdf,truth",
     "study table2 --problem cubby-0007 -o out/one",
     "study ablation --trials 12 -o out/ablation",
+    "study dtu --problems DTU -o out/dtu",
+    "study dtu -o out/dtu",
     "study ablation --trials 12 --width 160 -o out/ablation",
     "study scenes -o out/scenes",
     "study shared-workspace -o out/shared",

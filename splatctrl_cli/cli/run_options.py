@@ -65,7 +65,7 @@ def sweep_options(add: Options, parser: Parser) -> None:
 
 def study_options(add: Options, parser: Parser) -> None:
     """Of ``splatctrl study``."""
-    add("STUDY", "which experiment of the paper", ("table2", "ablation", "scenes", "shared-workspace"))
+    add("STUDY", "which experiment of the paper", ("table2", "scenes", "shared-workspace", "dtu", "ablation"))
     add("-o/--out DIR", "folder of the study, where it goes on (default: STUDY)", Path)
     add(
         "--trials N",
@@ -73,7 +73,7 @@ def study_options(add: Options, parser: Parser) -> None:
         whole(1, 100_000),
     )
     add("--methods A,B", "some of the study's (docs/study.md; default: all that are installed)", _names)
-    add("--problems DIR", "MotionBenchMaker's problems of the Panda (default: as SPLATCTRL_REAL_DATA has them)", Path)
+    add("--problems DIR", "table2: MotionBenchMaker's (default: of SPLATCTRL_REAL_DATA); dtu: a tree of scans", Path)
     add("--width PX", "of the cameras' images (default: 320; scenes 640, shared-workspace 160)", whole(32, 1280))
     add("--workers N", "problems that run at once (default: one per core)", whole(1, 256))
     add("--shard I/N", "only every N-th problem, from the I-th on", _shard)

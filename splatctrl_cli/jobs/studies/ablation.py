@@ -129,9 +129,9 @@ class Measured:
         return f"{self.label}: {self.psnr or 0.0:.2f} dB, {words}"
 
 
-def problems(trials: int | None, has_archive: bool) -> list[tuple[str, int]]:
+def problems(trials: int | None, archive: Path | None) -> list[tuple[str, int]]:
     """Environment and number of all, or of at most `trials` of each."""
-    del has_archive
+    del archive
     return [(name, n) for name, most in NUM_PROBLEMS.items() for n in range(min(most, trials or most))]
 
 

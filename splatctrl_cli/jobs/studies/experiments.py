@@ -9,6 +9,7 @@ from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.studies import (
     ablation,
     ablation_table,
+    dtu,
     scenes,
     scenes_table,
     scenes_trial,
@@ -18,7 +19,7 @@ from splatctrl_cli.jobs.studies import (
     workspace_trial,
 )
 from splatctrl_cli.jobs.studies.problem_run import SETTINGS, ProblemRequest, Study
-from splatctrl_cli.jobs.studies.problems import FAMILIES, read_problem
+from splatctrl_cli.jobs.studies.problems import FAMILIES, archive_of, read_problem
 
 
 def _planned(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[trial.Trial]:
@@ -52,6 +53,12 @@ def _ablated(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> I
     )
 
 
+def _scanned(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[dtu.Fit]:
+    """The fits of a scan; `config` is that of each."""
+    del config
+    return dtu.fits(request.problem, request.problems, request.methods, threads=request.threads, stopwatch=stopwatch)
+
+
 STUDIES: Mapping[str, Study[Any]] = {
     "ablation": Study(
         row=ablation.Measured,
@@ -69,6 +76,17 @@ STUDIES: Mapping[str, Study[Any]] = {
         sections=table2.sections,
         notes=table2.notes,
         archived=FAMILIES,
+        archive=archive_of,
+    ),
+    "dtu": Study(
+        row=dtu.Fit,
+        methods=dtu.METHODS,
+        problems=dtu.problems,
+        trials=_scanned,
+        sections=dtu.sections,
+        notes=dtu.notes,
+        archived=(dtu.GIVEN,),
+        archive=lambda given: None if given is None else given.absolute(),
     ),
     "scenes": Study(
         row=scenes_trial.Transport,

@@ -40,19 +40,21 @@ class ProblemRequest:
 @dataclass(frozen=True, kw_only=True)
 class Study(Generic[R]):
     """An experiment of the paper, whose trials are rows of a kind. problems: environment and number, of at most so
-    many of each (None: all), with the archive's or without; archived: environments of the archive; trials: those of a
-    problem; sections: tables of all trials; notes: sentences below them; draw: their figure, into a file.
+    many of each (None: all), with those of a folder; archive: that folder, by --problems; archived: the environments
+    that are in it; trials: those of a problem; sections: tables of all trials; notes: sentences below them; draw:
+    their figure, into a file.
     """
 
     row: type[R]
     methods: tuple[str, ...]
-    problems: Callable[[int | None, bool], list[tuple[str, int]]]
+    problems: Callable[[int | None, Path | None], list[tuple[str, int]]]
     trials: Callable[[ProblemRequest, Config, Stopwatch], Iterator[R]]
     sections: Callable[[Sequence[R]], Iterable[Section]]
     notes: Callable[[Sequence[R]], Iterable[str]]
     config: Config = SETTINGS
     width: int = 320
     archived: tuple[str, ...] = ()
+    archive: Callable[[Path | None], Path | None] = lambda given: None
     draw: Callable[[Sequence[R], Path], None] | None = None
 
     def methods_of(self, given: Sequence[str]) -> tuple[str, ...]:
@@ -87,7 +89,7 @@ def run_problem(study: Study[R], request: ProblemRequest, progress: Progress = S
             folder,
             command="study",
             config=study.config.as_dict(),
-            inputs={} if archive is None else {ARCHIVE: sha256(archive)},
+            inputs={ARCHIVE: sha256(archive)} if archive and archive.is_file() else {},
             metrics={"trials": len(trials), "succeeded": sum(trial.success for trial in trials)},
             stopwatch=stopwatch,
             seed=int(request.problem.rpartition("-")[2]),

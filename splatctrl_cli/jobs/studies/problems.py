@@ -1,5 +1,6 @@
 """The problems of a study: drawn environments by their seed, and those of MotionBenchMaker from their archive."""
 
+import os
 import tarfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from splatctrl_cli.simulate.environments import ENVIRONMENTS, drawn_texture
 from splatctrl_cli.simulate.primitives import Primitive
 
 ARCHIVE, ROBOT = "problems.tar.bz2", "panda_spherized.urdf"  # of MotionBenchMaker, in one folder
+DATA = "SPLATCTRL_REAL_DATA"  # the folder that may hold vamp_panda
 FAMILIES = ("bookshelf_small", "bookshelf_tall", "bookshelf_thin", "box", "cage", "table_pick", "table_under_pick")
 PER_FAMILY = 50  # problems, from 1 on
 KINDS = {"box": "box", "cylinder": "cylinder", "sphere": "sphere"}  # MoveIt's words and ours
@@ -64,6 +66,20 @@ class Problem:
 def name_of(environment: str, number: int) -> str:
     """Of a problem: environment and number."""
     return f"{environment}-{number:04d}"
+
+
+def archive_of(given: Path | None) -> Path | None:
+    """MotionBenchMaker's folder: the one that is given, or that of the data folder, if there is one.
+
+    Raises InputError for a given one without problems or robot.
+    """
+    if given is None:
+        found = Path(os.environ.get(DATA, "")) / "vamp_panda" / "resources" / "panda"
+        return found.absolute() if DATA in os.environ and (found / ARCHIVE).is_file() else None
+    for name in (ARCHIVE, ROBOT):
+        if not (given / name).is_file():
+            raise InputError(f"--problems {given}: has no {name}", remedy="give that of the Panda")
+    return given.absolute()
 
 
 def read_problem(name: str, archive: Path | None) -> Problem:

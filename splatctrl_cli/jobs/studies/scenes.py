@@ -5,6 +5,7 @@ J joints.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -88,7 +89,7 @@ def read_scene(name: str) -> Scene:
     raise InputError(f"--problem {name}: none of {ATTEMPTS} scenes has a way", remedy="give another number")
 
 
-def problems(trials: int | None, has_archive: bool) -> list[tuple[str, int]]:
+def problems(trials: int | None, archive: Path | None) -> list[tuple[str, int]]:
     """Layout and number of the twelve scenes, or of at most so many of each layout."""
     num = len(HEIGHTS) if trials is None else min(trials, len(HEIGHTS))
     return [(layout, number) for layout in LAYOUTS for number in range(num)]

@@ -58,7 +58,7 @@ def sections(trials: Sequence[Transport]) -> Iterator[tuple[str, Sequence[str], 
 
 def notes(trials: Sequence[Transport]) -> Iterator[str]:
     """What else is to be known of the tables."""
-    whole, there = len(problems(None, has_archive=False)), len({(t.layout, t.number) for t in trials})
+    whole, there = len(problems(None, None)), len({(t.layout, t.number) for t in trials})
     yield f"Sampled: {there} of {whole} scenes." if there < whole else "Every scene is there."
     yield (
         f"Distances are of the arm and of the cube in its hand, everywhere on the way; {1e3 * MARGIN:.0f} mm are kept"

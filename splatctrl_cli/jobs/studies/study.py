@@ -1,6 +1,5 @@
 """A study from its request to its table: its problems are nodes of a batch, each made once."""
 
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,11 +19,10 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.report import WriteReportRequest, write_report
 from splatctrl_cli.jobs.studies.experiments import STUDIES
 from splatctrl_cli.jobs.studies.problem_run import Section, Study
-from splatctrl_cli.jobs.studies.problems import ARCHIVE, ROBOT, name_of
+from splatctrl_cli.jobs.studies.problems import name_of
 from splatctrl_cli.jobs.studies.rows import TRIALS, Row, read_trials, verdict_on_trials, write_trials
 
 FILE, FORMAT = "study.json", "splatctrl-study"
-DATA = "SPLATCTRL_REAL_DATA"  # the folder that may hold vamp_panda
 DRAWN, ARCHIVED = "drawn", "archive"  # jobs: of environments by their seed, of MotionBenchMaker
 MOST_NAMED = 5  # problems that lack
 
@@ -70,8 +68,8 @@ def run_study(request: StudyRequest, command_line: CommandLine, progress: Progre
     Raises UsageError for an output of another study or of other settings, InputError for problems that lack.
     """
     study, out = STUDIES[request.study], request.out.absolute()
-    archive = archive_of(request.problems) if study.archived else None
-    wanted = study.problems(request.trials, archive is not None)
+    archive = study.archive(request.problems)
+    wanted = study.problems(request.trials, archive)
     asked: dict[str, Any] = {
         "study": request.study,
         "methods": list(study.methods_of(request.methods)),
@@ -158,20 +156,6 @@ def _write(out: Path, study: Study[Any], trials: Sequence[Row]) -> None:
     write_durably(out / TRIALS, lambda path: write_trials(path, trials, study.row))
     if study.draw is not None:
         study.draw(trials, out.with_name(f"{out.name}.png"))
-
-
-def archive_of(given: Path | None) -> Path | None:
-    """MotionBenchMaker's folder: the one that is given, or that of the data folder, if there is one.
-
-    Raises InputError for a given one without problems or robot.
-    """
-    if given is None:
-        found = Path(os.environ.get(DATA, "")) / "vamp_panda" / "resources" / "panda"
-        return found.absolute() if DATA in os.environ and (found / ARCHIVE).is_file() else None
-    for name in (ARCHIVE, ROBOT):
-        if not (given / name).is_file():
-            raise InputError(f"--problems {given}: has no {name}", remedy="give that of the Panda")
-    return given.absolute()
 
 
 def _suite(

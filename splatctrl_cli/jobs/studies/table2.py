@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -37,9 +38,9 @@ FAMILY = "MotionBenchMaker"
 Rows = Sequence[Sequence[str]]
 
 
-def problems(trials: int | None, has_archive: bool) -> list[tuple[str, int]]:
+def problems(trials: int | None, archive: Path | None) -> list[tuple[str, int]]:
     """Environment and number of the problems: all of the paper's counts, or at most `trials` of each environment."""
-    environments = (*ENVIRONMENTS, *(FAMILIES if has_archive else ()))
+    environments = (*ENVIRONMENTS, *(FAMILIES if archive else ()))
     return [
         (name, number + (name in FAMILIES))
         for name in environments

@@ -36,7 +36,7 @@ PAPER = (
 Rows = Sequence[Sequence[str]]
 
 
-def problems(trials: int | None, has_archive: bool) -> list[tuple[str, int]]:
+def problems(trials: int | None, archive: Path | None) -> list[tuple[str, int]]:
     """Place and number of the visits: as many as the paper's trials, or at most so many at each place."""
     return [(place, n) for place in PLACES for n in range(NUM_TRIALS if trials is None else min(trials, NUM_TRIALS))]
 

@@ -45,8 +45,8 @@ def test_without_a_mechanism_the_settings_differ(method: str) -> None:
 
 
 def test_the_problems_are_drawn_and_still() -> None:
-    assert problems(2, has_archive=False) == [(TABLE, 0), (TABLE, 1), (SCAN, 0), (SCAN, 1)]
-    assert len(problems(None, has_archive=False)) == 25
+    assert problems(2, archive=None) == [(TABLE, 0), (TABLE, 1), (SCAN, 0), (SCAN, 1)]
+    assert len(problems(None, archive=None)) == 25
 
 
 @pytest.mark.usefixtures("fast", "without_plots")

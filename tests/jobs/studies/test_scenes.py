@@ -135,7 +135,7 @@ def test_figures_are_those_of_successful_runs_and_pairs_are_of_the_same_run() ->
 
 
 def test_scenes_are_twelve_or_a_part_that_says_so() -> None:
-    assert len(problems(None, has_archive=False)) == 12 and len(problems(1, has_archive=False)) == 4
+    assert len(problems(None, archive=None)) == 12 and len(problems(1, archive=None)) == 4
     assert "Sampled: 3 of 12 scenes." in list(notes(rows()))
     assert NAMES[QP_IK_ALONE] not in str(list(sections(rows())))
     assert CUBE == 0.05

@@ -97,8 +97,8 @@ def test_collisions_and_what_came_near_are_counted_beside_the_verdicts() -> None
 
 
 def test_the_visits_are_as_many_as_the_papers_trials_and_a_part_says_so() -> None:
-    assert len(problems(None, has_archive=False)) == 32
-    assert problems(1, has_archive=False) == [("near-pickup", 0), ("near-goal", 0)]
+    assert len(problems(None, archive=None)) == 32
+    assert problems(1, archive=None) == [("near-pickup", 0), ("near-goal", 0)]
     said = list(notes(visits()))
     assert PAPER in said and "Sampled: 3 of 32 visits." in said
 
