@@ -32,7 +32,7 @@ START_GAP = 2e-3  # [m] that an obstacle of the map is from the arm at its start
 BEHIND = 0.06  # [m] from a surface of the map, within which unseen space is likely the rest of the thing
 SHARES = (1.0, 0.4)  # of the margin asked for
 THIN = 0.008  # [m] radius of balls where nothing else leaves a way: surface is in their middle
-LEAST_SHARE = 0.15  # of the margin, where a method has no balls to make thin
+LEAST_SHARE = 0.15  # of the margin, at the very last
 ENDS_ROOM = 2 * START_ROOM + 1e-4  # [m] more than the margin, which a start or a goal has to keep
 
 
@@ -85,7 +85,7 @@ class Surroundings:
                 for share, thing in zip(SHARES, things, strict=True):
                     scene = Asked(distance=_least_of(thing, unseen))
                     yield Way(scene=scene, margin=share * margin, in_known_space=is_known)
-        for share, is_thin in ((SHARES[0], False), (SHARES[1], False), (SHARES[1], True)):
+        for share, is_thin in ((SHARES[0], False), (SHARES[1], False), (SHARES[1], True), (LEAST_SHARE, True)):
             scene = Asked(distance=self.things(share * margin, is_thin=is_thin))
             yield Way(scene=scene, margin=share * margin, in_known_space=self.unseen is None)
 
