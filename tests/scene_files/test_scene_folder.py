@@ -114,6 +114,7 @@ def test_a_run_that_goes_on_drops_what_came_after_its_checkpoint(tmp_path: Path)
         if folder is cut:
             writer.audit(Row(999))
             writer.snapshot(999, splats(9), known(grid()), grid().states(0.3, 0.7))
+            writer.settle()
             for name in ("audit.jsonl", "snapshots/000003.ply", f"{CHECKPOINT}.new", "splats.ply", "run.json"):
                 with (folder / name).open("ab") as stream:
                     stream.write(b'{"stamp')
