@@ -18,6 +18,7 @@ from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.score import ScoreRequest, score
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
+from splatctrl_cli.jobs.studies.problems import named
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.simulate.recording import RecordingOptions
 
@@ -138,9 +139,8 @@ def problems(trials: int | None, archive: Path | None) -> list[tuple[str, int]]:
 def measured(
     problem: str, methods: Sequence[str], *, width: int, threads: int, stopwatch: Stopwatch
 ) -> Iterator[Measured]:
-    """The recording of a name through the mechanisms, each off in turn."""
-    environment, _, digits = problem.rpartition("-")
-    number = int(digits)
+    """The recording of a name through the mechanisms, each off in turn. Raises InputError for a name that is none."""
+    environment, number = named(problem, NUM_PROBLEMS, "environment")
     elsewhere = OF_MOTION if environment == SCAN else STILL_ALONE
     with TemporaryDirectory() as name:
         folder = Path(name)

@@ -22,6 +22,7 @@ from splatctrl_cli.jobs.score import ScoreRequest, score
 from splatctrl_cli.jobs.score_fit import METHODS as COMPARED
 from splatctrl_cli.jobs.score_fit import PROTOCOL
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
+from splatctrl_cli.jobs.studies.problems import named
 from splatctrl_cli.simulate.recording import RecordingOptions
 
 GIVEN, SIMULATED = "dtu", "simulated"  # scans of a tree, and the scan that `simulate` makes, fitted by several seeds
@@ -96,20 +97,21 @@ def problems(trials: int | None, root: Path | None) -> list[tuple[str, int]]:
 def fits(
     problem: str, root: Path | None, methods: Sequence[str], *, threads: int, stopwatch: Stopwatch
 ) -> Iterator[Fit]:
-    """A scan through the methods. Raises InputError for one that the tree does not have."""
-    environment, _, digits = problem.rpartition("-")
-    number = int(digits)
+    """A scan through the methods. Raises InputError for a name that is none, or not in the tree."""
+    environment, number = named(problem, (GIVEN, SIMULATED), "environment")
+    if environment == GIVEN and root is None:
+        raise InputError(f"--problem {problem}: is of a DTU tree", remedy="give its folder with --problems")
     with TemporaryDirectory() as name:
         folder = Path(name)
-        if environment == SIMULATED or root is None:
+        if root is None or environment == SIMULATED:
             with stopwatch.stage("recording"):
                 simulate(SimulateRequest(out=folder / "scan", options=RecordingOptions(duration_s=0.6), dtu=True))
             scan = RecordingRequest(path=folder / "scan" / "dtu", is_dtu=True, protocol=HELD_OUT)
         else:
-            named = [each for each in _names(root) if _number(each) == number]
-            if not named:
+            there = [each for each in _names(root) if _number(each) == number]
+            if not there:
                 raise InputError(f"{root}: has no scan {number}", remedy="give the tree that the study began with")
-            scan = RecordingRequest(path=root, is_dtu=True, scan=named[0], protocol=PROTOCOL)
+            scan = RecordingRequest(path=root, is_dtu=True, scan=there[0], protocol=PROTOCOL)
         for method in methods:
             row = Fit(environment=environment, number=number, method=method)
             with stopwatch.stage(method):

@@ -2,7 +2,7 @@
 
 import os
 import tarfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -82,29 +82,34 @@ def archive_of(given: Path | None) -> Path | None:
     return given.absolute()
 
 
+def named(name: str, kinds: Collection[str], kind: str) -> tuple[str, int]:
+    """What a problem's name, KIND-NUMBER, says: one of `kinds`, and which. Raises InputError for another name."""
+    first, _, number = name.rpartition("-")
+    if first not in kinds or not number.isdecimal():
+        raise InputError(f"--problem {name}: expected {kind.upper()}-NUMBER", remedy=f"{kind}s: {', '.join(kinds)}")
+    return first, int(number)
+
+
 def read_problem(name: str, archive: Path | None) -> Problem:
     """The problem of a name; archive: the folder of MotionBenchMaker's problems and their robot.
 
     Raises InputError for a name that is none, a folder without the problem, or one of another robot.
     """
-    environment, _, number = name.rpartition("-")
-    if environment in ENVIRONMENTS and number.isdigit():
+    environment, number = named(name, (*ENVIRONMENTS, *FAMILIES), "environment")
+    if environment in ENVIRONMENTS:
         model = simulated_arm()
-        task = task_of(environment, int(number), model)
+        task = task_of(environment, number, model)
         return Problem(
             environment=environment,
-            number=int(number),
+            number=number,
             model=model,
             things=task.environment.primitives,
             start=task.waypoints[0],
             goal=task.waypoints[-1],
         )
-    if environment not in FAMILIES or not number.isdigit():
-        known = ", ".join((*ENVIRONMENTS, *FAMILIES))
-        raise InputError(f"--problem {name}: expected ENVIRONMENT-NUMBER", remedy=f"environments: {known}")
     if archive is None:
         raise InputError(f"--problem {name}: is of MotionBenchMaker", remedy="give its folder with --problems")
-    (found,) = read_archive(archive, panda(archive), [(environment, int(number))])
+    (found,) = read_archive(archive, panda(archive), [(environment, number)])
     return found
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.jobs.simulated_task import solids_of
-from splatctrl_cli.jobs.studies.problems import Problem, room, simulated_arm
+from splatctrl_cli.jobs.studies.problems import Problem, named, room, simulated_arm
 from splatctrl_cli.planner.birrt import plan
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.planned import goal_postures
@@ -69,17 +69,15 @@ def read_scene(name: str) -> Scene:
 
     Raises InputError for a name that is none.
     """
-    layout, _, number = name.rpartition("-")
-    if layout not in LAYOUTS or not number.isdigit():
-        raise InputError(f"--problem {name}: expected LAYOUT-NUMBER", remedy=f"layouts: {', '.join(LAYOUTS)}")
+    layout, number = named(name, LAYOUTS, "layout")
     model = simulated_arm()
     for attempt in range(ATTEMPTS):
-        drawn = drawn_scene(layout, int(number), attempt)
+        drawn = drawn_scene(layout, number, attempt)
         ends = _ends(drawn, model)
         if ends is not None:
             return Scene(
                 layout=layout,
-                number=int(number),
+                number=number,
                 drawn=drawn,
                 model=model,
                 hover=ends[0],

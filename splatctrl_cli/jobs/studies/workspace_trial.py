@@ -8,12 +8,11 @@ import numpy as np
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.events import runs_of
 from splatctrl_cli.control.standstill import StopZone
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.verdict import Outcome as Judgement
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.replays.inputs import MeasuredRobot
 from splatctrl_cli.jobs.studies import judge
-from splatctrl_cli.jobs.studies.problems import simulated_arm
+from splatctrl_cli.jobs.studies.problems import named, simulated_arm
 from splatctrl_cli.jobs.studies.workspace_drives import (
     FPS,
     MAX_TIME,
@@ -125,12 +124,10 @@ def visits_of(
     name: str, methods: Sequence[str], config: Config, *, width: int, stopwatch: Stopwatch
 ) -> Iterator[Visit]:
     """A row per method of the visit with a name, PLACE-NUMBER. Raises InputError for one that is none."""
-    place, _, number = name.rpartition("-")
-    if place not in PLACES or not number.isdigit():
-        raise InputError(f"--problem {name}: expected PLACE-NUMBER", remedy=f"places: {', '.join(PLACES)}")
+    place, number = named(name, PLACES, "place")
     options = RecordingOptions(
         human_arm=place,
-        seed=int(number),
+        seed=number,
         duration_s=MAX_TIME,
         fps=FPS,
         width=width,
@@ -141,7 +138,7 @@ def visits_of(
     things = TruthField([p for p in recording.primitives if not p.name.startswith("human")])
     with stopwatch.stage("alone"):
         alone = driven(recording.robot, config, lambda index, q: things, None)
-    setting = Setting(place=place, number=int(number), recording=recording, config=config, alone=alone)
+    setting = Setting(place=place, number=number, recording=recording, config=config, alone=alone)
     robot = judge.measured(recording.robot, config)
     for method in methods:
         with stopwatch.stage(f"{method}: drive"):

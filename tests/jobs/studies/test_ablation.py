@@ -44,6 +44,12 @@ def test_without_a_mechanism_the_settings_differ(method: str) -> None:
     assert load_config(None, OFF[method]) != Config()
 
 
+@pytest.mark.parametrize("name", ["table-99x", "foo-0001", "table", "table-", "-3"])
+def test_a_name_that_is_none_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match=f"--problem {name}: expected ENVIRONMENT-NUMBER"):
+        list(measured(name, [ALL], width=48, threads=1, stopwatch=Stopwatch()))
+
+
 def test_the_problems_are_drawn_and_still() -> None:
     assert problems(2, archive=None) == [(TABLE, 0), (TABLE, 1), (SCAN, 0), (SCAN, 1)]
     assert len(problems(None, archive=None)) == 25

@@ -54,6 +54,11 @@ def test_a_scan_of_a_tree_goes_through_budgets_and_baseline() -> None:
         list(fits("dtu-0007", SAMPLE, METHODS, threads=1, stopwatch=Stopwatch()))
 
 
+def test_a_scan_of_a_tree_is_not_the_simulated_one() -> None:
+    with pytest.raises(InputError, match="is of a DTU tree"):
+        list(fits("dtu-0024", None, METHODS, threads=1, stopwatch=Stopwatch()))
+
+
 @pytest.mark.usefixtures("fast")
 def test_a_method_that_fails_is_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object) -> Fit:
