@@ -25,8 +25,10 @@ from splatctrl_cli.libraries import of_extra
 from splatctrl_cli.planner.configuration_clearance import HasDistance, OnlyDistance
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.gaussian_fitter import GaussianFitter
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask, self_mask_metrics
+from splatctrl_cli.splat_files.splats import nearest_splats
 from splatctrl_cli.voxels import Balls, VoxelState
 
 TSDF_BLOCKS = 20_000  # of 8 voxels along each edge, to begin with
@@ -135,6 +137,22 @@ def occupancy_map(made: Fitted, config: Config, threads: int) -> Map:
     return Map(scene=Asked(distance=_less_rounding(field)), num_parts=len(balls))
 
 
+def gaussian_map(problem: Problem, views: Views, config: Config, threads: int) -> Map:
+    """3D-GS, densified as in IV-A, of the frames without the arm's pixels: the distance to balls of its Gaussians'
+    volume. What reaches into the arm where it stands is left out, as of ours.
+    """
+    fitter = GaussianFitter(
+        config, workspace_of(problem), without_robot(problem, views, config), seed=problem.number, threads=threads
+    )
+    fitter.fit()
+    splats = nearest_splats(fitter.gaussians())
+    centers, radii = beside_the_start(problem, splats.centers, splats.radii)
+    if not len(radii):
+        raise NotEvaluableError("3D-GS: no Gaussian is left")
+    field = SphereField(centers, radii, threads=threads)
+    return Map(scene=Asked(distance=_less_rounding(field)), num_parts=len(splats))
+
+
 def tsdf_map(problem: Problem, views: Views, config: Config) -> Map:
     """Open3D's TSDF of the frames without the arm's pixels: the distance to its mesh. Raises UsageError without the
     extra.
@@ -171,13 +189,15 @@ def tsdf_map(problem: Problem, views: Views, config: Config) -> Map:
 
 
 def without_robot(problem: Problem, views: Views, config: Config) -> list[RgbdFrame]:
-    """Every frame, without depth where it shows the arm."""
+    """Every frame without what shows the arm: no depth there, and no valid colour."""
     return [_without_robot(frame, _posture(problem, step), config) for step in views.steps for frame in step]
 
 
 def _without_robot(frame: RgbdFrame, robot: RobotPosture, config: Config) -> RgbdFrame:
-    is_kept = self_mask(frame, robot, config.occupancy).kinds == PixelKind.OBJECT
-    return replace(frame, depth=np.where(is_kept, frame.depth, np.float32(0)))
+    kinds = self_mask(frame, robot, config.occupancy).kinds
+    depth = np.where(kinds == PixelKind.OBJECT, frame.depth, np.float32(0))
+    is_valid = (kinds == PixelKind.OBJECT) | (kinds == PixelKind.NOTHING)
+    return replace(frame, depth=depth, valid=is_valid if frame.valid is None else is_valid & frame.valid)
 
 
 def _posture(problem: Problem, step: Step) -> RobotPosture:

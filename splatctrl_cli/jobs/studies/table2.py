@@ -26,6 +26,7 @@ NAMES = {
     "qp-ik": "ours, QP-IK",
     "qp-ik-detours": "ours, QP-IK with ways out",
     "paper": "--preset paper, planner",
+    "3dgs": "3D-GS, planner",
     "occupancy": "occupancy grid, planner",
 }
 TITLES = {"tabletop": "Tabletop", "cubby": "Cubby", "merged-cubby": "Merged cubby"}

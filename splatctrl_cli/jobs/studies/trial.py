@@ -17,6 +17,7 @@ from splatctrl_cli.jobs.studies.maps import (
     Fitted,
     Map,
     fitted,
+    gaussian_map,
     occupancy_map,
     printed_map,
     splat_map,
@@ -34,8 +35,9 @@ from splatctrl_cli.simulate.environments import ENVIRONMENTS
 
 OURS, TSDF, TRUTH = "ours", "tsdf", "truth"
 QP_IK, QP_IK_DETOURS, PAPER, OCCUPANCY = "qp-ik", "qp-ik-detours", "paper", "occupancy"
+GAUSSIANS = "3dgs"
 FULL = (OURS, TSDF, TRUTH)  # methods of every problem; the others are of the first drawn ones
-METHODS = (*FULL, QP_IK, QP_IK_DETOURS, PAPER, OCCUPANCY)
+METHODS = (*FULL, QP_IK, QP_IK_DETOURS, PAPER, GAUSSIANS, OCCUPANCY)
 SUBSET = 20  # problems of each drawn environment that go through every method
 CAMERAS = (2, 4, 6)
 DETOURS = 3
@@ -281,5 +283,6 @@ MAKERS: Mapping[str, tuple[Callable[[Rig], Map], Drive]] = {  # how a method's m
     QP_IK: (lambda rig: rig.splats, by_controller(0)),
     QP_IK_DETOURS: (lambda rig: rig.splats, by_controller(DETOURS)),
     PAPER: (_printed, as_printed),
+    GAUSSIANS: (lambda rig: gaussian_map(rig.problem, rig.views, rig.config, rig.threads), by_planner),
     OCCUPANCY: (lambda rig: occupancy_map(rig.fitted, rig.config, rig.threads), by_planner),
 }

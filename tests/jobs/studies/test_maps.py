@@ -1,5 +1,7 @@
 """Maps of one simulated problem, and which of their ways a planner takes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,28 @@ def test_the_first_way_that_leads_to_the_goal_is_taken(problem: Problem, views: 
     assert [attempt.in_known_space for attempt in taken] == [True, False, False]
     assert [attempt.position is not None for attempt in taken] == [True, True, False]
     assert taken[2].cause == judge.GOAL_BLOCKED
+
+
+def test_the_gaussians_of_the_baseline_lie_on_the_things_and_not_on_the_arm(problem: Problem, views: Views) -> None:
+    config = replace(Config(), gaussians=replace(Config().gaussians, iterations=60))
+    made = maps.gaussian_map(problem, views, config, threads=1)
+    on_table = np.array([[0.6, y, 0.0] for y in np.linspace(-0.6, 0.6, 41)])
+    others = [p for p in problem.things if p.name != "table_0"]
+    clear = on_table[distance_to(others, on_table, 0) > 0.1]
+    assert np.median(made.scene.distance(clear)) < 0.02
+    middle = problem.model.sphere_centers(problem.start)[problem.model.moving_spheres]
+    radii = problem.model.sphere_set.radii[problem.model.moving_spheres]
+    assert (made.scene.distance(middle) > radii).all()  # the arm itself is in no map
+    assert made.num_parts > 500
+
+
+def test_no_pixel_of_the_arm_counts_for_a_baseline(problem: Problem, views: Views) -> None:
+    plain = [frame for step in views.steps for frame in step]
+    for frame, without in zip(plain, maps.without_robot(problem, views, Config()), strict=True):
+        assert without.valid is not None
+        assert (without.depth[~without.valid] == 0).all()
+        assert 0 < (~without.valid).sum() < 0.2 * without.valid.size
+        assert (without.valid | (frame.depth > 0)).all()  # what has no depth may be seen
 
 
 def test_the_tsdfs_surfaces_are_those_of_the_things_without_the_arm(problem: Problem) -> None:
