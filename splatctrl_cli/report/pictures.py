@@ -129,13 +129,15 @@ def drawn_figure(height: float) -> Iterator["mpl.figure.Figure"]:
         yield figure
 
 
-def save_figure(figure: "mpl.figure.Figure", path: Path) -> None:
-    """Write the figure without the clock in it."""
+def save_figure(figure: "mpl.figure.Figure", path: Path, told: str = "") -> None:
+    """Write the figure without the clock in it; told: what it shows, for who reads the file and does not look."""
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)  # else savefig lays out once more, and draws everything for it
-    figure.savefig(path, dpi=DPI, facecolor="white", metadata={"Software": "splatctrl"})
+    figure.savefig(
+        path, dpi=DPI, facecolor="white", metadata={"Software": "splatctrl"} | ({"Description": told} if told else {})
+    )
 
 
 def _draw_comparison(figure: "mpl.figure.Figure", axes: Sequence[Any], row: ComparisonRow) -> None:

@@ -27,7 +27,13 @@ def _planned(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> I
     with stopwatch.stage("problem"):
         problem = read_problem(request.problem, request.problems)
     yield from trial.trials_of(
-        problem, config, request.methods, width=request.width, threads=request.threads, stopwatch=stopwatch
+        problem,
+        config,
+        request.methods,
+        width=request.width,
+        threads=request.threads,
+        stopwatch=stopwatch,
+        out=request.out,
     )
 
 

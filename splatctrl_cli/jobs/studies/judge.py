@@ -70,7 +70,7 @@ def against_truth(problem: Problem, position: Float64, views: Views) -> Executio
     cause = GOAL_MISSED if moved > GOAL_POSITION or turned > GOAL_ROTATION else ""
     is_free = check_edges(room, position[:-1], position[1:], contact=TOUCH).is_free
     if not is_free.all():
-        cause = _what_is_hit(problem, room, position, views)
+        cause = _what_is_hit(problem, position, views)
     alone = Clearance.of(problem.model.with_self_pairs(NO_PAIRS), problem.solids)
     clearance = least_clearance(alone, position, tolerance=5e-4)
     return Execution(
@@ -81,17 +81,43 @@ def against_truth(problem: Problem, position: Float64, views: Views) -> Executio
     )
 
 
-def _what_is_hit(problem: Problem, room: Clearance, position: Float64, views: Views) -> str:
-    """Whether the deepest contact of the states, or of the middles between them, is with something seen."""
-    middles = 0.5 * (position[:-1] + position[1:])
-    postures = np.concatenate([position, middles])
+@dataclass(frozen=True, kw_only=True)
+class Contact:
+    """The deepest of a motion: the posture q (J,), which sphere of the arm, the point (3,) [m], world, that it came
+    to, whether that is its own, and when, in words.
+    """
+
+    q: Float64
+    sphere: int
+    point: Float64
+    is_own: bool
+    when: str
+
+
+def deepest_contact(problem: Problem, position: Float64) -> Contact:
+    """Of the states (T, J) and of the middles between them."""
+    room = Clearance.of(problem.model, problem.solids)
+    postures = np.concatenate([position, 0.5 * (position[:-1] + position[1:])])
     rows = room.rows(postures)
     deepest, row = np.unravel_index(int(np.argmin(rows)), rows.shape)
+    q = postures[deepest]
+    when = f"state {deepest % len(position)} of {len(position)}"
+    centers = problem.model.sphere_centers(q)
     if row >= len(room.moving):
+        first, second = room.pairs[row - len(room.moving)]
+        middle = 0.5 * (centers[first] + centers[second])
+        return Contact(q=q, sphere=int(first), point=middle, is_own=True, when=when)
+    sphere = int(room.moving[row])
+    _, surface = closest_of(problem.primitives, centers[sphere][None], 0)
+    return Contact(q=q, sphere=sphere, point=surface[0], is_own=False, when=when)
+
+
+def _what_is_hit(problem: Problem, position: Float64, views: Views) -> str:
+    """Whether the deepest contact is with something seen."""
+    contact = deepest_contact(problem, position)
+    if contact.is_own:
         return HIT_SELF
-    center = problem.model.sphere_centers(postures[deepest])[room.moving[row]]
-    _, surface = closest_of(problem.primitives, center[None], 0)
-    return HIT_SEEN if views.has_seen(surface)[0] else HIT_UNSEEN
+    return HIT_SEEN if views.has_seen(contact.point[None])[0] else HIT_UNSEEN
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from splatctrl_cli.jobs.studies.views import Step, Views
 from splatctrl_cli.jobs.studies.ways import Asked, Surroundings, Ways, beside_the_start
 from splatctrl_cli.libraries import of_extra
 from splatctrl_cli.planner.configuration_clearance import HasDistance, OnlyDistance
-from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, RgbdFrame
+from splatctrl_cli.records import Box, DistanceGrid, Float32, Float64, Label, RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.gaussian_fitter import GaussianFitter
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
@@ -39,12 +39,14 @@ TSDF_VOXEL, TSDF_BAND = 0.01, 0.04  # [m] edge of a voxel, and how far from a su
 class Map:
     """scene: what the method takes for things; ways: where a planner may go in it, None for anywhere outside of
     things. known: what a verdict and a controller look at, None without. num_parts: splats, voxels or triangles.
+    things: balls, centers (N, 3) and radii (N,) [m], that a picture shows for them; None where there is no map.
     """
 
     scene: HasDistance
     ways: Ways | None = None
     known: KnownScene | None = None
     num_parts: int = 0
+    things: tuple[Float32, Float32] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +107,7 @@ def splat_map(problem: Problem, made: Fitted, config: Config, threads: int) -> M
         ways=surroundings.ways,
         known=known,
         num_parts=len(fitter.splats()),
+        things=(centers, radii),
     )
 
 
@@ -121,7 +124,8 @@ def printed_map(problem: Problem, made: Fitted, config: Config, threads: int) ->
     planes = baker.allocate(layout.shape[0])
     baker.bake(0, layout.shape[0], planes)
     grid = DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=planes, header={})
-    return Map(scene=OnlyDistance(field=GridField(grid)), num_parts=len(splats))
+    scene = OnlyDistance(field=GridField(grid))
+    return Map(scene=scene, num_parts=len(splats), things=(splats.centers, splats.radii))
 
 
 def occupancy_map(made: Fitted, config: Config, threads: int) -> Map:
@@ -133,8 +137,10 @@ def occupancy_map(made: Fitted, config: Config, threads: int) -> Map:
     if not len(centers):
         raise NotEvaluableError("occupancy grid: no voxel is occupied")
     balls = Balls.of_voxels(centers.astype(np.float32), grid.voxel, np.zeros(len(centers), np.uint8))
-    field = SphereField(balls.centers, np.full(len(balls), balls.radius, np.float32), threads=threads)
-    return Map(scene=Asked(distance=_less_rounding(field)), num_parts=len(balls))
+    radii = np.full(len(balls), balls.radius, np.float32)
+    field = SphereField(balls.centers, radii, threads=threads)
+    scene = Asked(distance=_less_rounding(field))
+    return Map(scene=scene, num_parts=len(balls), things=(balls.centers, radii))
 
 
 def gaussian_map(problem: Problem, views: Views, config: Config, threads: int) -> Map:
@@ -185,7 +191,9 @@ def tsdf_map(problem: Problem, views: Views, config: Config) -> Map:
         asked = tensor(np.ascontiguousarray(points, np.float32))
         return np.asarray(scene.compute_distance(asked).numpy(), np.float64) - ROUNDING
 
-    return Map(scene=Asked(distance=distance), num_parts=num_triangles)
+    corners = mesh.vertex.positions.numpy()
+    radii = np.full(len(corners), 0.5 * TSDF_VOXEL, np.float32)
+    return Map(scene=Asked(distance=distance), num_parts=num_triangles, things=(corners, radii))
 
 
 def without_robot(problem: Problem, views: Views, config: Config) -> list[RgbdFrame]:

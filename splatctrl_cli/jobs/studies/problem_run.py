@@ -1,7 +1,7 @@
 """One problem of a study as a run of its own: its trials as a table, and the verdict that no green one was false."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic
 
@@ -41,8 +41,8 @@ class ProblemRequest:
 class Study(Generic[R]):
     """An experiment of the paper, whose trials are rows of a kind. problems: environment and number, of at most so
     many of each (None: all), with those of a folder; archive: that folder, by --problems; archived: the environments
-    that are in it; trials: those of a problem; sections: tables of all trials; notes: sentences below them; draw:
-    their figure, into a file.
+    that are in it; trials: those of a problem, whose `out` is the folder that is being written; sections: tables of
+    all trials; notes: sentences below them; draw: their figure, into a file.
     """
 
     row: type[R]
@@ -79,7 +79,7 @@ def run_problem(study: Study[R], request: ProblemRequest, progress: Progress = S
     stopwatch = Stopwatch()
     with output_path(request.out, force=request.force, is_folder=True) as folder:
         trials = list[R]()
-        for trial in study.trials(request, study.config, stopwatch):
+        for trial in study.trials(replace(request, out=folder), study.config, stopwatch):
             trials.append(trial)
             progress.log(f"study: {request.problem}: {trial.told}")
         write_trials(folder / TRIALS, trials, study.row)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.evaluate.verdict import Outcome as Judgement
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.replays.inputs import MeasuredRobot
-from splatctrl_cli.jobs.studies import judge
+from splatctrl_cli.jobs.studies import failures, judge
 from splatctrl_cli.jobs.studies.maps import (
     Fitted,
     Map,
@@ -101,13 +102,16 @@ class Attempt:
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
-    """A problem seen by its first cameras; config: of all methods but the paper's literal one."""
+    """A problem seen by its first cameras; config: of all methods but the paper's literal one; out: the folder for
+    pictures of failures, None for none.
+    """
 
     problem: Problem
     views: Views
     config: Config
     threads: int
     stopwatch: Stopwatch
+    out: Path | None = None
 
     @cached_property
     def task(self) -> ReplayTask:
@@ -136,9 +140,16 @@ Drive = Callable[[Rig, Map], Attempt]
 
 
 def trials_of(
-    problem: Problem, config: Config, methods: Sequence[str], *, width: int, threads: int, stopwatch: Stopwatch
+    problem: Problem,
+    config: Config,
+    methods: Sequence[str],
+    *,
+    width: int,
+    threads: int,
+    stopwatch: Stopwatch,
+    out: Path | None = None,
 ) -> Iterator[Trial]:
-    """Every method that the problem goes through, with every number of cameras."""
+    """Every method that the problem goes through, with every number of cameras; out: as of a `Rig`."""
     chosen = [name for name in methods if name in FULL or is_in_subset(problem.environment, problem.number)]
     with stopwatch.stage("views"):
         views = views_of(problem, max(CAMERAS), width=width, num_steps=NUM_STEPS)
@@ -150,6 +161,7 @@ def trials_of(
             config=config,
             threads=threads,
             stopwatch=stopwatch,
+            out=out,
         )
         for name in chosen:
             if name != TRUTH:
@@ -181,7 +193,9 @@ def trial_of(rig: Rig, method: str, num_cameras: int, robot: MeasuredRobot) -> T
         with rig.stopwatch.stage(f"{method}: plan"):
             attempt = drive(rig, known)
     except SplatCtrlError as error:
-        return replace(begun, reason=error.message)
+        failed = replace(begun, reason=error.message)
+        _draw(rig, failed, None, None)
+        return failed
     told = replace(
         begun,
         cause=attempt.cause,
@@ -190,10 +204,33 @@ def trial_of(rig: Rig, method: str, num_cameras: int, robot: MeasuredRobot) -> T
         in_known_space=attempt.in_known_space,
         num_parts=known.num_parts,
     )
-    if attempt.position is None:
-        return told
-    with rig.stopwatch.stage(f"{method}: judge"):
-        return _judged(rig, told, attempt, known, robot)
+    if attempt.position is not None:
+        with rig.stopwatch.stage(f"{method}: judge"):
+            told = _judged(rig, told, attempt, known, robot)
+    if not told.success and method != TRUTH:
+        _draw(rig, told, attempt, known)
+    return told
+
+
+def _draw(rig: Rig, trial: Trial, attempt: Attempt | None, known: Map | None) -> None:
+    """A picture of a trial without success."""
+    if rig.out is None:
+        return
+    with rig.stopwatch.stage("pictures"):
+        failures.draw(
+            failures.Failure(
+                problem=rig.problem,
+                views=rig.views,
+                told=trial.label,
+                cause=trial.cause,
+                verdict=trial.verdict,
+                reason=trial.reason,
+                position=None if attempt is None else attempt.position,
+                scene=None if known is None else known.scene,
+                things=None if known is None else known.things,
+            ),
+            rig.out / f"failure-{trial.method}-{trial.cameras}.png",
+        )
 
 
 def _judged(rig: Rig, trial: Trial, attempt: Attempt, known: Map, robot: MeasuredRobot) -> Trial:

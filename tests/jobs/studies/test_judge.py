@@ -10,43 +10,13 @@ from splatctrl_cli.evaluate.verdict import Outcome, Verdict, held, verdict_of
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.studies import judge, trial
 from splatctrl_cli.jobs.studies.maps import Map
-from splatctrl_cli.jobs.studies.problems import Problem, simulated_arm
+from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.jobs.studies.rows import FALSE_GREEN, verdict_on_trials
 from splatctrl_cli.jobs.studies.trial import OURS, Attempt, Rig, Trial, trial_of
-from splatctrl_cli.jobs.studies.views import Views, views_of
+from splatctrl_cli.jobs.studies.views import Views
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.records import Float64
-from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.simulate.environments import drawn_texture
-from splatctrl_cli.simulate.primitives import Primitive
-
-HOME = np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785])
-TURN = np.array([0.8, 0, 0, 0, 0, 0, 0])  # [rad] from either side of the post to the other
-
-
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return simulated_arm()
-
-
-def post(model: RobotModel, radius: float = 0.03) -> Primitive:
-    """A post that the hand sweeps half way, and that neither end is near."""
-    T = np.eye(4)
-    T[:3, 3] = model.frame_pose(HOME, "hand")[:3, 3]
-    texture = drawn_texture(np.random.default_rng(0))
-    return Primitive(name="post", kind="cylinder", size=(radius, 0.3), T_world_shape=T, texture=texture)
-
-
-@pytest.fixture(scope="module")
-def problem(model: RobotModel) -> Problem:
-    return Problem(
-        environment="tabletop", number=0, model=model, things=(post(model),), start=HOME - TURN, goal=HOME + TURN
-    )
-
-
-@pytest.fixture(scope="module")
-def views(problem: Problem) -> Views:
-    return views_of(problem, 2, width=160, num_steps=1)
+from tests.jobs.studies.conftest import HOME, blind
 
 
 def test_a_way_that_touches_a_thing_between_two_states_alone_has_collided(problem: Problem, views: Views) -> None:
@@ -61,8 +31,7 @@ def test_a_way_that_touches_a_thing_between_two_states_alone_has_collided(proble
 def test_a_thing_that_no_camera_measured_is_an_unseen_one(problem: Problem, views: Views) -> None:
     position = np.array([problem.start, HOME, problem.goal])
     assert judge.against_truth(problem, position, views).cause == judge.HIT_SEEN
-    blind = Views(steps=tuple(tuple(replace(f, depth=0 * f.depth) for f in step) for step in views.steps))
-    assert judge.against_truth(problem, position, blind).cause == judge.HIT_UNSEEN
+    assert judge.against_truth(problem, position, blind(views)).cause == judge.HIT_UNSEEN
 
 
 @pytest.mark.parametrize(("joint", "angle", "cause"), [(6, 0.0, ""), (6, np.radians(1.1), judge.GOAL_MISSED)])
@@ -107,8 +76,7 @@ def test_a_green_verdict_on_a_motion_that_collides_is_counted_as_false(
 
 
 def test_what_a_method_cannot_do_is_a_failed_trial_with_its_reason(problem: Problem, views: Views) -> None:
-    blind = Views(steps=tuple(tuple(replace(f, depth=0 * f.depth) for f in step) for step in views.steps))
-    rig = Rig(problem=problem, views=blind, config=Config(), threads=1, stopwatch=Stopwatch())
+    rig = Rig(problem=problem, views=blind(views), config=Config(), threads=1, stopwatch=Stopwatch())
     row = trial_of(rig, "occupancy", 2, None)  # type: ignore[arg-type]
     assert not row.success and row.cause == judge.NOT_EVALUABLE and "no voxel is occupied" in row.reason
     assert isinstance(row, Trial)

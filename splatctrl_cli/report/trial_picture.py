@@ -1,0 +1,117 @@
+"""A trial of a planner drawn: what is there, what no camera saw of it, what the map takes for things, and the arm.
+
+Rendered by the kernel that renders a robot's own surface, in flat colours with few shades, so that a file is small.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.geometry import back_project, invert_transform, look_at, project, transform_points
+from splatctrl_cli.libraries import mpl
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics
+from splatctrl_cli.report.pictures import INK, drawn_figure, save_figure
+from splatctrl_cli.robot.surface import RobotSurface
+
+THING, UNSEEN, MAP, START, GOAL = "thing", "never measured", "map", "start", "goal"
+ARM, TOUCHED, WAY, CAMERA = "arm here", "sphere named above", "way of the tip", "camera"
+COLORS = {
+    THING: "#b9c3cb",
+    UNSEEN: "#e69f00",
+    MAP: "#009e73",
+    START: "#56b4e9",
+    GOAL: "#cc79a7",
+    ARM: "#7a8288",
+    TOUCHED: "#d00000",
+    WAY: "#111111",
+    CAMERA: "#0072b2",
+}
+SIZE = (560, 430)  # [px] of a view
+SHADES = 5  # of a colour, by how a surface is turned
+SHOWN = 0.45  # of what shines through: the map, the start and the goal
+LENS = Intrinsics(fx=520.0, fy=520.0, cx=(SIZE[0] - 1) / 2, cy=(SIZE[1] - 1) / 2, width=SIZE[0], height=SIZE[1])
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialScene:
+    """Surfaces in the world frame, each link of the name of a colour: solid ones, and light ones that shine through
+    where they are nearer. is_seen: whether a camera measured something at points (Q, 3); place (3,) [m]: what to
+    look at; cameras (C, 3) [m].
+    """
+
+    solid: RobotSurface
+    light: Sequence[RobotSurface]
+    is_seen: Callable[[Float64], Sequence[bool]]
+    place: Float64
+    cameras: Float64
+
+
+def trial_picture(path: Path, scene: TrialScene, views: Sequence[tuple[str, Float64, Float64]], caption: str) -> None:
+    """Write views side by side, each a title, its eye (3,) and what it looks at (3,) [m]; the caption above."""
+    with drawn_figure(6.2) as figure:
+        for axes, (title, eye, target) in zip(figure.subplots(1, len(views)), views, strict=True):
+            T_world_camera = look_at(eye, target)
+            axes.imshow(_rendered(scene, T_world_camera), interpolation="nearest")
+            _mark(axes, scene, T_world_camera)
+            axes.set_title(title, fontsize=10, pad=5)
+            axes.set(xticks=[], yticks=[], xlim=(-0.5, SIZE[0] - 0.5), ylim=(SIZE[1] - 0.5, -0.5))
+        figure.suptitle(caption, fontsize=10, x=0.01, ha="left")
+        marks = [mpl.patches.Patch(color=color, label=name) for name, color in COLORS.items()]
+        figure.legend(handles=marks, frameon=False, fontsize=9, loc="outside lower center", ncols=len(marks))
+        save_figure(figure, path, caption)
+
+
+def _rendered(scene: TrialScene, T_world_camera: Float64) -> Float64:
+    """RGB (H, W, 3) in [0, 1]."""
+    depth, color = _layer(scene.solid, T_world_camera, scene.is_seen)
+    for surface in scene.light:
+        nearer, tint = _layer(surface, T_world_camera)
+        is_before = (nearer > 0) & ((depth == 0) | (nearer < depth))
+        color[is_before] = (1 - SHOWN) * color[is_before] + SHOWN * tint[is_before]
+    return color
+
+
+def _layer(
+    surface: RobotSurface, T_world_camera: Float64, is_seen: Callable[[Float64], Sequence[bool]] | None = None
+) -> tuple[Float32, Float64]:
+    """depth (H, W) [m], 0 = none, and RGB (H, W, 3) of one surface, white where it is not."""
+    nothing = np.zeros(SIZE[::-1], np.float32)
+    seen = surface.render(np.tile(np.eye(4), (len(surface.links), 1, 1)), LENS, T_world_camera, nothing)
+    names = [*surface.links, UNSEEN, "none"]
+    number = np.where(seen.link < 0, len(names) - 1, seen.link)
+    points = back_project(LENS, seen.depth)
+    if is_seen is not None and THING in surface.links:
+        is_thing = number == names.index(THING)
+        number[is_thing & ~_everywhere(is_seen, transform_points(T_world_camera, points), is_thing)] = len(names) - 2
+    palette = np.array([mpl.colors.to_rgb(COLORS.get(name, "#ffffff")) for name in names])
+    return seen.depth, palette[number] * np.where(seen.link < 0, 1.0, _shade(points))[..., None]
+
+
+def _everywhere(is_seen: Callable[[Float64], Sequence[bool]], points_world: Float64, is_asked: Bool) -> Bool:
+    """What was seen (H, W) of points (H, W, 3), asked at every second pixel of both directions."""
+    coarse = np.zeros(is_asked[::2, ::2].shape, bool)
+    coarse[is_asked[::2, ::2]] = is_seen(points_world[::2, ::2][is_asked[::2, ::2]])
+    return coarse.repeat(2, axis=0).repeat(2, axis=1)[: is_asked.shape[0], : is_asked.shape[1]]
+
+
+def _shade(points: Float64) -> Float64:
+    """(H, W) in (0, 1]: bright where a surface faces the camera, in `SHADES` steps."""
+    across, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    normal = np.cross(across, down)
+    facing = np.abs(np.sum(normal * points, axis=2))
+    length = np.linalg.norm(normal, axis=2) * np.linalg.norm(points, axis=2)
+    turned = np.divide(facing, length, out=np.zeros_like(facing), where=length > 0)
+    return np.asarray(0.45 + 0.55 * np.rint(turned * SHADES) / SHADES)
+
+
+def _mark(axes: "mpl.axes.Axes", scene: TrialScene, T_world_camera: Float64) -> None:
+    """A ring about the place, whatever hides it, and the numbers of the cameras that are in the picture."""
+    T_camera_world = invert_transform(T_world_camera)
+    u, v = project(LENS, transform_points(T_camera_world, scene.place[None])[0])
+    axes.plot(u, v, "o", markersize=22, markerfacecolor="none", markeredgecolor=INK, markeredgewidth=1.2)
+    for number, eye in enumerate(transform_points(T_camera_world, scene.cameras)):
+        if eye[2] > 0:
+            u, v = project(LENS, eye)
+            axes.annotate(f"cam{number}", (u, v), (6, 4), textcoords="offset points", fontsize=8, clip_on=True)

@@ -1,0 +1,78 @@
+"""A trial without success leaves a picture of why; one that succeeds leaves none."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.jobs.studies import judge, trial
+from splatctrl_cli.jobs.studies.maps import Map
+from splatctrl_cli.jobs.studies.problems import Problem
+from splatctrl_cli.jobs.studies.trial import OURS, Attempt, Rig, trial_of
+from splatctrl_cli.jobs.studies.views import Views
+from splatctrl_cli.report.trial_picture import COLORS, TOUCHED, UNSEEN
+from tests.jobs.studies.conftest import HOME, blind
+
+MOST = 150_000  # bytes
+
+
+def pictured(
+    problem: Problem,
+    views: Views,
+    attempt: Attempt,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> tuple[str, Path]:
+    """The cause of a trial with a map of one ball at the post, and where its picture is to be."""
+    ball = problem.things[0].T_world_shape[:3, 3] if problem.things else np.zeros(3)
+    known = Map(scene=problem.solids, things=(ball[None].astype(np.float32), np.full(1, 0.05, np.float32)))
+    monkeypatch.setattr(trial, "MAKERS", {OURS: (lambda rig: known, lambda rig, known: attempt)})
+    rig = Rig(problem=problem, views=views, config=Config(), threads=1, stopwatch=Stopwatch(), out=folder)
+    row = trial_of(rig, OURS, 2, None)  # type: ignore[arg-type]
+    return row.cause, folder / "failure-ours-2.png"
+
+
+def num_pixels(path: Path, name: str) -> int:
+    """How many have the hue of a colour, in both views."""
+    image = cv2.imread(str(path))[80:530, :, ::-1].astype(np.float64)
+    brightest = image.max(axis=2, keepdims=True)
+    color = np.array(to_rgb(COLORS[name]))
+    is_near = np.abs(image / np.maximum(brightest, 1) - color / color.max()).max(axis=2) < 0.06
+    return int(np.sum(is_near & (brightest[..., 0] > 60)))
+
+
+@pytest.mark.parametrize("is_blind", [False, True])
+def test_a_collision_is_shown_where_it_is_deepest_and_whether_that_was_seen(
+    problem: Problem, views: Views, is_blind: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    position = np.array([problem.start, HOME, problem.goal])
+    seen_by = blind(views) if is_blind else views
+    cause, path = pictured(problem, seen_by, Attempt(position=position), tmp_path, monkeypatch)
+    assert cause == (judge.HIT_UNSEEN if is_blind else judge.HIT_SEEN)
+    assert cause.encode() in path.read_bytes() and path.stat().st_size < MOST
+    assert num_pixels(path, TOUCHED) > 100
+    assert num_pixels(path, UNSEEN) > 2000 if is_blind else num_pixels(path, UNSEEN) < 1500  # its back is unseen
+
+
+def test_what_blocks_is_shown_where_there_is_no_plan(
+    problem: Problem, views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attempt = Attempt(position=None, cause=judge.GOAL_BLOCKED)
+    cause, path = pictured(replace(problem, goal=HOME), views, attempt, tmp_path, monkeypatch)
+    assert cause == judge.GOAL_BLOCKED and b"at the goal" in path.read_bytes()
+    assert num_pixels(path, TOUCHED) > 100
+    pictured(replace(problem, start=HOME), views, replace(attempt, cause=judge.START_BLOCKED), tmp_path, monkeypatch)
+    assert b"at the start" in path.read_bytes()
+
+
+def test_a_success_leaves_no_picture(
+    problem: Problem, views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    position = np.array([problem.start, problem.goal])
+    cause, path = pictured(replace(problem, things=()), views, Attempt(position=position), tmp_path, monkeypatch)
+    assert not cause and not path.exists()
