@@ -173,17 +173,12 @@ def closed_loop(
     record: where the steps are kept, None for memory; commander: who gives the velocities. Raises InputError for a
     start outside the limits or a goal out of reach, NotEvaluableError for a start in collision or outside the field.
     """
-    q = checked_posture(model, task.start, what="start")
-    check_within_limits(model, q, config.limit_tolerance)
-    for waypoint in (*task.via, Waypoint(T_world_goal=task.T_world_goal)):
-        check_goal(model, waypoint.T_world_goal)
     field = field_at(task.stamp_ns)
-    controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
-    check_free(model, field, q)
+    q, controller = _ready(model, config, task, field, solver)
     statics = static_violations(model, field, q, scene_margin(model, config))
-    course, last_velocity = _Course(model, config, task), np.zeros(len(q))
+    course, last_velocity = _Course(model, config, task, plan_detour), np.zeros(len(q))
     kept: StepRecord = InMemory() if record is None else record
-    positions, changes, anchored = [], [], []
+    changes, anchored = [], []
     outcome = Outcome.TIMEOUT if task.last_ns is None else Outcome.LOG_ENDED
     for index in range(course.num_steps):
         stamp = task.stamp_ns + round(index * config.period * 1e9)
@@ -204,17 +199,12 @@ def closed_loop(
         if commander.is_over:
             outcome = Outcome.CONTROLLER_FAILED
             break
-        if task.last_ns is None:
-            positions.append(q)
         if course.has_ended(stamp, index, step):
             outcome = Outcome.GOAL_REACHED
             break
-        if task.last_ns is None and _has_stalled(positions[course.since :], config):
-            detour = None if plan_detour is None or not course.may_detour else plan_detour(stamp, q, course.pose)
-            if detour is None:
-                outcome = Outcome.STALLED
-                break
-            course.leave(index, detour)
+        if course.has_stalled(stamp, index, q):
+            outcome = Outcome.STALLED
+            break
         q, last_velocity = q + config.period * step.velocity, step.velocity
     return ReplayTrace(
         stamp_ns=kept.stamp_ns,
@@ -229,15 +219,31 @@ def closed_loop(
     )
 
 
+def _ready(
+    model: ArmModel, config: ControlConfig, task: ReplayTask, field: DistanceField, solver: QpSolver | None
+) -> tuple[Float64, QpIkController]:
+    """The posture (J,) [rad] at the start and our controller. Raises as `closed_loop` does."""
+    q = checked_posture(model, task.start, what="start")
+    check_within_limits(model, q, config.limit_tolerance)
+    for waypoint in (*task.via, Waypoint(T_world_goal=task.T_world_goal)):
+        check_goal(model, waypoint.T_world_goal)
+    controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
+    check_free(model, field, q)
+    return q, controller
+
+
 class _Course:
     """Which goal holds at a step: one waypoint after the other, or the logged motion."""
 
-    def __init__(self, model: ArmModel, config: ControlConfig, task: ReplayTask) -> None:
-        self._model, self._config, self._task = model, config, task
+    def __init__(
+        self, model: ArmModel, config: ControlConfig, task: ReplayTask, plan_detour: PlanDetour | None
+    ) -> None:
+        self._model, self._config, self._task, self._plan_detour = model, config, task, plan_detour
         self._waypoints = (*task.via, Waypoint(T_world_goal=task.T_world_goal, posture=None))
         self.num_reached = 0
-        self.since = 0  # the step from which a stall counts: the last anchor, waypoint or detour
         self.detours: list[int] = []
+        self._since = 0  # the step from which a stall counts: the last anchor, waypoint or detour
+        self._positions: list[Float64] = []  # of steps that may stall
         self._detour: Detour | None = None
         last_ns = task.last_ns
         left = config.max_time if last_ns is None else (last_ns - task.stamp_ns) * 1e-9 + config.period
@@ -252,7 +258,7 @@ class _Course:
         is_logged = task.stamp_ns + round(index * self._config.period * 1e9) <= task.anchors.last_ns
         if index % every or not is_logged:
             return False
-        self.since = index
+        self._since = index
         return True
 
     def anchor(self, stamp_ns: int) -> tuple[Float64, Float64]:
@@ -260,21 +266,23 @@ class _Course:
         assert self._task.anchors is not None
         return self._task.anchors.at(stamp_ns)
 
-    @property
-    def may_detour(self) -> bool:
-        """Whether another planned way may be taken."""
-        return len(self.detours) < self._config.max_detours
-
-    @property
-    def pose(self) -> Float64:
-        """The pose (4, 4) of the next waypoint."""
-        return self._waypoints[self.num_reached].T_world_goal
-
-    def leave(self, index: int, detour: Detour) -> None:
-        """Go on to the next waypoint along a way that begins here."""
-        self._detour = detour
+    def has_stalled(self, stamp_ns: int, index: int, q: Float64) -> bool:
+        """True where the arm stands still before its goal, and there is no planned way on to the next waypoint, which
+        begins here where there is one. With a log's end nothing stalls.
+        """
+        if self._task.last_ns is not None:
+            return False
+        self._positions.append(q)
+        if not _has_stalled(self._positions[self._since :], self._config):
+            return False
+        if self._plan_detour is None or len(self.detours) >= self._config.max_detours:
+            return True
+        self._detour = self._plan_detour(stamp_ns, q, self._waypoints[self.num_reached].T_world_goal)
+        if self._detour is None:
+            return True
         self.detours.append(index)
-        self.since = index
+        self._since = index
+        return False
 
     def goal(self, stamp_ns: int, q: Float64) -> tuple[Float64, Guide | None]:
         """The goal's pose at a stamp and posture (J,), and how it moves."""
@@ -302,7 +310,7 @@ class _Course:
         if self._task.follow is not None:
             return stamp_ns >= self._task.follow.last_ns
         self.num_reached += 1
-        self.since = index
+        self._since = index
         return self.num_reached == len(self._waypoints)
 
 
