@@ -7,16 +7,16 @@ from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.control.user_controller import ClearanceRow, Controller, ControllerInput, ControllerStart
 from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, UsageError, WriteError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict
-from splatctrl_cli.jobs.bake import BakeResult, bake
-from splatctrl_cli.jobs.bake_request import BakeRequest
+from splatctrl_cli.jobs.bakes.bake import BakeResult, bake
+from splatctrl_cli.jobs.bakes.request import BakeRequest
 from splatctrl_cli.jobs.compare import CompareRequest, CompareResult, compare
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
 from splatctrl_cli.jobs.export_run import ExportRunRequest, ExportRunResult, export_run
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.query import QueryRequest, QueryResult, query
-from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
-from splatctrl_cli.jobs.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.report import (
@@ -27,7 +27,7 @@ from splatctrl_cli.jobs.report import (
     view,
     write_report,
 )
-from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Box, Label
 

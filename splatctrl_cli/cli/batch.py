@@ -31,7 +31,16 @@ from splatctrl_cli.jobs.batches.ledger import NAME, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batches.run import DONE, FAILED, told
 from splatctrl_cli.jobs.batches.suite import Table
 
-PRELOADED = ("check", "ingest", "reconstruct", "export", "bake", "score", "replay", "studies.study")  # of a runner
+PRELOADED = (
+    "check",
+    "ingest",
+    "reconstructions.reconstruct",
+    "export",
+    "bakes.bake",
+    "scores.score",
+    "replay",
+    "studies.study",
+)  # of a runner
 MOST_ROWS = 40  # recordings that are all printed
 OWN = ("out", "force", "resume", "threads")  # options that a batch gives itself, where a command has them
 NOT_OF_A_NODE = (*OWN, "help", "help-all", "json", "verbose", "quiet", "junit", "preset")  # the last is in --set

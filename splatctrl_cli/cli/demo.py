@@ -15,12 +15,12 @@ from splatctrl_cli.cli.replay import show_replayed
 from splatctrl_cli.cli.score import show_scored
 from splatctrl_cli.cli.sdf_bake import show_baked
 from splatctrl_cli.files.summary import Summary
-from splatctrl_cli.jobs.bake import BakeResult
+from splatctrl_cli.jobs.bakes.bake import BakeResult
 from splatctrl_cli.jobs.demo import DemoRequest, StepResult, demo
 from splatctrl_cli.jobs.export import ExportResult
 from splatctrl_cli.jobs.ingest import IngestResult
-from splatctrl_cli.jobs.reconstruct import ReconstructResult
-from splatctrl_cli.jobs.score import ScoreResult
+from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult
+from splatctrl_cli.jobs.scores.score import ScoreResult
 from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
 from splatctrl_cli.simulate.environments import ENVIRONMENT_S
 from splatctrl_cli.simulate.recording import RecordingOptions

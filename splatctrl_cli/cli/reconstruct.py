@@ -10,13 +10,13 @@ from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of, source_options
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.jobs.correct_views import Corrections
 from splatctrl_cli.jobs.device import shown
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
-from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
-from splatctrl_cli.jobs.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.resume import DECIDING_OPTIONS
+from splatctrl_cli.jobs.reconstructions.correct_views import Corrections
+from splatctrl_cli.jobs.reconstructions.gaussians import reconstruct_gaussians
+from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.reconstructions.resume import DECIDING_OPTIONS
 from splatctrl_cli.kernels import native
 from splatctrl_cli.records import Box
 

@@ -10,9 +10,9 @@ from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.score_report import PREFIX, counted
 from splatctrl_cli.jobs.device import shown
-from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.jobs.score_fit import EACH, METHODS, FitRequest, score_fits
-from splatctrl_cli.jobs.score_views import CloudSettings
+from splatctrl_cli.jobs.scores.fit import EACH, METHODS, FitRequest, score_fits
+from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.scores.views import CloudSettings
 from splatctrl_cli.records import MILLIMETRE
 
 OF_FITS: dict[str, object] = {

@@ -14,8 +14,8 @@ from splatctrl_cli.evaluate.field_accuracy import BandAccuracy
 from splatctrl_cli.evaluate.field_truth import TruthComparison
 from splatctrl_cli.field.baker import CHANNELS
 from splatctrl_cli.grid_files.grid_formats import FORMATS
-from splatctrl_cli.jobs.bake import BakeResult, bake
-from splatctrl_cli.jobs.bake_request import BakeRequest
+from splatctrl_cli.jobs.bakes.bake import BakeResult, bake
+from splatctrl_cli.jobs.bakes.request import BakeRequest
 from splatctrl_cli.records import Box
 
 SETTINGS = ("distance", "weights", "unknown", "probability", "voxel", "length_scale")  # of the field, as options

@@ -17,18 +17,18 @@ from splatctrl_cli.evaluate.verdict import DAMAGED, Outcome, Reason, Verdict, ve
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.jobs.bake import BakeResult, bake
-from splatctrl_cli.jobs.bake_request import BakeRequest
+from splatctrl_cli.jobs.bakes.bake import BakeResult, bake
+from splatctrl_cli.jobs.bakes.request import BakeRequest
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
 from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
-from splatctrl_cli.jobs.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.reconstructions.resume import DECIDING_OPTIONS
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.jobs.resume import DECIDING_OPTIONS
-from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame

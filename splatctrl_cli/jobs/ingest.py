@@ -15,7 +15,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import DAMAGED
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.jobs.resume import check_same_run, told_how_to_go_on
+from splatctrl_cli.jobs.reconstructions.resume import check_same_run, told_how_to_go_on
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.sources.calibrated import LOGGED
 from splatctrl_cli.sources.source import logged_descriptions, open_session

@@ -20,10 +20,14 @@ from splatctrl_cli.evaluate import field_accuracy, score_report
 from splatctrl_cli.evaluate.field_truth import FIELDS
 from splatctrl_cli.evaluate.metrics import Better, Scale, Shown
 from splatctrl_cli.files.output import PARTIAL, output_path
-from splatctrl_cli.jobs import bake, reconstruct_gaussians, reconstruct_verdict, robot, score_fit
+from splatctrl_cli.jobs import robot
+from splatctrl_cli.jobs.bakes import bake
+from splatctrl_cli.jobs.reconstructions import gaussians as reconstruct_gaussians
+from splatctrl_cli.jobs.reconstructions import verdict as reconstruct_verdict
 from splatctrl_cli.jobs.replays.metrics import metric_scales, shown_metrics
 from splatctrl_cli.jobs.replays.request import MODES
 from splatctrl_cli.jobs.replays.standstill_baseline import BASELINES
+from splatctrl_cli.jobs.scores import fit as score_fit
 
 REPLAY_FIELDS = ("exact", "barrier", "certified")
 WORDS = {  # of a name in the documentation, for those that it stands for

@@ -20,7 +20,7 @@ from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import Stopwatch, output_path
 from splatctrl_cli.files.point_table import point_blocks
 from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.jobs.bake_request import BakeSource, read_bake_source, source_of_grid
+from splatctrl_cli.jobs.bakes.request import BakeSource, read_bake_source, source_of_grid
 from splatctrl_cli.jobs.device import CUDA, TO_CPU, Device, chosen, named
 from splatctrl_cli.jobs.point_answers import TITLES, Answers, GridAnswers, SceneAnswers, rows_of
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait

@@ -13,7 +13,7 @@ from splatctrl_cli.evaluate.views import frames_of
 from splatctrl_cli.evaluate.worst_frames import Sight
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.jobs.reconstruct import declarations_of
+from splatctrl_cli.jobs.reconstructions.reconstruct import declarations_of
 from splatctrl_cli.jobs.replays.criteria_input import Judged
 from splatctrl_cli.jobs.replays.evidence import Evidence, check_evidence, map_error, open_evidence
 from splatctrl_cli.jobs.replays.files import write_replay

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.records import Box, Intrinsics, RgbdFrame
-from splatctrl_cli.scene.audit_row import Refined
 from splatctrl_cli.scene.buffer import Filled
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.keyframes import Window
 from splatctrl_cli.scene.posture import POSTURE_NAMES, RobotPosture
 from splatctrl_cli.scene.removal import REASONS
 from splatctrl_cli.scene.seeding import SeedDensity
+from splatctrl_cli.scene.time_steps import Refined
 from splatctrl_cli.voxels import LostEdges
 
 Arrays = Mapping[str, NDArray[np.generic]]

@@ -20,7 +20,6 @@ from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
-from splatctrl_cli.scene.audit_row import AuditRow, Refined
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
 from splatctrl_cli.scene.depth_holes import unanswered_points
@@ -58,6 +57,7 @@ from splatctrl_cli.scene.self_mask import (
     without_mixed,
 )
 from splatctrl_cli.scene.shell import Shell
+from splatctrl_cli.scene.time_steps import AuditRow, Refined
 from splatctrl_cli.scene.unrepresented import bare_voxels, unrepresented_voxels
 from splatctrl_cli.voxels import Balls, KnownVoxels
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import MASK_FAR_OFF, MASK_PIXELS, MASK_SIGMAS
 from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
-from splatctrl_cli.scene.audit_row import AuditRow
 from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.time_steps import AuditRow
 
 
 class PixelKind(IntEnum):

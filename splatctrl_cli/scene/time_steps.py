@@ -1,13 +1,14 @@
-"""Groups a stream of records into time steps, and finds the workspace."""
+"""Groups a stream of records into time steps, finds the workspace, and what is reported of each step."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from splatctrl_cli.config.fixed import FRAMES_PER_STEP, JOINTS_GAP_NS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Box, Float64, JointState, PointCloud, Record, RgbdFrame
+from splatctrl_cli.scene.buffer import Filled
 from splatctrl_cli.scene.seeding import thinned, thinning, world_points_at
 
 
@@ -47,6 +48,48 @@ class TimeStep:
     def has_depth(self) -> bool:
         """Whether any pixel of any frame has a depth."""
         return any(bool((frame.depth > 0).any()) for frame in self.frames)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditRow:
+    """What one time step did: counts of splats, loss (eq. 4) and PSNR [dB] over the newest frames, each as the last
+    iteration that looked at it found it.
+
+    dead: slots that wait to be reused. unmet: seeds that found no slot. evicted: splats that gave theirs to surface
+    without any. unrepresented: occupied voxels that no splat stands for. without_depth: frames without any valid
+    depth, which seed nothing. loss and psnr are None where no view shows anything of the workspace. self_mask: by
+    link, measured less rendered depth over the pixels within the robot's outline: `median_mm`, its `sign` and
+    `num_pixels`. inside_robot: by link, measured points inside it that its surface does not explain. blind: cameras
+    without any valid depth.
+    """
+
+    stamp_ns: int
+    cameras: tuple[str, ...]
+    alive: int
+    dead: int
+    added: int
+    relocated: int
+    unmet: int
+    evicted: int
+    removed: dict[str, int]
+    robot: int
+    human: int
+    unrepresented: int
+    without_depth: int
+    loss: float | None
+    psnr: float | None
+    self_mask: dict[str, dict[str, float]] = field(default_factory=dict)
+    inside_robot: dict[str, int] = field(default_factory=dict)
+    blind: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refined:
+    """How far refining has come: blocks done, where their seeds went, and what they removed by reason."""
+
+    num_blocks: int
+    filled: Filled
+    removed: dict[str, int]
 
 
 def time_steps(

@@ -302,8 +302,7 @@ def test_the_simulated_arm_is_where_the_joints_say_or_it_is_a_warning(sample_dat
         assert [f.where for f in arms if f.severity is WARNING] == ["cameras cam0, cam1, cam2, cam3"]
     else:
         assert above_note(report) == []
-        assert len(arms) == 4
-        assert all(finding.value is not None and abs(finding.value) < 15 for finding in arms)
+        assert len(arms) == 4 and all(abs(finding.value) < 15 for finding in arms)
 
 
 def test_stamps_of_zero_are_an_error_unless_the_times_of_logging_are_taken(tmp_path: Path) -> None:
@@ -350,9 +349,8 @@ def test_a_file_that_was_cut_is_a_warning_and_the_rest_is_judged(tmp_path: Path)
     log = make_log(tmp_path / "log.mcap", GOOD)
     log.write_bytes(log.read_bytes()[: 2 * log.stat().st_size // 3])
     report = checked(log)
-    damaged = [finding for finding in above_note(report) if finding.code == "damaged"]
-    assert damaged
-    assert all(f.severity is WARNING and f.remedy.startswith("copy the file again") for f in damaged)
+    damaged = [f for f in above_note(report) if f.code == "damaged"]
+    assert damaged and all(f.severity is WARNING and f.remedy.startswith("copy the file again") for f in damaged)
     assert next(rate for rate in report.rates if rate.topic == COLOR).messages > 10
 
 
@@ -379,9 +377,7 @@ def test_of_many_images_fewer_and_fewer_are_decoded(tmp_path: Path, monkeypatch:
 def test_several_logs_are_checked_as_one(tmp_path: Path) -> None:
     cameras = broken_log(tmp_path / "cameras.mcap", without(JOINTS))
     joints = broken_log(tmp_path / "joints.mcap", without(COLOR, DEPTH, INFO, "/tf", "/tf_static"))
-    log = open_logs([cameras, joints])
-    assert log is not None
-    report = check_log(log, SourceOptions())
+    report = check_log(open_logs([cameras, joints]), SourceOptions())
     assert above_note(report) == []
     assert all(not report.lacks(need) for need in report.needs)
 

@@ -13,13 +13,13 @@ from splatctrl_cli.datasets.dtu import read_dtu
 from splatctrl_cli.datasets.idr import write_idr
 from splatctrl_cli.evaluate.score_report import other_scans
 from splatctrl_cli.evaluate.verdict import noted, verdict_of
-from splatctrl_cli.jobs import score_fit
-from splatctrl_cli.jobs.reconstruct import ReconstructResult
-from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult
+from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult
+from splatctrl_cli.jobs.scores import fit as score_fit
+from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult
 from splatctrl_cli.records import LossReport
 from tests.cli import here
 from tests.datasets.make_layout import half_size
-from tests.jobs.wall import FRAMES, FakeScene, FakeSource, set_up, write_scene
+from tests.jobs.scores.wall import FRAMES, FakeScene, FakeSource, set_up, write_scene
 
 
 @pytest.fixture

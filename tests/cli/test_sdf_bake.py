@@ -19,7 +19,7 @@ from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.grid_files import grid_formats
 from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.jobs.bake import SUMMARY_METRICS
+from splatctrl_cli.jobs.bakes.bake import SUMMARY_METRICS
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.truth import load_truth
 from splatctrl_cli.splat_files import splat_formats

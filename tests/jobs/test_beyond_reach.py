@@ -20,11 +20,11 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_folder import open_scene
 from splatctrl_cli.splat_files.splats import SHELL, read_ply, write_ply
 from tests.cli.replay_desk import Desk, splats_of
-from tests.jobs.bakes import baked
+from tests.jobs.bakes.baked import baked
 from tests.jobs.runs import patch_json
+from tests.jobs.scores.test_score import run as scores
+from tests.jobs.scores.wall import FRAMES, FakeScene, FakeSource, set_up, wall, write_scene
 from tests.jobs.stage import FAR, Stage, ball_beside, voxels
-from tests.jobs.test_score import run as scores
-from tests.jobs.wall import FRAMES, FakeScene, FakeSource, set_up, wall, write_scene
 
 pytestmark = pytest.mark.usefixtures("without_plots")
 

@@ -8,7 +8,8 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.jobs import bake_request, query
+from splatctrl_cli.jobs import query
+from splatctrl_cli.jobs.bakes import request as bake_request
 from splatctrl_cli.kernels.cuda import driver
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.splat_files.splats import write_ply

@@ -17,8 +17,8 @@ from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.jobs.ingest import IngestRequest, PackRequest, ingest, pack, unpack
 from splatctrl_cli.jobs.logged_robot import differs, logged_urdf, urdf_of
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.jobs.reconstruct import _robot
-from splatctrl_cli.jobs.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.reconstructions.reconstruct import _robot
+from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replays.inputs import open_log
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.reports.spaces import space_of

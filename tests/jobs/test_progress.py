@@ -8,7 +8,7 @@ import pytest
 import splatctrl_cli
 from splatctrl_cli.jobs import progress
 from splatctrl_cli.jobs.progress import Wait, duration
-from tests.jobs.bakes import Said
+from tests.jobs.bakes.baked import Said
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from splatctrl_cli.jobs.query import QueryRequest, QueryResult, query
 from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.cli.replay_desk import splats_of, write_scene
-from tests.jobs.bakes import baked
+from tests.jobs.bakes.baked import baked
 from tests.logs.make_states import START_NS
 
 BALLS = (((0.0, 0.0, 0.0), 0.10), ((0.5, 0.0, 0.0), 0.05))

@@ -11,9 +11,9 @@ import numpy as np
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.cuda.memory import Array, Launch, Memory
-from splatctrl_cli.scene.audit_row import AuditRow
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter
 from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.time_steps import AuditRow
 from tests.kernels.cuda.conftest import new_device  # noqa: F401
 from tests.kernels.cuda.emulator import EmulatedDevice, EmulatedGraph
 from tests.scene.wall import WORKSPACE, frame

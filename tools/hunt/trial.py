@@ -11,8 +11,8 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import SplatCtrlError
-from splatctrl_cli.jobs.reconstruct import reconstruct
-from splatctrl_cli.jobs.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.reconstructions.reconstruct import reconstruct
+from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays import files, inputs
 from splatctrl_cli.jobs.replays.request import ReplayRequest

@@ -23,7 +23,7 @@ from splatctrl_cli.evaluate.held_out_depth import depth_edges
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.files.spilled_rows import ranges
 from splatctrl_cli.geometry import back_project, transform_points
-from splatctrl_cli.jobs.reconstruction import training_cameras
+from splatctrl_cli.jobs.reconstructions.reconstruction import training_cameras
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.state_store import StoredAudit
 from splatctrl_cli.logs.source_options import SourceOptions

@@ -17,7 +17,7 @@ from splatctrl_cli.files.output import Stopwatch, write_run
 from splatctrl_cli.jobs.device import CUDA, TO_CPU, FitDevice
 from splatctrl_cli.jobs.open_recording import check_pose_jumps
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.jobs.reconstruction import Reconstruction, ReconstructRequest
+from splatctrl_cli.jobs.reconstructions.reconstruction import Reconstruction, ReconstructRequest
 from splatctrl_cli.jobs.replays.evidence import EVERY, every_of, trained, training_options
 from splatctrl_cli.jobs.replays.known_scene import (
     KnownFields,

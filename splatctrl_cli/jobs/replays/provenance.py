@@ -21,7 +21,7 @@ from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import RecordSource, Stamps
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.scene.splats_and_occupancy import agreement_with_grid
+from splatctrl_cli.scene.unrepresented import agreement_with_grid
 from splatctrl_cli.scene_files.scene_folder import SceneFolder
 from splatctrl_cli.simulate.truth import Truth
 

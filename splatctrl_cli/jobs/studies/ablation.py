@@ -12,11 +12,11 @@ from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.evaluate.verdict import verdict_of
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.jobs.reconstruct import reconstruct
-from splatctrl_cli.jobs.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.reconstructions.reconstruct import reconstruct
+from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.jobs.score import ScoreRequest, score
+from splatctrl_cli.jobs.scores.score import ScoreRequest, score
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
 from splatctrl_cli.jobs.studies.problems import named
 from splatctrl_cli.logs.source_options import SourceOptions

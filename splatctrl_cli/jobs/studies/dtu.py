@@ -15,12 +15,12 @@ from splatctrl_cli.evaluate.proportions import mean_between
 from splatctrl_cli.evaluate.protocols import SURFACE_SCANS
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.jobs.reconstruct import reconstruct
-from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
-from splatctrl_cli.jobs.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.score import ScoreRequest, score
-from splatctrl_cli.jobs.score_fit import METHODS as COMPARED
-from splatctrl_cli.jobs.score_fit import PROTOCOL
+from splatctrl_cli.jobs.reconstructions.gaussians import reconstruct_gaussians
+from splatctrl_cli.jobs.reconstructions.reconstruct import reconstruct
+from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.scores.fit import METHODS as COMPARED
+from splatctrl_cli.jobs.scores.fit import PROTOCOL
+from splatctrl_cli.jobs.scores.score import ScoreRequest, score
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
 from splatctrl_cli.jobs.studies.problems import named
 from splatctrl_cli.simulate.recording import RecordingOptions

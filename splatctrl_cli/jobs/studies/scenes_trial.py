@@ -28,10 +28,10 @@ from splatctrl_cli.planner.path import effector_length, joint_length, least_clea
 from splatctrl_cli.planner.planned import goal_postures
 from splatctrl_cli.records import Box, Float64
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.scene.audit_row import AuditRow
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.scene.self_mask import self_mask_metrics
+from splatctrl_cli.scene.time_steps import AuditRow
 from splatctrl_cli.simulate.pick_and_place import HELD, HOME, depth_cameras
 from splatctrl_cli.simulate.primitives import Primitive
 

@@ -27,10 +27,10 @@ from splatctrl_cli.jobs.replays.known_scene import (
 )
 from splatctrl_cli.records import Bool, Box, DistanceField, Float64, RgbdFrame, UInt8
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.scene.audit_row import AuditRow
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.scene.self_mask import self_mask_metrics
+from splatctrl_cli.scene.time_steps import AuditRow
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.recording import START_NS, Recording
 from splatctrl_cli.simulate.shared_workspace import HOME, TASK

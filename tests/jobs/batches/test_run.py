@@ -17,7 +17,7 @@ from splatctrl_cli.jobs.batches.ledger import Ledger, Run
 from splatctrl_cli.jobs.batches.run import DONE, ERROR, FAILED, SKIPPED, Clock, Scheduler, local_executor
 from splatctrl_cli.jobs.batches.task import End, Task, run_task, stop_runners
 from splatctrl_cli.kernels.cuda import driver
-from tests.jobs.bakes import Said
+from tests.jobs.bakes.baked import Said
 from tests.jobs.batches.desk import ENTRY, batch_of, node, states
 
 
@@ -128,7 +128,7 @@ def test_what_may_pass_is_tried_again_and_nothing_else(tmp_path: Path) -> None:
 PROGRAM = """
 import sys
 from pathlib import Path
-from tests.jobs.bakes import Said
+from tests.jobs.bakes.baked import Said
 from tests.jobs.batches.desk import batch_of, node
 folder = Path(sys.argv[1])
 words = ("tell", "{0}/begun{1}", "sleep", "0.1", "tell", "{0}/told{1}")

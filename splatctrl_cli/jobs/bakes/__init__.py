@@ -1,0 +1,1 @@
+"""Distance fields baked on a grid."""

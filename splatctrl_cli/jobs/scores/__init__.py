@@ -1,0 +1,1 @@
+"""Scores of splats on recorded views."""

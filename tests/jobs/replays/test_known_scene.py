@@ -1,0 +1,64 @@
+"""What a replay may know of the scene at a time, and of space."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.grid_files.npz_grid import read_npz, write_npz
+from splatctrl_cli.jobs.replays.known_scene import KnownScene, fields_at, known_space
+from splatctrl_cli.voxels import SWEPT, OccupancyGrid, VoxelState
+from tests.cli.replay_desk import SECOND
+from tests.jobs.stage import FAR, Stage, decisive, passing
+
+
+def test_a_scene_is_known_from_its_latency_on_until_the_next_is() -> None:
+    at = fields_at((100, 200), 50, lambda index: index, lambda index: index)  # type: ignore[arg-type, return-value]
+    assert [at(stamp) for stamp in (150, 249, 250, 10_000)] == [0, 0, 1, 1]
+    with pytest.raises(NotEvaluableError, match="no scene is known at stamp 149 ns"):
+        at(149)
+
+
+@pytest.mark.parametrize(("stamp_ns", "age_s"), [(1 * SECOND, 2.0), (3 * SECOND, 0.0), (7 * SECOND, 4.0)])
+def test_a_field_of_one_moment_is_as_old_as_it_is_far_off(stamp_ns: int, age_s: float) -> None:
+    scene = KnownScene(
+        at=lambda _: None,  # type: ignore[arg-type, return-value]
+        observed=lambda points: np.ones(len(points), np.uint8),
+        first_ns=None,
+        cameras=None,
+        digests={},
+        moment_ns=3 * SECOND,
+    )
+    assert scene.age_s(stamp_ns) == pytest.approx(age_s)
+
+
+def test_space_that_a_camera_saw_or_the_robot_was_in_is_known() -> None:
+    shape = (3, 1, 1)
+    seen, entity = np.zeros(shape, np.uint16), np.zeros(shape, np.uint8)
+    seen[0], entity[1] = 4, SWEPT
+    grid = OccupancyGrid(
+        origin=np.zeros(3), voxel=0.1, log_odds=np.zeros(shape, np.float32), num_updates=seen, entity=entity
+    )
+    points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [9.0, 0, 0]])
+    assert known_space(grid)(points).tolist() == [1, 1, 0, 0]
+
+
+@pytest.mark.usefixtures("without_plots")
+def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_said_not_to_be(stage: Stage) -> None:
+    stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
+    code, verdict = stage.judged_by_field(FAR, moment_ns=SECOND)
+    assert (code, decisive(verdict)) == (0, {})
+    assert "age of the evidence about the arm not judged" in verdict["sentence"]
+    field = stage.desk.folder / "field"
+    grid = read_npz(field / "field.npz")
+    for state, channels in (
+        (VoxelState.SWEPT_BY_ROBOT, {"observed": np.full_like(grid.channels["observed"], VoxelState.SWEPT_BY_ROBOT)}),
+        (None, {}),
+    ):
+        kept = {name: values for name, values in grid.channels.items() if name != "observed"} | channels
+        write_npz(field / "field.npz", replace(grid, channels=kept))
+        code, verdict = stage.replayed("--field", str(field))
+        assert (code, decisive(verdict)) == (5, {"known space": "not evaluable"})
+        words = "what cameras saw is not recorded" if state is None else "100 % of the space about the arm"
+        assert words in verdict["sentence"]
