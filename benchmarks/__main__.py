@@ -26,6 +26,7 @@ NAMES = (
     "long_log",
     "planner",
 )
+NAMED = ("certificate", "density", "field_accuracy", "marching", "probability", "solvers", "stability")  # or not run
 BASELINE = ROOT / "benchmarks" / "baseline.json"
 NOISE = 1.3  # a ratio that fell by less than this factor says nothing on a shared machine
 
@@ -34,10 +35,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run and report; 1 where --gate is given and a limit or the baseline is missed."""
     parser = _parser()
     args = parser.parse_args(argv)
-    unknown = [name for name in args.names if name not in NAMES]
+    unknown = [name for name in args.names if name not in NAMES + NAMED]
     if unknown:
-        parser.error(f"no benchmark {', '.join(unknown)}; there are: {', '.join(NAMES)}")
-    options = Options(is_quick=args.quick, with_demo=args.demo)
+        parser.error(f"no benchmark {', '.join(unknown)}; there are: {', '.join(NAMES + NAMED)}")
+    options = Options(is_quick=args.quick, with_demo=args.demo, plots=args.plots)
     results: dict[str, Result] = {}
     start, load = time.perf_counter(), OtherLoad()
     for name in args.names or NAMES:
@@ -62,19 +63,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__, allow_abbrev=False)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of: {', '.join(NAMES)}")
+    known = f"of: {', '.join(NAMES)}, which run by default; {', '.join(NAMED)}"
+    parser.add_argument("names", nargs="*", metavar="NAME", help=known)
     default = Path("bench_output/bench.json")
     parser.add_argument("--json", type=Path, default=default, metavar="FILE", help=f"default: {default}")
     parser.add_argument("--baseline", type=Path, default=BASELINE, metavar="FILE", help="an earlier run's JSON")
     parser.add_argument("--quick", action="store_true", help="fewer repeats, small sizes only, no reconstruction")
     parser.add_argument("--demo", action="store_true", help="time `splatctrl demo` as well")
+    parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write the plots of docs/images here")
     parser.add_argument("--gate", action="store_true", help="exit 1 where a limit is missed or a ratio fell")
     return parser
 
 
 def _print(result: Result) -> None:
     lines = table(list(result.columns), [list(row) for row in result.rows])
-    print("\n".join([f"== {result.title}", *lines, *(f"note: {note}" for note in result.notes), ""]))
+    print("\n".join([f"== {result.title}", *lines, *(f"note: {note}" for note in result.notes), "", *result.more]))
 
 
 def _missed_limits(results: Mapping[str, Result]) -> list[str]:

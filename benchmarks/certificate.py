@@ -1,27 +1,23 @@
 """A million random queries against what a baked grid certifies: not one may read more than the exact distance.
 
-    python -m benchmarks.certificate [--num N] [--voxel M] [--json FILE]
-
 The exact distance is that to the splats' spheres, in float64 over all pairs. Prints per scene how many queries break
 each promise, how much the bound gives away, and how often and by how much the interpolated `sdf`, which promises
-nothing between cell centres, exceeds the exact distance. The exit code is 1 where a promise breaks.
+nothing between cell centres, exceeds the exact distance.
 """
 
-import argparse
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.measure import machine
+from benchmarks.measure import Limit, Options, Result
 from benchmarks.surfaces import exact_distance, random_balls, shapes, splats_on
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, SplatSet
+from splatctrl_cli.records import Box, DistanceGrid, Float64
+from tests.field.scenes import splat_set
 
 NUM = 1_000_000
 NUM_BALLS = 300
@@ -56,24 +52,22 @@ class Verdict:
         return all(count == 0 for count, _ in self.excess.values())
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Ask, print, write JSON."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.certificate", description=__doc__)
-    parser.add_argument("--num", type=int, default=NUM, help=f"queries over all scenes (default: {NUM})")
-    parser.add_argument("--voxel", type=float, default=FieldConfig.voxel, metavar="M")
-    parser.add_argument("--json", type=Path, default=Path("bench_output/certificate.json"), metavar="FILE")
-    args = parser.parse_args(argv)
+def run(options: Options) -> Result:
+    """Broken promises, and what the interpolated sdf does."""
     scenes = [(shape.name, *splats_on(shape, 0.01, is_inset=True, seed=0)) for shape in shapes()]
     scenes += [(f"random balls {seed}", *random_balls(NUM_BALLS, seed=seed)) for seed in (1, 2)]
-    each = -(-args.num // len(scenes))
-    verdicts = [ask(name, centers, radii, args.voxel, each) for name, centers, radii in scenes]
-    print("\n".join(lines(verdicts)))
-    args.json.parent.mkdir(parents=True, exist_ok=True)
-    report = {"machine": machine(), "voxel": args.voxel, "verdicts": [asdict(verdict) for verdict in verdicts]}
-    args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    each = -(-NUM // (100 if options.is_quick else 1) // len(scenes))
+    verdicts = [ask(name, centers, radii, FieldConfig.voxel, each) for name, centers, radii in scenes]
     num_broken = sum(count for verdict in verdicts for count, _ in verdict.excess.values())
-    print(f"{sum(v.num_queries for v in verdicts)} queries, {num_broken} broken promises; wrote {args.json}")
-    return int(num_broken > 0)
+    rows = [(v.scene, v.num_splats, v.num_cells, each, *(v.excess[p][0] for p in PROMISES)) for v in verdicts]
+    return Result(
+        title="certificate: queries that read more than the exact distance to the splats",
+        columns=("scene", "splats", "cells", "queries", *PROMISES),
+        rows=[[*map(str, row)] for row in rows],
+        figures={"num_queries": float(each * len(scenes)), "num_broken": float(num_broken)},
+        limits=[Limit(figure="num_broken", bound=0.0)],
+        more=given_away(verdicts),
+    )
 
 
 def ask(scene: str, centers: Float64, radii: Float64, voxel: float, num_queries: int) -> Verdict:
@@ -131,62 +125,22 @@ def over_of(error: Float64) -> tuple[int, float]:
     return int(np.count_nonzero(error > 0)), float(error.max())
 
 
-def splat_set(centers: Float64, radii: Float64) -> SplatSet:
-    """Grey object splats."""
-    num = len(radii)
-    return SplatSet(
-        centers=centers.astype(np.float32),
-        radii=radii.astype(np.float32),
-        colors=np.full((num, 3), 0.5, np.float32),
-        opacities=np.full(num, 0.8, np.float32),
-        labels=np.full(num, Label.OBJECT, np.uint8),
-        density=np.zeros(num, np.float32),
+def given_away(verdicts: Sequence[Verdict]) -> list[str]:
+    """The table of the interpolated sdf, and of what bounds give away."""
+    names = ("bound_nearest_cell", "bound_interpolated", "certified")
+    header = (
+        *("scene", "bound, nearest cell", "bound, interpolated", "certified"),
+        *("sdf above exact %", "median mm", "max mm"),
     )
-
-
-def lines(verdicts: Sequence[Verdict]) -> list[str]:
-    """Two tables: broken promises, and what the interpolated sdf does."""
-    header = ("scene", "splats", "cells", "queries", *(f"{name}" for name in PROMISES))
-    broken = [
-        [v.scene, str(v.num_splats), str(v.num_cells), str(v.num_queries), *(str(v.excess[p][0]) for p in PROMISES)]
-        for v in verdicts
-    ]
-    header_of_sdf = (
-        *(
-            "scene",
-            "bound, nearest cell",
-            "bound, interpolated",
-            "certified",
-            "sdf above exact %",
-            "median mm",
-            "max mm",
-        ),
-    )
-    given = [
+    rows = [
         [
-            v.scene,
-            *(
-                f"{v.given_away[name] * 1e3:.1f}"
-                for name in ("bound_nearest_cell", "bound_interpolated", "certified")
-            ),
-            f"{v.interpolated_share * 100:.1f}",
-            f"{v.interpolated_median * 1e3:.2f}",
-            f"{v.interpolated_max * 1e3:.1f}",
+            *(v.scene, *(f"{v.given_away[name] * 1e3:.1f}" for name in names), f"{v.interpolated_share * 100:.1f}"),
+            *(f"{v.interpolated_median * 1e3:.2f}", f"{v.interpolated_max * 1e3:.1f}"),
         ]
         for v in verdicts
     ]
-    return [
-        "queries that read more than the exact distance to the splats:",
-        *table(header, broken),
-        "",
-        "median below the exact distance [mm], and the interpolated sdf above it:",
-        *table(header_of_sdf, given),
-    ]
+    return ["median below the exact distance [mm], and the interpolated sdf above it:", *table(header, rows), ""]
 
 
 def _at(grid: DistanceGrid, channel: str, cells: np.ndarray) -> Float64:
     return np.asarray(grid.channels[channel][tuple(cells.T)], dtype=np.float64)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

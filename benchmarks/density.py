@@ -1,20 +1,11 @@
 """The voxel density against exact row sums: error of the density, of the distance, and time, by number of splats.
 
-    python -m benchmarks.density [--quick] [--json FILE]
-
 A wavy sheet of 1 m x 1 m, l = 2 cm, one core; the distance at 300 points 1 to 20 cm above it, by both weights.
 """
 
-import argparse
-import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
-
 import numpy as np
 
-from benchmarks.measure import machine, seconds
-from splatctrl_cli.cli.common import table
+from benchmarks.measure import Options, Result, rms, seconds
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.clusters import cluster_points
 from splatctrl_cli.field.distance import GpdfField, SeField
@@ -28,57 +19,20 @@ LENGTH = FieldConfig.length_scale
 KINDS = {"Matern": (Matern12(LENGTH), GpdfField), "Gaussian": (SquaredExponential(LENGTH), SeField)}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """Relative error of the density, error of the distance [m], seconds, and how many times faster than row sums."""
-
-    num_splats: int
-    kernel: str
-    density_rms: float
-    density_largest: float
-    distance_rms: float
-    distance_largest: float
-    row_sum_seconds: float
-    voxel_seconds: float
-    ratio: float
+def run(options: Options) -> Result:
+    """Both kernels on every sheet."""
+    sizes = SIZES[:NUM_QUICK] if options.is_quick else SIZES
+    return Result(
+        title="density: voxels beside exact row sums; how many times faster",
+        columns=(
+            *("splats", "kernel", "density RMS", "largest", "distance RMS [mm]", "largest"),
+            *("row sums [s]", "voxel", "ratio"),
+        ),
+        rows=[measured(num, kernel) for num in sizes for kernel in KINDS],
+    )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print, write JSON."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.density", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="up to 50,000 splats")
-    parser.add_argument("--json", type=Path, default=Path("bench_output/density.json"), metavar="FILE")
-    args = parser.parse_args(argv)
-    sizes = SIZES[:NUM_QUICK] if args.quick else SIZES
-    rows = [measured(num, kernel) for num in sizes for kernel in KINDS]
-    head = [
-        "splats",
-        "kernel",
-        "density RMS",
-        "largest",
-        "distance RMS [mm]",
-        "largest",
-        "row sums [s]",
-        "voxel",
-        "ratio",
-    ]
-    body = [
-        [
-            *(str(row.num_splats), row.kernel, f"{row.density_rms:.4f}", f"{row.density_largest:.4f}"),
-            *(f"{1e3 * row.distance_rms:.3f}", f"{1e3 * row.distance_largest:.3f}"),
-            *(f"{row.row_sum_seconds:.3f}", f"{row.voxel_seconds:.3f}", f"{row.ratio:.2f}"),
-        ]
-        for row in rows
-    ]
-    print("\n".join(table(head, body)))
-    args.json.parent.mkdir(parents=True, exist_ok=True)
-    report = {"machine": machine(), "quick": args.quick, "rows": [asdict(row) for row in rows]}
-    args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    print(f"wrote {args.json}")
-    return 0
-
-
-def measured(num: int, name: str) -> Row:
+def measured(num: int, name: str) -> list[str]:
     """One kernel on one sheet; the voxel density is the faster of two runs, as its first one warms the transform."""
     kernel, kind = KINDS[name]
     centers, points = sheet(num)
@@ -97,17 +51,11 @@ def measured(num: int, name: str) -> Row:
     radii = np.full(num, 0.005)
     by_weights = [kind(centers, radii, LENGTH, weights=name).query(points)[0] for name in ("rowsum", "voxel")]
     distance = by_weights[1] - by_weights[0]
-    return Row(
-        num_splats=num,
-        kernel=name,
-        density_rms=float(np.sqrt(np.mean(density**2))),
-        density_largest=float(np.abs(density).max()),
-        distance_rms=float(np.sqrt(np.mean(distance**2))),
-        distance_largest=float(np.abs(distance).max()),
-        row_sum_seconds=row_sum_seconds,
-        voxel_seconds=voxel_seconds,
-        ratio=row_sum_seconds / voxel_seconds,
-    )
+    return [
+        *(str(num), name, f"{rms(density):.4f}", f"{np.abs(density).max():.4f}"),
+        *(f"{1e3 * rms(distance):.3f}", f"{1e3 * np.abs(distance).max():.3f}"),
+        *(f"{row_sum_seconds:.3f}", f"{voxel_seconds:.3f}", f"{row_sum_seconds / voxel_seconds:.2f}"),
+    ]
 
 
 def sheet(num: int) -> tuple[Float64, Float64]:
@@ -122,7 +70,3 @@ def sheet(num: int) -> tuple[Float64, Float64]:
     points = rng.uniform(0.0, 1.0, (300, 3))
     points[:, 2] = height(points) + rng.uniform(0.01, 0.2, 300)
     return centers.astype(np.float32).astype(np.float64), points
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

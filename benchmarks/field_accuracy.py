@@ -1,21 +1,17 @@
 """How far the distance fields are from exact surfaces, by shape, spacing, radius, field and weights.
 
-    python -m benchmarks.field_accuracy [--quick] [--plots docs/images]
-
 The truth is exact: solids made here, and the closed meshes below SPLATCTRL_REAL_DATA. Errors are field less truth at
 points even in space from 1 to 20 cm outside; positive is a clearance that is not there. The bar that `safe` is held
-to is 1 mm and a third of the spacing, RMSE; the exit code is 1 where a row misses it.
+to is 1 mm and a third of the spacing, RMSE.
 """
 
-import argparse
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.measure import machine
+from benchmarks.field_plots import write_plots
+from benchmarks.measure import Limit, Options, Result, rms
 from benchmarks.surfaces import (
     LONE_SPLATS,
     LoneSplat,
@@ -86,42 +82,29 @@ class PlanarBias:
     at_10_cm: float
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print, write JSON and plots."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.field_accuracy", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="solids made here only, fewer points")
-    parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write the plots of docs/results.md here")
-    parser.add_argument("--json", type=Path, default=Path("bench_output/field_accuracy.json"), metavar="FILE")
-    args = parser.parse_args(argv)
-    num = NUM_QUICK if args.quick else NUM_POINTS
-    rows = [row for shape in shapes(with_meshes=not args.quick) for row in shape_rows(shape, num)]
+def run(options: Options) -> Result:
+    """Every table; with --quick on solids made here only, at fewer points."""
+    num = NUM_QUICK if options.is_quick else NUM_POINTS
+    rows = [row for shape in shapes(with_meshes=not options.is_quick) for row in shape_rows(shape, num)]
     bias = [planar_bias(length) for length in LENGTHS]
-    print("\n".join(default_lines(rows)), end="\n\n")
-    print("\n".join(weight_lines(rows)), end="\n\n")
-    print("\n".join(bias_lines(bias)), end="\n\n")
-    places = place_errors(shapes(with_meshes=False)[0], num)
-    print("\n".join(place_lines(places)), end="\n\n")
-    lone = [lone_reading(case) for case in LONE_SPLATS]
-    print("\n".join(lone_lines(lone)), end="\n\n")
-    missed = [row for row in rows if row.field == "safe" and row.weights == FieldConfig.weights and not row.is_kept]
-    print(f"{len(missed)} of {sum(_is_judged(row) for row in rows)} rows miss the bar of safe")
-    args.json.parent.mkdir(parents=True, exist_ok=True)
-    report = {
-        "machine": machine(),
-        "quick": args.quick,
-        "band": BAND,
-        "rows": [{**asdict(row), "bar": row.bar, "kept": row.is_kept} for row in rows],
-        "planar_bias": [asdict(one) for one in bias],
-        "places": [asdict(one) for one in places],
-        "lone_splat": [asdict(one) for one in lone],
-    }
-    args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    print(f"wrote {args.json}")
-    if args.plots is not None:
-        from benchmarks.field_plots import write_plots
-
-        write_plots(args.plots, bias)
-    return int(bool(missed))
+    judged = [row for row in rows if _is_judged(row)]
+    missed = [row for row in judged if not row.is_kept]
+    if options.plots is not None:
+        write_plots(options.plots, bias)
+    header, cells = default_table(rows)
+    return Result(
+        title=f"field - truth [mm], true distance {BAND[0] * 100:g} to {BAND[1] * 100:g} cm, "
+        f"l = {FieldConfig.length_scale * 100:g} cm, {FieldConfig.weights}; RMSE by field; mean to max of safe",
+        columns=header,
+        rows=cells,
+        figures={"num_judged": float(len(judged)), "num_missed": float(len(missed))},
+        limits=[Limit(figure="num_missed", bound=0.0)],
+        more=[
+            *(*weight_lines(rows), "", *bias_lines(bias), ""),
+            *(*place_lines(place_errors(shapes(with_meshes=False)[0], num)), ""),
+            *(*lone_lines([lone_reading(case) for case in LONE_SPLATS]), ""),
+        ],
+    )
 
 
 def shape_rows(shape: Shape, num_points: int, methods: Sequence[str] = WEIGHTS) -> list[Row]:
@@ -217,14 +200,14 @@ def place_errors(box: Shape, num_points: int) -> list[PlaceError]:
             for (name, _), distance in readings.items():
                 errors = [(distance - truth)[place] for place in places]
                 mean = [float(error.mean()) for error in errors]
-                rmse = [float(np.sqrt(np.mean(error**2))) for error in errors]
+                rms_of = [rms(error) for error in errors]
                 found.append(
                     PlaceError(
                         spacing=spacing,
                         is_inset=is_inset,
                         field=name,
                         mean=(mean[0], mean[1], mean[2]),
-                        rmse=(rmse[0], rmse[1], rmse[2]),
+                        rmse=(rms_of[0], rms_of[1], rms_of[2]),
                     )
                 )
     return found
@@ -252,7 +235,7 @@ def lone_reading(case: LoneSplat) -> LoneReading:
     return LoneReading(case=case, gpdf=gpdf_over, se=se_over, safe=safe_over)
 
 
-def default_lines(rows: Sequence[Row]) -> list[str]:
+def default_table(rows: Sequence[Row]) -> tuple[Sequence[str], list[list[str]]]:
     """One line per covering: RMSE of every field with the default weights, and all of `safe`."""
     header = (
         *("shape", "spacing cm", "centres", "splats", "radius mm", "hard", "gpdf", "se", "safe"),
@@ -272,11 +255,7 @@ def default_lines(rows: Sequence[Row]) -> list[str]:
                     *(f"{row.share_below_hard * 100:.0f}", millimetres(row.bar), "yes" if row.is_kept else "NO"),
                 ]
             )
-    title = (
-        f"error = field - truth [mm], true distance {BAND[0] * 100:g} to {BAND[1] * 100:g} cm, "
-        f"l = {FieldConfig.length_scale * 100:g} cm, {FieldConfig.weights}; RMSE by field; mean to max of safe"
-    )
-    return [title, *table(header, cells)]
+    return header, cells
 
 
 def weight_lines(rows: Sequence[Row]) -> list[str]:
@@ -308,7 +287,7 @@ def _pooled(
     rmse = np.array([whole.rmse for whole in wholes], dtype=np.float64)
     over_95 = np.array([whole.over_95 for whole in wholes], dtype=np.float64)
     over_max = np.array([whole.over_max for whole in wholes], dtype=np.float64)
-    return float(np.sqrt(np.mean(rmse**2))), float(over_95.mean()), float(over_max.max())
+    return rms(rmse), float(over_95.mean()), float(over_max.max())
 
 
 def bias_lines(bias: Sequence[PlanarBias]) -> list[str]:
@@ -363,7 +342,3 @@ def _covering(row: Row) -> tuple[str, float, bool]:
 
 def _is_judged(row: Row) -> bool:
     return row.field == "safe" and row.weights == FieldConfig.weights
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.certificate import splat_set
 from benchmarks.surfaces import Shape, exact_distance, lone_splat, points_around, shapes, splats_on
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.distance import GpdfField, SafeField, SeField, SphereField
 from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceField, Float64
+from tests.field.scenes import splat_set
 
 if TYPE_CHECKING:
     from benchmarks.field_accuracy import PlanarBias

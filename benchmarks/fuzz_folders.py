@@ -14,7 +14,7 @@ from splatctrl_cli.records import Intrinsics, SplatSet
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.voxels import OccupancyGrid
 from tests.datasets.make_layout import make_bop, make_frames, make_nerfstudio, make_redwood, make_scannet, make_tum
-from tests.plain import known
+from tests.plain import known, plain_grid, plain_splats
 
 Commands = tuple[tuple[str, ...], ...]
 
@@ -107,23 +107,8 @@ def _view(number: int) -> DtuView:
 
 def _splats() -> SplatSet:
     y, x = (axis.ravel() for axis in np.meshgrid(np.linspace(-0.2, 0.2, 6), np.linspace(-0.2, 0.2, 6)))
-    num = len(x)
-    return SplatSet(
-        centers=np.column_stack([x, y, np.full(num, 0.6)]).astype(np.float32),
-        radii=np.full(num, 0.03, np.float32),
-        colors=np.full((num, 3), 0.4, np.float32),
-        opacities=np.full(num, 0.9, np.float32),
-        labels=np.zeros(num, np.uint8),
-        density=np.ones(num, np.float32),
-    )
+    return plain_splats(np.column_stack([x, y, np.full(len(x), 0.6)]), 0.03, colors=0.4)
 
 
 def _occupancy() -> OccupancyGrid:
-    shape = (4, 4, 8)
-    return OccupancyGrid(
-        origin=np.array([-0.4, -0.4, -0.4]),
-        voxel=0.2,
-        log_odds=np.full(shape, -1.0, np.float32),
-        num_updates=np.full(shape, 3, np.uint16),
-        entity=np.zeros(shape, np.uint8),
-    )
+    return plain_grid((4, 4, 8), 0.2, -0.4, log_odds=-1.0, num_updates=3)

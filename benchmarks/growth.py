@@ -23,6 +23,7 @@ from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.simulate.render import Renderer
 from splatctrl_cli.simulate.tabletop import cameras, furniture, things
 from splatctrl_cli.states.state_source import open_states
+from tests.plain import plain_frame
 
 NUM_VIEWS = (8, 16, 31)
 LOG_SECONDS = (20, 40, 80)  # of a thousand messages each
@@ -85,16 +86,8 @@ def views_on_a_circle(num_views: int) -> list[RgbdFrame]:
         eye = (0.5 + 0.9 * np.cos(angle), 0.9 * np.sin(angle), 0.8)
         camera = replace(cameras(320, 240)[0], T_world_camera=look_at(eye, (0.5, 0.0, 0.0)))
         color, depth = Renderer(camera, [*furniture(), *things()], color_rays=0).image([])
-        frames.append(
-            RgbdFrame(
-                stamp_ns=index,
-                camera=f"{index:03d}",
-                color=color,
-                depth=depth,
-                intrinsics=camera.intrinsics,
-                T_world_camera=camera.T_world_camera,
-            )
-        )
+        place = {"stamp_ns": index, "camera": f"{index:03d}", "color": color}
+        frames.append(plain_frame(depth, camera.intrinsics, camera.T_world_camera, **place))
     return frames
 
 

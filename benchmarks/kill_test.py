@@ -4,9 +4,9 @@ Each command first runs to its end. Then it is killed (SIGKILL) N times, after a
 other time with --force over an output that is there. After each kill the output is not there, or holds the same
 bytes as the whole one (but for times and paths in run.json), and what is left under NAME.partial is refused by the
 tool's own readers or is whole, too. Commands that can go on are killed anew N times, every third time once more while
-they go on, and then end with --resume: every byte has to be that of the whole run, but for the times in run.json.
-Commands run in forked children that have their imports behind them, so that the
-moments fall where files are written.
+they go on (`reconstruct` up to nine times, on one to four threads), and then end with --resume: every byte has to be
+that of the whole run, but for the times in run.json. Commands run in forked children that have their imports behind
+them, so that the moments fall where files are written.
 """
 
 import argparse
@@ -24,7 +24,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatctrl_cli.cli.commands import COMMANDS
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import SplatCtrlError
@@ -41,12 +40,17 @@ _TIMED = ("run.json", "SHA256SUMS")  # SHA256SUMS holds the sum of run.json wher
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A command's arguments before ``-o OUT``, and the name of its output."""
+    """A command's arguments before ``-o OUT``, and the name of its output.
+
+    again: how often it is killed while it goes on; threads: how many it has, in turn.
+    """
 
     name: str
     arguments: tuple[str, ...]
     out: str
     resumes: bool = False
+    again: int = 1
+    threads: tuple[str, ...] = ()
 
 
 def tasks(folder: Path) -> list[Task]:
@@ -55,17 +59,17 @@ def tasks(folder: Path) -> list[Task]:
     audit = ("replay", str(SAMPLE / "log.mcap"), "--field", str(folder / "field"), *robot, "--max-unknown", "1")
     bake = ("sdf-bake", str(folder / "splats.ply"), "--set", "field.max_loss=1", "--no-report", "--voxel", "0.1")
     fine = (*bake[:-1], "0.06", "--threads", "1")
-    found = [
+    fit = ("reconstruct", str(SAMPLE / "log.mcap"), "--cameras", "cam0,cam1,cam2", *robot)
+    pack = ("capture", "pack", str(folder / "log.capture"))
+    return [
         Task(name="ingest", arguments=("ingest", str(SAMPLE / "log.mcap")), out="log.capture", resumes=True),
         Task(name="export", arguments=("export", str(folder / "a.ply"), "--isotropic"), out="splats.ply"),
         Task(name="sdf-bake", arguments=bake, out="field"),
         Task(name="sdf-bake, fine", arguments=fine, out="fine", resumes=True),
         Task(name="replay", arguments=audit, out="replay"),
+        Task(name="capture pack", arguments=pack, out="packed.mcap"),
+        Task(name="reconstruct", arguments=fit, out="scene", resumes=True, again=9, threads=("1", "2", "4")),
     ]
-    if "capture" in COMMANDS:
-        pack = ("capture", "pack", str(folder / "log.capture"))
-        found.append(Task(name="capture pack", arguments=pack, out="packed.mcap"))
-    return found
 
 
 def run(argv: Sequence[str] | None = None) -> int:
@@ -91,7 +95,7 @@ def run(argv: Sequence[str] | None = None) -> int:
                 print("\t".join(map(str, resumed[-1])), flush=True)
                 faults += found
     print("\n".join(table(["command", "seconds", "killed", "ended first", "left partial", "faults"], rows)))
-    print("\n".join(table(["command", "seconds", "kills", "went on", "of these twice", "differ"], resumed)))
+    print("\n".join(table(["command", "seconds", "kills", "went on", "while going on", "differ"], resumed)))
     print("\n".join(faults))
     return 1 if faults else 0
 
@@ -134,24 +138,27 @@ def kill_and_resume(task: Task, folder: Path, num: int, moments: random.Random) 
     _wait(_start([*task.arguments, "-o", str(out), "--force"]), None)
     seconds = time.monotonic() - start
     whole = exact(out)
-    kills, went_on, twice, faults = 0, 0, 0, []
+    kills, went_on, further, faults = 0, 0, 0, []
     while kills < num:
         shutil.rmtree(box, ignore_errors=True)
         box.mkdir()
         target = box / task.out
-        arguments = [*task.arguments, "-o", str(target)]
+        threads = ["--threads", task.threads[kills % len(task.threads)]] if task.threads else []
+        arguments = [*task.arguments, "-o", str(target), *threads]
         again = [*arguments, "--resume", "--force"]  # it may have been killed when all was done
         moment = moments.uniform(0.0, seconds)
         if _wait(_start(arguments), moment):
             continue
         kills += 1
         went_on += partial_path(target).exists()
-        if kills % 3 == 0 and not _wait(_start(again), moments.uniform(0.0, seconds)):
-            kills, twice = kills + 1, twice + 1
+        for _ in range(task.again if kills % 3 == 0 or task.threads else 0):
+            if _wait(_start(again), moments.uniform(0.0, seconds / task.again)):
+                break
+            kills, further = kills + 1, further + 1
         _wait(_start(again), None)
         if exact(target) != whole or partial_path(target).exists():
             faults.append(f"{task.name}, killed after {moment:.3f} s: goes on to other bytes")
-    return [f"{seconds:.2f}", kills, went_on, twice, len(faults)], faults
+    return [f"{seconds:.2f}", kills, went_on, further, len(faults)], faults
 
 
 def exact(path: Path) -> dict[str, object]:

@@ -1,23 +1,16 @@
 """How far sphere marching brings the Matern field to its surface and to the true one, by shape and number of steps.
 
-    python -m benchmarks.marching [--json FILE]
-
 Splats every 5 mm on a plane, and 1 cm apart on a box and a ball, without radii and as balls that touch the surface
 from within; points 1 to 10 cm outside. Error is the distance less the truth, root mean square; `hard` is the exact
 distance to the splats.
 """
 
-import argparse
-import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.measure import machine
+from benchmarks.measure import Options, Result, rms
 from benchmarks.surfaces import points_around, shapes, splats_on
-from splatctrl_cli.cli.common import table
 from splatctrl_cli.field.distance import GpdfField, SphereField, march
 from splatctrl_cli.records import Float64
 
@@ -28,36 +21,14 @@ NUM_POINTS = 4000
 Scene = tuple[Float64, Float64, Float64, Float64]  # centres, radii, points, truth
 
 
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """RMSE [m] of the plain field, after each number of steps, and of hard; bias [m] after 5 steps."""
-
-    scene: str
-    num_splats: int
-    plain: float
-    marched: dict[int, float]
-    bias: float
-    hard: float
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print, write JSON."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.marching", description=__doc__)
-    parser.add_argument("--json", type=Path, default=Path("bench_output/marching.json"), metavar="FILE")
-    args = parser.parse_args(argv)
-    rows = [measured(name, make()) for name, make in scenes().items()]
-    head = ["splats on", "splats", "gpdf", *(f"{steps} steps" for steps in STEPS), "bias of 5", "hard"]
-    body = [
-        [row.scene, str(row.num_splats)]
-        + [f"{1e3 * value:.2f}" for value in (row.plain, *row.marched.values(), row.bias, row.hard)]
-        for row in rows
-    ]
-    print("\n".join(["RMSE [mm]", *table(head, body)]))
-    args.json.parent.mkdir(parents=True, exist_ok=True)
-    report = {"machine": machine(), "band": BAND, "rows": [asdict(row) for row in rows]}
-    args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    print(f"wrote {args.json}")
-    return 0
+def run(options: Options) -> Result:
+    """RMSE of the plain field, after each number of steps, and of hard; bias after 5 steps."""
+    chosen = list(scenes().items())[:: 2 if options.is_quick else 1]
+    return Result(
+        title="marching: RMSE [mm]",
+        columns=("splats on", "splats", "gpdf", *(f"{steps} steps" for steps in STEPS), "bias of 5", "hard"),
+        rows=[measured(name, make()) for name, make in chosen],
+    )
 
 
 def scenes() -> dict[str, Callable[[], Scene]]:
@@ -87,25 +58,11 @@ def plane(radius: float) -> Scene:
     return centers, np.full(len(centers), radius), points, points[:, 2]
 
 
-def measured(name: str, scene: Scene) -> Row:
+def measured(name: str, scene: Scene) -> list[str]:
     """The field before and after marching."""
     centers, radii, points, truth = scene
     field, exact = GpdfField(centers, radii), SphereField(centers, radii)
     errors = {steps: march(field, exact, points, steps=steps).distance - truth for steps in STEPS}
-    return Row(
-        scene=name,
-        num_splats=len(radii),
-        plain=rms(field.query(points)[0] - truth),
-        marched={steps: rms(error) for steps, error in errors.items()},
-        bias=float(errors[5].mean()),
-        hard=rms(exact.query(points)[0] - truth),
-    )
-
-
-def rms(error: Float64) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(error**2)))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    plain, hard = (rms(one.query(points)[0] - truth) for one in (field, exact))
+    figures = (plain, *map(rms, errors.values()), float(errors[5].mean()), hard)
+    return [name, str(len(radii)), *(f"{1e3 * value:.2f}" for value in figures)]

@@ -8,7 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from splatctrl_cli.kernels import num_threads
+from splatctrl_cli.records import Float64
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_data" / "tabletop"
@@ -16,10 +19,13 @@ SAMPLE = ROOT / "sample_data" / "tabletop"
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """is_quick: fewer repeats, small sizes only. with_demo: time `splatctrl demo` as well."""
+    """is_quick: fewer repeats, small sizes only. with_demo: time `splatctrl demo` as well. plots: where the plots of
+    docs/ are written, None for nowhere.
+    """
 
     is_quick: bool
-    with_demo: bool
+    with_demo: bool = False
+    plots: Path | None = None
 
     def rounds(self, full: int) -> int:
         """How often to repeat what a full run repeats `full` times."""
@@ -45,16 +51,17 @@ class Result:
 
     columns and rows make the table for people; figures the same numbers by name, with the unit as last part of the
     name. ratios: how many times faster than a reference of the same run (larger is better), which is what two
-    machines, or two days, can be compared by.
+    machines, or two days, can be compared by. more: lines of further tables.
     """
 
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
-    figures: Mapping[str, float]
+    figures: Mapping[str, float] = field(default_factory=dict)
     ratios: Mapping[str, float] = field(default_factory=dict)
     limits: Sequence[Limit] = ()
     notes: Sequence[str] = ()
+    more: Sequence[str] = ()
 
 
 def seconds(task: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
@@ -82,6 +89,11 @@ def medians(
             if index >= num_untimed:
                 times[name].append(elapsed)
     return {name: statistics.median(values) for name, values in times.items()}
+
+
+def rms(error: Float64) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(error**2)))
 
 
 class OtherLoad:

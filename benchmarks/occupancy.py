@@ -15,6 +15,7 @@ from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.scene.self_mask import self_mask
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.tabletop import WAYPOINTS
+from tests.plain import plain_frame
 
 SIDES = {"typical": 1.7, "reach": 2.9, "empty": 8.0}  # [m] of the workspace: a table's, a long arm's, a hall's
 
@@ -69,14 +70,7 @@ def _floor_frame(T_world_camera: Float64) -> RgbdFrame:
     rays = back_project(VGA, np.ones((VGA.height, VGA.width))) @ T_world_camera[:3, :3].T
     down = np.minimum(rays[..., 2], -1e-6)
     depth = -T_world_camera[2, 3] / down
-    return RgbdFrame(
-        stamp_ns=0,
-        camera="cam",
-        color=np.zeros((VGA.height, VGA.width, 3), np.uint8),
-        depth=np.where(depth < 10.0, depth, 0.0).astype(np.float32),
-        intrinsics=VGA,
-        T_world_camera=T_world_camera,
-    )
+    return plain_frame(np.where(depth < 10.0, depth, 0.0), VGA, T_world_camera)
 
 
 def _numpy_hits(hits: Float32, frame: RgbdFrame, lower: Float64, voxel: float) -> None:

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.planning_problems import Problem
 from splatctrl_cli.config import PlannerConfig
+from splatctrl_cli.jobs.simulated_task import solids_of
+from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
 from splatctrl_cli.planner.path import joint_length, resampled
@@ -45,7 +46,7 @@ def notes_beside_ompl(clearance: Clearance, problems: Sequence[Problem]) -> list
 
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(1)
-    rooms = [(problem, clearance.in_scene(problem.scene)) for problem in problems]
+    rooms = [(problem, clearance.in_scene(solids_of(problem.things))) for problem in problems]
     valid = [(p, room) for p, room in rooms if min(room.at(np.array([p.start, p.goal]))) > 0]
     notes = []
     for way, by_edges in (("states", False), ("edges", True)):

@@ -11,9 +11,10 @@ import numpy as np
 
 from benchmarks.measure import Limit, Options, Result
 from benchmarks.ompl_planner import notes_beside_ompl
-from benchmarks.planning_problems import Problem, panda, read_problems
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.errors import SplatCtrlError
+from splatctrl_cli.jobs.simulated_task import solids_of
+from splatctrl_cli.jobs.studies.problems import Problem, panda, read_archive
 from splatctrl_cli.planner.birrt import Plan, plan
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
@@ -22,6 +23,7 @@ from splatctrl_cli.planner.tracking import TrackingRun, follow_joints, follow_wi
 from splatctrl_cli.records import Bool, Float64
 
 FRAME = "panda_grasptarget"
+ROBOT = Path("vamp_panda/resources/panda")  # the Panda with its 59 spheres, and the archive
 FINE, COARSE = 0.01, 0.05  # [rad] of the recheck, and of the fixed steps compared with
 NUM_EDGES = 40  # random edges per scene, for the comparison with fixed steps
 EVERY_TRACKED = 25  # problems per one that is followed
@@ -42,29 +44,33 @@ class Solved:
 def run(options: Options) -> Result:
     """Solve them all, recheck every edge of every path at 0.01 rad, and say what was not solved."""
     root = os.environ.get("SPLATCTRL_REAL_DATA")
-    if root is None or not (Path(root) / "vamp_panda").is_dir():
+    if root is None or not (Path(root) / ROBOT).is_dir():
         return _skipped()
-    model = panda(Path(root))
-    problems = read_problems(Path(root), model)[:: 10 if options.is_quick else 1]
-    clearance = Clearance.of(model, problems[0].scene)
+    model = panda(Path(root) / ROBOT)
+    problems = read_archive(Path(root) / ROBOT, model)[:: 10 if options.is_quick else 1]
+    clearance = Clearance.of(model, solids_of(problems[0].things))
     solved: list[Solved] = []
     failed, invalid = [], []
     for problem in problems:
-        room = clearance.in_scene(problem.scene)
+        room = clearance.in_scene(solids_of(problem.things))
         start = process_time()
         try:
             answer = plan(room, problem.start, problem.goal, PlannerConfig())
         except SplatCtrlError as error:
-            invalid.append(f"{problem.name}: {error.message}")
+            invalid.append(f"{_name(problem)}: {error.message}")
             continue
         if not answer.is_solved:
-            failed.append(f"{problem.name}: {answer.outcome} after {answer.num_iterations} iterations")
+            failed.append(f"{_name(problem)}: {answer.outcome} after {answer.num_iterations} iterations")
             continue
         solved.append(_solved(problem, answer, process_time() - start, room))
-    runs = [_followed(s, clearance.in_scene(s.problem.scene)) for s in solved[::EVERY_TRACKED]]
+    runs = [_followed(s, clearance.in_scene(solids_of(s.problem.things))) for s in solved[::EVERY_TRACKED]]
     edges = _edge_checks(clearance, problems[::10])
     notes = notes_beside_ompl(clearance, problems if options.is_quick else problems[::10])
     return _result(solved, failed, invalid, edges, runs, notes)
+
+
+def _name(problem: Problem) -> str:
+    return f"{problem.environment} {problem.number:04d}"
 
 
 def _solved(problem: Problem, answer: Plan, cpu: float, room: Clearance) -> Solved:
@@ -85,8 +91,8 @@ def _followed(solved: Solved, room: Clearance) -> tuple[TrackingRun, TrackingRun
     planner, control = PlannerConfig(), ControlConfig(margin=0.0, self_margin=0.0, max_time=60.0, solver="daqp")
     path = timed(solved.plan.waypoints, room.model.velocity_limit, planner.max_acceleration)
     slow = timed(solved.plan.waypoints, room.model.velocity_limit / 4, planner.max_acceleration)
-    joints = follow_joints(path, room, FRAME, planner, control)
-    return joints, follow_with_controller(slow, room, lambda stamp_ns: solved.problem.scene, FRAME, planner, control)
+    joints, scene = follow_joints(path, room, FRAME, planner, control), solids_of(solved.problem.things)
+    return joints, follow_with_controller(slow, room, lambda stamp_ns: scene, FRAME, planner, control)
 
 
 def _edge_checks(clearance: Clearance, problems: Sequence[Problem]) -> dict[str, float]:
@@ -97,7 +103,7 @@ def _edge_checks(clearance: Clearance, problems: Sequence[Problem]) -> dict[str,
     random = np.random.default_rng(0)
     counts = dict.fromkeys(("edges", "free", "checks", "false", "fixed_checks", "fixed_false", "refused"), 0)
     for problem in problems:
-        room, model = clearance.in_scene(problem.scene), clearance.model
+        room, model = clearance.in_scene(solids_of(problem.things)), clearance.model
         start = _free_postures(room, random)
         way = random.normal(size=start.shape)
         way *= random.uniform(0.3, 1.5, (len(way), 1)) / np.linalg.norm(way, axis=1, keepdims=True)
@@ -150,8 +156,8 @@ def _result(
     runs: Sequence[tuple[TrackingRun, TrackingRun]],
     notes: Sequence[str],
 ) -> Result:
-    families = sorted({s.problem.family for s in solved})
-    groups = {name: [s for s in solved if s.problem.family == name] for name in families} | {"all": list(solved)}
+    families = sorted({s.problem.environment for s in solved})
+    groups = {name: [s for s in solved if s.problem.environment == name] for name in families} | {"all": list(solved)}
     times = [s.plan.search_time + s.plan.shortcut_time for s in solved]
     num_valid = len(solved) + len(failed)
     num_hit = sum(s.num_hit for s in solved)

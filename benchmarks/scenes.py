@@ -17,6 +17,7 @@ from splatctrl_cli.scene.render import camera_array
 from splatctrl_cli.scene.seeding import inside_workspace, world_points
 from splatctrl_cli.scene.time_steps import time_steps
 from splatctrl_cli.sources.source import open_source
+from tests.plain import plain_splats
 
 TRAINING = ("cam0", "cam1", "cam2")
 VGA = Intrinsics(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
@@ -141,11 +142,4 @@ def surface_splats(num_splats: int) -> SplatSet:
     box[np.arange(len(box)), axis] = np.sign(box[np.arange(len(box)), axis])
     box = box * [0.1, 0.15, 0.2] + [-0.2, -0.1, 0.2]
     centers = np.concatenate([table, ball, box]).astype(np.float32)
-    return SplatSet(
-        centers=centers,
-        radii=np.full(num_splats, 0.01, np.float32),
-        colors=np.full((num_splats, 3), 0.5, np.float32),
-        opacities=np.full(num_splats, 0.9, np.float32),
-        labels=np.full(num_splats, Label.OBJECT, np.uint8),
-        density=np.zeros(num_splats, np.float32),
-    )
+    return plain_splats(centers, 0.01, colors=0.5, labels=Label.OBJECT)

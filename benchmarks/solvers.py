@@ -1,9 +1,8 @@
-"""`python -m benchmarks.solvers [--steps N]`: the QP of random steps by both solvers, by CVXPY where it is installed.
+"""The QP of random steps by both solvers, by CVXPY where it is installed.
 
 The programs are those of an arm of seven joints with up to 40 barrier rows, some of which cannot hold together.
 """
 
-import argparse
 import importlib.util
 import statistics
 import time
@@ -11,23 +10,20 @@ from collections.abc import Callable
 
 import numpy as np
 
-from splatctrl_cli.cli.common import table
+from benchmarks.measure import Options, Result, seconds
 from splatctrl_cli.control.fallbacks import assemble
 from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QpSolver, QuadraticProgram
 from splatctrl_cli.control.terms import Barrier, reach_cost, stray_cost
 from splatctrl_cli.records import Float64
 
 JOINTS, SPEED, MAX_ROWS = 7, 1.0, 40
-CVXPY_EVERY = 50
+NUM_STEPS, CVXPY_EVERY = 10_000, 50
 
 
-def main() -> int:
-    """Print how far the solvers are apart, and how long they take."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.solvers", description=__doc__, allow_abbrev=False)
-    parser.add_argument("--steps", type=int, default=10_000, metavar="N")
-    args = parser.parse_args()
-    rng = np.random.default_rng(0)
-    programs = [random_program(rng) for _ in range(args.steps)]
+def run(options: Options) -> Result:
+    """How far the solvers are apart, and how long they take."""
+    rng, num = np.random.default_rng(0), NUM_STEPS // (50 if options.is_quick else 1)
+    programs = [random_program(rng) for _ in range(num)]
     solvers: dict[str, QpSolver] = {
         "daqp": DaqpSolver(),
         "clarabel": ClarabelSolver(),
@@ -35,21 +31,23 @@ def main() -> int:
     }
     exact, rows = [solvers["daqp"].solve(program) for program in programs], []
     for name, solver in solvers.items():
-        answers, seconds = [], []
+        answers, times = [], []
         for program in programs:
             start = time.perf_counter()
             answers.append(solver.solve(program))
-            seconds.append(time.perf_counter() - start)
+            times.append(time.perf_counter() - start)
         compared = zip(programs, exact, answers, strict=True)
         apart = np.array([differences(p, e.z, a.z) for p, e, a in compared if a.is_solved])
         solved = sum(answer.is_solved for answer in answers)
         rows.append(
-            [name, str(solved), *[f"{v:.1e}" for v in apart.max(axis=0)], f"{1e6 * statistics.median(seconds):.0f}"]
+            [name, str(solved), *[f"{v:.1e}" for v in apart.max(axis=0)], f"{1e6 * statistics.median(times):.0f}"]
         )
-    print("\n".join(table(("solver", "solved", "objective apart", "velocity apart [rad/s]", "median [us]"), rows)))
-    print(f"{args.steps} programs; apart from daqp, at most: relative objective, joint velocity")
-    print(_beside_cvxpy(programs[::CVXPY_EVERY]))
-    return 0
+    return Result(
+        title=f"solvers: {num} programs; apart from daqp, at most: relative objective, joint velocity",
+        columns=("solver", "solved", "objective apart", "velocity apart [rad/s]", "median [us]"),
+        rows=rows,
+        notes=[_beside_cvxpy(programs[::CVXPY_EVERY])],
+    )
 
 
 def random_program(rng: np.random.Generator) -> QuadraticProgram:
@@ -78,8 +76,8 @@ def differences(program: QuadraticProgram, exact: Float64, other: Float64) -> tu
 def _beside_cvxpy(programs: list[QuadraticProgram]) -> str:
     if importlib.util.find_spec("cvxpy") is None:
         return "CVXPY is not installed: not compared"
-    seconds = [_timed(_cvxpy_task(program)) for program in programs]
-    took = f"{1e6 * statistics.median(seconds):.0f} us (median of {len(programs)})"
+    times = [seconds(_cvxpy_task(program)) for program in programs]
+    took = f"{1e6 * statistics.median(times):.0f} us (median of {len(programs)})"
     return f"CVXPY's own formulation with Clarabel: {took}"
 
 
@@ -92,13 +90,3 @@ def _cvxpy_task(program: QuadraticProgram) -> Callable[[], object]:
         return cvxpy.Problem(cvxpy.Minimize(objective), [program.G @ z <= program.h]).solve(solver="CLARABEL")
 
     return solve
-
-
-def _timed(task: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    task()
-    return time.perf_counter() - start
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

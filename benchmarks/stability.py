@@ -1,7 +1,5 @@
 """Table I of the paper, by one command: which forms of the Matern field are finite, at which l, and how far off.
 
-    python -m benchmarks.stability [--json FILE]
-
 100 points on the unit circle, without radii (as in the paper) and with radii from 1 mm to 30 cm, asked at 41 x 41
 points on [-2, 2] x [-2, 2]. Each cell has a tick where every answer is finite, as the paper has it, and beside it the
 largest difference to the same weights' field in the log domain in float64, which is finite everywhere.
@@ -11,17 +9,12 @@ Forms, with M = (K + noise I)^-1 y of eq. 12, lumped (eq. 15) or of the full pro
 exponent, shifted by the largest exponent, in NumPy; `GpdfField`: that, in this package's float32 kernels.
 """
 
-import argparse
-import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.measure import machine
-from splatctrl_cli.cli.common import table
+from benchmarks.measure import Options, Result
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.distance import GpdfField
 from splatctrl_cli.records import Float64
@@ -57,18 +50,16 @@ class Row:
     cells: tuple[Cell, ...]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print, write JSON."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.stability", description=__doc__)
-    parser.add_argument("--json", type=Path, default=Path("bench_output/stability.json"), metavar="FILE")
-    args = parser.parse_args(argv)
-    rows = table_rows()
-    print("\n".join(lines(rows)))
-    args.json.parent.mkdir(parents=True, exist_ok=True)
-    report = {"machine": machine(), "lengths": LENGTHS, "rows": [asdict(row) for row in rows]}
-    args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    print(f"wrote {args.json}")
-    return 0
+def run(_: Options) -> Result:
+    """Every form, with the paper's own ticks below."""
+    body = [[row.cloud, row.weights, row.form, row.number, *map(shown, row.cells)] for row in table_rows()]
+    for form, ticks in PRINTED.items():
+        body.append(["no radii", "not said", form, "in the paper", *("yes" if tick else "no" for tick in ticks)])
+    return Result(
+        title="stability: Table I",
+        columns=("radii", "M", "form", "numbers", *(f"l = {length:.0e}" for length in LENGTHS)),
+        rows=body,
+    )
 
 
 def table_rows() -> list[Row]:
@@ -177,21 +168,8 @@ def log_domain(distance: Array, log_size: Array, sign: Array, length: float) -> 
         return np.asarray(-scale * (largest + np.log(np.where(total > 0, total, np.nan))))
 
 
-def lines(rows: Sequence[Row]) -> list[str]:
-    """The table, with the paper's own ticks below."""
-    head = ["radii", "M", "form", "numbers", *(f"l = {length:.0e}" for length in LENGTHS)]
-    body = [[row.cloud, row.weights, row.form, row.number, *map(shown, row.cells)] for row in rows]
-    for form, ticks in PRINTED.items():
-        body.append(["no radii", "not said", form, "in the paper", *("yes" if tick else "no" for tick in ticks)])
-    return table(head, body)
-
-
 def shown(cell: Cell) -> str:
     """``yes`` or the number of bad answers, and the error."""
     return (
         f"{'yes' if not cell.num_bad else f'no {cell.num_bad}'} {'-' if cell.error is None else f'{cell.error:.0e}'}"
     )
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -3,6 +3,7 @@
 import numpy as np
 
 from splatctrl_cli.records import Float64, Label, SplatSet
+from tests.plain import plain_splats
 
 
 def cloud(num: int = 600, seed: int = 0) -> tuple[Float64, Float64]:
@@ -22,12 +23,4 @@ def queries(num: int = 300, seed: int = 1, extent: float = 0.5) -> Float64:
 
 def splat_set(centers: Float64, radii: Float64, label: Label = Label.OBJECT) -> SplatSet:
     """Grey splats of one label."""
-    num = len(radii)
-    return SplatSet(
-        centers=centers.astype(np.float32),
-        radii=radii.astype(np.float32),
-        colors=np.full((num, 3), 0.5, np.float32),
-        opacities=np.full(num, 0.8, np.float32),
-        labels=np.full(num, int(label), np.uint8),
-        density=np.zeros(num, np.float32),
-    )
+    return plain_splats(centers, radii, colors=0.5, opacities=0.8, labels=label)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.certificate import Verdict, ask, judge, splat_set
+from benchmarks.certificate import Verdict, ask, judge
 from benchmarks.surfaces import (
     LONE_SPLATS,
     LoneSplat,
@@ -23,6 +23,7 @@ from splatctrl_cli.field.grid_cells import LOSS, check_loss
 from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceGrid, Float64
+from tests.field.scenes import splat_set
 
 NUM = 4000
 

@@ -1,4 +1,4 @@
-"""Table I of the paper, as `python -m benchmarks.stability` prints it."""
+"""Table I of the paper, as `python -m benchmarks stability` prints it."""
 
 import pytest
 
