@@ -47,7 +47,7 @@ class NearFigures:
     age: float
     ahead: float
     unanswered: float
-    place: Float64
+    unanswered_place: Float64
     hidden: float
     hidden_place: Float64
     edge: float
@@ -96,7 +96,9 @@ class NearSpace:
         if (~is_never).sum() >= fewest:
             ages = (stamp_ns - seen[~is_never]) * 1e-9
             age, ahead = float(np.quantile(ages, fixed.NEAR_FRESH_SHARE)), max(-float(ages.min()), 0.0)
-        unanswered, place = self._nearest(known.unanswered, centers, known.voxel / 2)  # from its nearest face
+        unanswered, unanswered_place = self._nearest(
+            known.unanswered, centers, known.voxel / 2
+        )  # from its nearest face
         edge, edge_place = self._nearest(known.edges[:, :3], centers, known.edges[:, 3])
         hidden, hidden_place = np.inf, np.full(3, np.nan)
         if distance is not None:
@@ -108,7 +110,7 @@ class NearSpace:
             age=age,
             ahead=ahead,
             unanswered=unanswered,
-            place=place,
+            unanswered_place=unanswered_place,
             hidden=hidden,
             hidden_place=hidden_place,
             edge=edge,

@@ -32,6 +32,11 @@ class Clusters:
     centers: Float32
     boxes: Float32
 
+    @property
+    def arrays(self) -> tuple[Float32, Float32]:
+        """As the kernels take them."""
+        return self.centers, self.boxes
+
 
 @dataclass(frozen=True, kw_only=True)
 class Offsets:
@@ -42,6 +47,11 @@ class Offsets:
 
     values: Float32
     maxima: Float32
+
+    @property
+    def arrays(self) -> tuple[Float32, Float32]:
+        """As the kernels take them."""
+        return self.values, self.maxima
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,9 +75,10 @@ class GridSpan:
         return (self.last - self.first, self.shape[1], self.shape[2])
 
     @property
-    def sizes(self) -> NDArray[np.int64]:
-        """As the kernels take them."""
-        return np.array([*self.shape, self.first, self.last], dtype=np.int64)
+    def arrays(self) -> tuple[Float64, float, NDArray[np.int64], UInt8 | None]:
+        """Origin, voxel, sizes and mask as the kernels take them."""
+        sizes = np.array([*self.shape, self.first, self.last], dtype=np.int64)
+        return self.origin, self.voxel, sizes, self.mask
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,17 +104,7 @@ def nearest(
     """``min_i |x - p_i| - r_i`` (Q,) at points (Q, 3), its gradient (Q, 3), zero at a centre, its entry (Q,)."""
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     entry = np.empty(len(points), np.int32)
-    native.field_nearest(
-        spheres.centers,
-        spheres.boxes,
-        radii.values,
-        radii.maxima,
-        points,
-        num_threads(threads),
-        score,
-        gradient,
-        entry,
-    )
+    native.field_nearest(*spheres.arrays, *radii.arrays, points, num_threads(threads), score, gradient, entry)
     return score, gradient, entry
 
 
@@ -124,17 +125,7 @@ def matern(
     """
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     native.field_matern(
-        spheres.centers,
-        spheres.boxes,
-        offsets.values,
-        offsets.maxima,
-        sign,
-        length,
-        truncation,
-        points,
-        num_threads(threads),
-        score,
-        gradient,
+        *spheres.arrays, *offsets.arrays, sign, length, truncation, points, num_threads(threads), score, gradient
     )
     return score, gradient
 
@@ -159,10 +150,8 @@ def gaussian(
     """
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     native.field_gaussian(
-        spheres.centers,
-        spheres.boxes,
-        offsets.values,
-        offsets.maxima,
+        *spheres.arrays,
+        *offsets.arrays,
         radii,
         sign,
         common,
@@ -195,12 +184,9 @@ def safe(
     """
     score, gradient = np.empty(len(points)), np.empty((len(points), 3))
     is_finite = native.field_safe(
-        spheres.centers,
-        spheres.boxes,
-        offsets.values,
-        offsets.maxima,
-        radii.values,
-        radii.maxima,
+        *spheres.arrays,
+        *offsets.arrays,
+        *radii.arrays,
         sign,
         common,
         length,
@@ -236,18 +222,7 @@ def bake_hard(
 ) -> None:
     """`nearest` at the cells of `span`, into distance (X, Y, Z), gradient (X, Y, Z, 3), entry (X, Y, Z)."""
     native.field_bake_hard(
-        spheres.centers,
-        spheres.boxes,
-        radii.values,
-        radii.maxima,
-        span.origin,
-        span.voxel,
-        span.sizes,
-        span.mask,
-        num_threads(threads),
-        distance,
-        gradient,
-        entry,
+        *spheres.arrays, *radii.arrays, *span.arrays, num_threads(threads), distance, gradient, entry
     )
 
 
@@ -262,19 +237,14 @@ def bake_gaussian(
 ) -> None:
     """`gaussian` at the cells of `span`; the exact terms are ``log |w_i|``, the offsets ``2 l^2 log |w_i|``."""
     native.field_bake_gaussian(
-        spheres.centers,
-        spheres.boxes,
-        terms.offsets.values,
-        terms.offsets.maxima,
+        *spheres.arrays,
+        *terms.offsets.arrays,
         terms.exact,
         terms.radii,
         terms.sign,
         terms.length,
         terms.tolerance,
-        span.origin,
-        span.voxel,
-        span.sizes,
-        span.mask,
+        *span.arrays,
         num_threads(threads),
         distance,
         gradient,
@@ -292,18 +262,13 @@ def bake_matern(
 ) -> None:
     """`matern` at the cells of `span`; the exact terms are the offsets in float64."""
     native.field_bake_matern(
-        spheres.centers,
-        spheres.boxes,
-        terms.offsets.values,
-        terms.offsets.maxima,
+        *spheres.arrays,
+        *terms.offsets.arrays,
         terms.exact,
         terms.sign,
         terms.length,
         terms.tolerance,
-        span.origin,
-        span.voxel,
-        span.sizes,
-        span.mask,
+        *span.arrays,
         num_threads(threads),
         distance,
         gradient,
@@ -325,15 +290,11 @@ def touched_blocks(
     To `bake_hard` where `length` is None (offsets are the radii), else to `bake_gaussian` (``2 l^2 log |w_i|``).
     """
     native.field_touched(
-        spheres.centers,
-        spheres.boxes,
-        offsets.values,
-        offsets.maxima,
+        *spheres.arrays,
+        *offsets.arrays,
         changed,
         0.0 if length is None else length,
-        span.origin,
-        span.voxel,
-        span.sizes,
+        *span.arrays[:3],
         num_threads(threads),
         is_touched,
     )

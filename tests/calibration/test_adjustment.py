@@ -7,19 +7,13 @@ from splatctrl_cli.calibration.unknowns import HELD, Estimate, Unknowns, transfo
 from splatctrl_cli.calibration.views import DepthView, landed, overlap_rows, still_frame, strided, surface_normals
 from splatctrl_cli.geometry import back_project, look_at, transform_points
 from splatctrl_cli.records import Intrinsics, RgbdFrame
+from tests.plain import plain_frame
 
 LENS = Intrinsics(fx=100.0, fy=105.0, cx=31.5, cy=23.5, width=64, height=48)
 
 
 def frame_of(depth: np.ndarray, camera: str = "cam", stamp_ns: int = 0) -> RgbdFrame:
-    return RgbdFrame(
-        stamp_ns=stamp_ns,
-        camera=camera,
-        color=np.zeros((1, 1, 3), np.uint8),
-        depth=depth.astype(np.float32),
-        intrinsics=LENS,
-        T_world_camera=np.eye(4),
-    )
+    return plain_frame(depth, LENS, stamp_ns=stamp_ns, camera=camera)
 
 
 def plane(normal: np.ndarray, distance: float) -> np.ndarray:

@@ -92,9 +92,9 @@ def test_the_nearest_place_without_an_answer_is_told_with_its_distance() -> None
     known = Seen(last_ns=half_seen, unanswered=np.array([far, place]))
     found = NearSpace(arm, 0.03).look(0, LATER, known)
     want = np.min(np.linalg.norm(centers - place, axis=1) - radii)
-    assert (found.unanswered, found.place.tolist()) == (pytest.approx(want), place.tolist())
+    assert (found.unanswered, found.unanswered_place.tolist()) == (pytest.approx(want), place.tolist())
     nothing = NearSpace(arm, 0.03).look(0, LATER, Seen(last_ns=half_seen, unanswered=far[None]))
-    assert nothing.unanswered == np.inf and np.isnan(nothing.place).all()
+    assert nothing.unanswered == np.inf and np.isnan(nothing.unanswered_place).all()
 
 
 def test_a_lost_edge_is_as_near_as_its_ball() -> None:

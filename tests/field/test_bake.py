@@ -13,8 +13,9 @@ from splatctrl_cli.field.grid_cells import GridLayout, bounding_box
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.grid_files.npz_grid import write_npz
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Label
-from splatctrl_cli.voxels import SWEPT, OccupancyGrid
+from splatctrl_cli.voxels import SWEPT
 from tests.field.scenes import cloud, splat_set
+from tests.plain import plain_grid
 from tests.reference import field as reference
 
 BOX = Box(lower=np.array([-0.41, -0.37, -0.2]), upper=np.array([0.35, 0.4, 0.33]))
@@ -135,13 +136,7 @@ def test_robot_splats_are_left_out_unless_asked_for() -> None:
 
 def test_observed_comes_from_the_occupancy_voxel_of_the_cell() -> None:
     shape = (3, 1, 1)
-    occupancy = OccupancyGrid(
-        origin=np.zeros(3),
-        voxel=0.1,
-        log_odds=np.array([-2.0, 2.0, 0.0], np.float32).reshape(shape),
-        num_updates=np.array([1, 1, 1], np.uint16).reshape(shape),
-        entity=np.zeros(shape, np.uint8),
-    )
+    occupancy = plain_grid(shape, 0.1, 0.0, log_odds=np.reshape([-2.0, 2.0, 0.0], shape))
     box = Box(lower=np.array([-0.1, 0.0, 0.0]), upper=np.array([0.3, 0.1, 0.1]))
     config = replace(CONFIG, voxel=0.1)
     splats = splat_set(*cloud(10))

@@ -15,6 +15,7 @@ from splatctrl_cli.field.unknown import apply_unknown
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.voxels import OccupancyGrid
 from tests.field.scenes import cloud, splat_set
+from tests.plain import plain_grid
 
 LAYOUT = GridLayout(origin=np.array([-0.5, -0.5, -0.2]), voxel=0.02, shape=(51, 40, 21))
 
@@ -100,16 +101,7 @@ def test_statistics_of_a_grid_without_a_channel_are_none() -> None:
 
 def half_seen() -> OccupancyGrid:
     """Voxels of 20 cm that cover the layout, free where x < 0 and never seen beyond."""
-    shape = (8, 8, 8)
-    seen = np.zeros(shape, np.uint16)
-    seen[:4] = 1
-    return OccupancyGrid(
-        origin=np.full(3, -0.7),
-        voxel=0.2,
-        log_odds=np.full(shape, -2.0, np.float32),
-        num_updates=seen,
-        entity=np.zeros(shape, np.uint8),
-    )
+    return plain_grid((8, 8, 8), 0.2, -0.7, num_updates=np.repeat([1, 0], 4)[:, None, None])
 
 
 @pytest.mark.parametrize("policy", ["nan", "obstacle"])

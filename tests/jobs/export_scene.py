@@ -6,18 +6,18 @@ import numpy as np
 
 from splatctrl_cli.records import SplatSet
 from splatctrl_cli.splat_files.splats import write_ply
+from tests.plain import plain_splats
 
 
 def ball(num: int = 400) -> SplatSet:
     directions = np.random.default_rng(0).normal(size=(num, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return SplatSet(
-        centers=(0.3 * directions + [0.5, 0.0, 0.2]).astype(np.float32),
-        radii=np.full(num, 0.02, np.float32),
-        colors=(0.5 + 0.4 * directions).astype(np.float32),
-        opacities=np.linspace(0.2, 1.0, num).astype(np.float32),
-        labels=(np.arange(num) % 3).astype(np.uint8),
-        density=np.zeros(num, np.float32),
+    return plain_splats(
+        0.3 * directions + [0.5, 0.0, 0.2],
+        0.02,
+        colors=0.5 + 0.4 * directions,
+        opacities=np.linspace(0.2, 1.0, num),
+        labels=np.arange(num) % 3,
     )
 
 

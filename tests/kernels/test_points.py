@@ -9,6 +9,7 @@ from splatctrl_cli.geometry import invert_transform, look_at, transform_points
 from splatctrl_cli.kernels import points as kernels
 from splatctrl_cli.kernels.raster import pack_camera
 from splatctrl_cli.records import Float32, Float64, Intrinsics, RgbdFrame
+from tests.plain import plain_frame
 from tests.reference import points as reference
 
 RNG = np.random.default_rng(7)
@@ -19,14 +20,8 @@ needs_fma = pytest.mark.skipif(kernels.native.x86_64_level() < 3, reason="BLAS a
 def frame(width: int, height: int) -> RgbdFrame:
     """A camera somewhere, a depth of noise with holes."""
     depth = np.where(RNG.random((height, width)) < 0.8, RNG.uniform(0.5, 3.0, (height, width)), 0.0)
-    return RgbdFrame(
-        stamp_ns=0,
-        camera="a",
-        color=np.zeros((height, width, 3), np.uint8),
-        depth=depth.astype(np.float32),
-        intrinsics=Intrinsics(fx=71.3, fy=69.9, cx=width / 2 + 0.3, cy=height / 3, width=width, height=height),
-        T_world_camera=look_at(RNG.normal(size=3), RNG.normal(size=3)),
-    )
+    intrinsics = Intrinsics(fx=71.3, fy=69.9, cx=width / 2 + 0.3, cy=height / 3, width=width, height=height)
+    return plain_frame(depth, intrinsics, look_at(RNG.normal(size=3), RNG.normal(size=3)))
 
 
 def packed(seen: RgbdFrame, T: Float64) -> Float64:

@@ -11,8 +11,8 @@ from splatctrl_cli.scene.eviction import distance_to_box, far_away, redundant, r
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.voxels import SWEPT
+from tests.plain import plain_splats
 from tests.reference.unrepresented import unrepresented
-from tests.scene.test_unrepresented import splats_at
 from tests.scene.wall import WORKSPACE, frame
 
 PATH = Box(lower=np.zeros(3), upper=np.ones(3))
@@ -21,7 +21,7 @@ PATH = Box(lower=np.zeros(3), upper=np.ones(3))
 def floor(spacing: float) -> SplatSet:
     """Splats all over a square of 40 cm."""
     steps = np.arange(0.0, 0.4, spacing)
-    return splats_at([[x, y, 0.0] for x in steps for y in steps])
+    return plain_splats([[x, y, 0.0] for x in steps for y in steps], 0.01)
 
 
 def voxels() -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
@@ -52,7 +52,7 @@ def test_the_first_in_the_order_go_and_no_more_than_are_wanted() -> None:
 
 
 def test_the_only_splat_of_a_surface_is_not_redundant() -> None:
-    pair = splats_at([[0.1, 0.1, 0.0], [0.1, 0.1, 0.0], [0.3, 0.3, 0.0]])
+    pair = plain_splats([[0.1, 0.1, 0.0], [0.1, 0.1, 0.0], [0.3, 0.3, 0.0]], 0.01)
     surface = np.float32([[0.1, 0.1, 0.0], [0.3, 0.3, 0.0]])
     assert redundant(np.array([2, 0, 1]), 3, pair, surface, 0.018).tolist() == [0]
 

@@ -7,7 +7,7 @@ import pytest
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.kernels.points import Cubes
-from splatctrl_cli.records import Float32, SplatSet
+from splatctrl_cli.records import Float32
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seed_octree import cube_levels, leaves, tolerance_for
 from splatctrl_cli.scene.seeding import (
@@ -21,6 +21,7 @@ from splatctrl_cli.scene.seeding import (
     thinning,
     world_points,
 )
+from tests.plain import plain_splats
 from tests.scene.wall import WORKSPACE, frame
 
 CONFIG = SceneConfig()
@@ -159,15 +160,7 @@ def test_a_measured_surface_far_from_every_sphere_is_seeded() -> None:
     seen = frame()
     points = world_points(seen).reshape(-1, 3).astype(np.float32)
     has_hole = points[np.linalg.norm(points[:, :2], axis=1) > 0.12]
-    count = len(has_hole)
-    splats = SplatSet(
-        centers=has_hole,
-        radii=np.full(count, 0.02, np.float32),
-        colors=np.zeros((count, 3), np.float32),
-        opacities=np.full(count, 0.9, np.float32),
-        labels=np.zeros(count, np.uint8),
-        density=np.zeros(count, np.float32),
-    )
+    splats = plain_splats(has_hole, 0.02)
     views = [(seen, inside_workspace(seen, world_points(seen), WORKSPACE))]
     nothing = np.zeros((0, 3), np.float32)
     seeds = gap_seeds(views, nothing, 0.02, splats, CONFIG)
@@ -180,14 +173,7 @@ def test_a_measured_surface_far_from_every_sphere_is_seeded() -> None:
 def test_the_two_halves_of_the_rows_are_looked_at_in_turn() -> None:
     seen = frame()
     occupied = np.float32([[0, 0, 0.3], [0.1, 0, 0.3], [0.2, 0, 0.3], [0.3, 0, 0.3]])
-    bare = SplatSet(
-        centers=np.zeros((0, 3), np.float32),
-        radii=np.zeros(0, np.float32),
-        colors=np.zeros((0, 3), np.float32),
-        opacities=np.zeros(0, np.float32),
-        labels=np.zeros(0, np.uint8),
-        density=np.zeros(0, np.float32),
-    )
+    bare = plain_splats([], 0.02)
     for half in (0, 1):
         centers = gap_seeds([(seen, seen.depth > 0)], occupied, 0.02, bare, CONFIG, half=half).centers
         in_air = centers[:, 2] > 0.2

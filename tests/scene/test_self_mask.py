@@ -11,6 +11,7 @@ from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.self_mask import PixelKind, audited, link_residuals, self_mask, without_mixed
+from tests.plain import plain_frame
 
 K = Intrinsics(fx=160.0, fy=160.0, cx=79.5, cy=59.5, width=160, height=120)
 FLOOR, CENTER, RADIUS = 1.2, np.array([0.0, 0.0, 0.9]), 0.1
@@ -28,14 +29,7 @@ def ball_depth(center: Float64 = CENTER, radius: float = RADIUS) -> Float64:
 
 
 def frame(depth: Float64) -> RgbdFrame:
-    return RgbdFrame(
-        stamp_ns=5,
-        camera="cam0",
-        color=np.zeros((K.height, K.width, 3), np.uint8),
-        depth=np.minimum(depth, FLOOR).astype(np.float32),
-        intrinsics=K,
-        T_world_camera=np.eye(4),
-    )
+    return plain_frame(np.minimum(depth, FLOOR), K, stamp_ns=5)
 
 
 def robot(*, by_spheres: bool = False, extra: float = 0.0) -> RobotPosture:

@@ -17,24 +17,12 @@ from splatctrl_cli.scene.unrepresented import (
     unrepresented_voxels,
 )
 from splatctrl_cli.voxels import SWEPT, Balls, KnownVoxels
+from tests.plain import plain_splats
 from tests.reference.unrepresented import unrepresented
 from tests.scene.wall import WORKSPACE, frame
 
 CONFIG = SceneConfig()
 BOX = Box(lower=np.zeros(3), upper=np.full(3, 0.4))
-
-
-def splats_at(centers: object, radius: object = 0.01, label: int = 0) -> SplatSet:
-    points = np.asarray(centers, np.float32).reshape(-1, 3)
-    count = len(points)
-    return SplatSet(
-        centers=points,
-        radii=np.broadcast_to(np.float32(radius), count).copy(),
-        colors=np.zeros((count, 3), np.float32),
-        opacities=np.full(count, 0.9, np.float32),
-        labels=np.full(count, label, np.uint8),
-        density=np.zeros(count, np.float32),
-    )
 
 
 def occupied(*cells: tuple[int, int, int], voxel: float = 0.02) -> OccupancyMap:
@@ -50,7 +38,7 @@ def test_the_voxels_are_those_of_the_plain_reference(voxel: float) -> None:
     rng = np.random.default_rng(1)
     grid = occupied(voxel=voxel)
     grid.log_odds[rng.random(grid.log_odds.shape) < 0.2] = 2.0
-    splats = splats_at(rng.uniform(-0.02, 0.42, (150, 3)), rng.uniform(0.002, 0.02, 150))
+    splats = plain_splats(rng.uniform(-0.02, 0.42, (150, 3)), rng.uniform(0.002, 0.02, 150))
     found = unrepresented_voxels(grid, splats, CONFIG)
     centers = grid.occupied_centers().astype(np.float64)
     reach = representing_reach(CONFIG, voxel)
@@ -64,7 +52,7 @@ def test_a_voxel_is_represented_up_to_the_gap_that_is_filled() -> None:
     grid, center = occupied((10, 10, 10)), np.array([0.21, 0.21, 0.21])
     reach = 0.018 + 0.01
     assert representing_reach(CONFIG, 0.02) == pytest.approx(reach)
-    near, far = (splats_at(center + np.array([0.0, 0.01 + reach + e, 0.0])) for e in (-1e-4, 1e-4))
+    near, far = (plain_splats(center + np.array([0.0, 0.01 + reach + e, 0.0]), 0.01) for e in (-1e-4, 1e-4))
     assert len(unrepresented_voxels(grid, near, CONFIG)) == 0
     assert len(unrepresented_voxels(grid, far, CONFIG)) == 1
 
@@ -76,21 +64,21 @@ def test_the_reach_is_at_most_a_voxels_diagonal() -> None:
 def test_one_hit_is_not_enough() -> None:
     grid = occupied((3, 3, 3))
     grid.log_odds[3, 3, 3] = grid.config.log_odds_hit
-    assert len(unrepresented_voxels(grid, splats_at([]), CONFIG)) == 0
+    assert len(unrepresented_voxels(grid, plain_splats([], 0.01), CONFIG)) == 0
 
 
 def test_the_robots_splats_stand_for_nothing_and_its_voxels_are_none() -> None:
     grid = occupied((3, 3, 3), (9, 9, 9))
-    assert len(unrepresented_voxels(grid, splats_at([0.07, 0.07, 0.07], label=Label.ROBOT), CONFIG)) == 2
+    assert len(unrepresented_voxels(grid, plain_splats([0.07, 0.07, 0.07], 0.01, labels=Label.ROBOT), CONFIG)) == 2
     grid.entity[3, 3, 3] = SWEPT
-    balls = unrepresented_voxels(grid, splats_at([]), CONFIG)
+    balls = unrepresented_voxels(grid, plain_splats([], 0.01), CONFIG)
     assert balls.centers.tolist() == pytest.approx(np.float32([[0.19, 0.19, 0.19]]))
 
 
 def test_a_persons_voxels_are_balls_of_a_person() -> None:
     grid = occupied((3, 3, 3), (9, 9, 9))
     grid.entity[9, 9, 9] = Label.HUMAN
-    assert unrepresented_voxels(grid, splats_at([]), CONFIG).labels.tolist() == [Label.OBJECT, Label.HUMAN]
+    assert unrepresented_voxels(grid, plain_splats([], 0.01), CONFIG).labels.tolist() == [Label.OBJECT, Label.HUMAN]
 
 
 def test_a_ball_contains_its_voxel() -> None:
@@ -102,7 +90,7 @@ def test_gap_filling_looks_at_all_that_is_bare_and_half_of_it_in_turn() -> None:
     rng = np.random.default_rng(1)
     grid = occupied()
     grid.log_odds[rng.random(grid.log_odds.shape) < 0.2] = 2.0
-    splats = splats_at(rng.uniform(0.0, 0.4, (150, 3)), 0.02)
+    splats = plain_splats(rng.uniform(0.0, 0.4, (150, 3)), 0.02)
     everything = bare_voxels(grid, splats, BOX, CONFIG)
     halves = [bare_voxels(grid, splats, BOX, CONFIG, half) for half in (0, 1)]
     assert sorted(np.concatenate(halves).tolist()) == sorted(everything.tolist())

@@ -3,6 +3,7 @@
 import numpy as np
 
 from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, RgbdFrame
+from tests.plain import plain_frame
 
 INTRINSICS = Intrinsics(fx=80.0, fy=80.0, cx=39.0, cy=29.5, width=80, height=60)
 HEIGHT = 1.0  # [m] of the camera above the floor z = 0
@@ -39,11 +40,5 @@ def frame(
         is_block = (np.abs(top_x - block_x) < 0.1) & (np.abs(top_y) < 0.1)
         depth[is_block] = HEIGHT - block
         color[is_block] = [0.9, 0.1, 0.1]
-    return RgbdFrame(
-        stamp_ns=stamp_ns,
-        camera=camera,
-        color=(255 * color).round().astype(np.uint8),
-        depth=depth,
-        intrinsics=INTRINSICS,
-        T_world_camera=looking_down(x, y),
-    )
+    T_world_camera, pixels = looking_down(x, y), (255 * color).round()
+    return plain_frame(depth, INTRINSICS, T_world_camera, stamp_ns=stamp_ns, camera=camera, color=pixels)

@@ -26,7 +26,7 @@ from splatctrl_cli.scene_files.voxel_file import (
 )
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.voxels import SWEPT, UNANSWERED, LostEdges, OccupancyGrid
-from tests.plain import known
+from tests.plain import known, plain_grid, plain_splats
 
 
 @dataclass(frozen=True)
@@ -39,24 +39,15 @@ STATE = {"a": np.arange(4), "scalar": np.array(2.5)}
 
 def splats(count: int) -> SplatSet:
     rng = np.random.default_rng(count)
-    return SplatSet(
-        centers=rng.normal(size=(count, 3)).astype(np.float32),
-        radii=rng.uniform(0.01, 0.02, count).astype(np.float32),
-        colors=rng.uniform(0, 1, (count, 3)).astype(np.float32),
-        opacities=rng.uniform(0.1, 0.9, count).astype(np.float32),
-        labels=np.zeros(count, np.uint8),
-        density=np.zeros(count, np.float32),
-    )
+    centers, radii = rng.normal(size=(count, 3)), rng.uniform(0.01, 0.02, count)
+    return plain_splats(centers, radii, colors=rng.uniform(0, 1, (count, 3)), opacities=rng.uniform(0.1, 0.9, count))
 
 
 def grid() -> OccupancyGrid:
-    rng = np.random.default_rng(0)
-    return OccupancyGrid(
-        origin=np.array([-0.1, 0.2, 0.3]),
-        voxel=0.05,
-        log_odds=rng.normal(size=(3, 4, 5)).astype(np.float32),
-        num_updates=rng.integers(0, 9, (3, 4, 5)).astype(np.uint16),
-        entity=rng.integers(0, 4, (3, 4, 5)).astype(np.uint8),
+    rng, shape = np.random.default_rng(0), (3, 4, 5)
+    log_odds, num_updates = rng.normal(size=shape), rng.integers(0, 9, shape)
+    return plain_grid(
+        shape, 0.05, [-0.1, 0.2, 0.3], log_odds=log_odds, num_updates=num_updates, entity=rng.integers(0, 4, shape)
     )
 
 

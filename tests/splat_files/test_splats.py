@@ -12,6 +12,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.splat_files.gaussian_ply import read_gaussian_ply
 from splatctrl_cli.splat_files.splats import DTYPE, read_ply, write_ply
+from tests.plain import plain_splats
 from tests.splat_files.test_gaussian_ply import ascii_ply, assert_equal_bits
 
 MINIMAL = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
@@ -64,14 +65,8 @@ def test_the_header_has_the_standard_properties_in_the_reference_order(tmp_path:
 
 
 def test_one_splat_has_the_bytes_a_stock_viewer_expects(tmp_path: Path) -> None:
-    one = SplatSet(
-        centers=np.array([[1, 2, 3]], np.float32),
-        radii=np.array([0.01], np.float32),
-        colors=np.array([[0.5, 1.0, 0.0]], np.float32),
-        opacities=np.array([0.5], np.float32),
-        labels=np.array([Label.HUMAN], np.uint8),
-        density=np.array([7.0], np.float32),
-    )
+    one = plain_splats([1, 2, 3], 0.01, colors=[0.5, 1.0, 0.0], opacities=0.5, labels=Label.HUMAN)
+    one = replace(one, density=np.array([7.0], np.float32))
     write_ply(tmp_path / "a.ply", one, {})
     body = tmp_path.joinpath("a.ply").read_bytes().split(b"end_header\n")[1]
     values = struct.unpack("<17fBf", body)

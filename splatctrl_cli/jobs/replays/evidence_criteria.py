@@ -104,40 +104,40 @@ def _hidden(judged: Judged) -> Iterator[Reason]:
 
 def _unanswered(judged: Judged) -> Iterator[Reason]:
     """Where cameras looked and got no depth, within the margin of the arm: a dark or shiny thing may stand there."""
-    distance, margin = judged.replay.near["unanswered"], judged.replay.margin
-    if not np.any(distance < margin):
-        return
-    worst = int(np.nanargmin(distance))
-    yield lacking(
-        sentence=f"cameras looked at a place {mm(distance[worst])} from the arm and got no depth from it, margin "
-        f"{mm(margin)}",
-        value=float(distance[worst]),
-        threshold=margin,
-        unit="m",
-        time_s=seconds_at(judged, worst),
-        place=tuple(judged.replay.near["place"][worst].tolist()),
-        cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*judged.replay.near["place"][worst]),
-        remedy="a dark, shiny or clear thing may stand there: add a camera that gets depth there",
-        count=int(np.isfinite(distance).sum()),
+    yield from _within_margin(
+        judged,
+        "unanswered",
+        "cameras looked at a place {} from the arm and got no depth from it, margin {}",
+        "a dark, shiny or clear thing may stand there: add a camera that gets depth there",
     )
 
 
 def _lost_edge(judged: Judged) -> Iterator[Reason]:
     """Where a surface may go on in a pixel without depth beside it, within the margin of the arm."""
-    distance, margin = judged.replay.near["edge"], judged.replay.margin
+    yield from _within_margin(
+        judged,
+        "edge",
+        "the edge of a surface was lost {} from the arm, margin {}: it may go on for a pixel",
+        "keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
+    )
+
+
+def _within_margin(judged: Judged, column: str, sentence: str, remedy: str) -> Iterator[Reason]:
+    """A distance of `NearFigures` below the margin, with its place; the sentence has room for both lengths."""
+    distance, margin = judged.replay.near[column], judged.replay.margin
     if not np.any(distance < margin):
         return
     worst = int(np.nanargmin(distance))
+    place = judged.replay.near[f"{column}_place"][worst]
     yield lacking(
-        sentence=f"the edge of a surface was lost {mm(distance[worst])} from the arm, margin {mm(margin)}: it may go "
-        "on for a pixel",
+        sentence=sentence.format(mm(distance[worst]), mm(margin)),
         value=float(distance[worst]),
         threshold=margin,
         unit="m",
         time_s=seconds_at(judged, worst),
-        place=tuple(judged.replay.near["edge_place"][worst].tolist()),
-        cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*judged.replay.near["edge_place"][worst]),
-        remedy="keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
+        place=tuple(place.tolist()),
+        cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*place),
+        remedy=remedy,
         count=int(np.isfinite(distance).sum()),
     )
 

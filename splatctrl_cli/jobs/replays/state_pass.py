@@ -1,7 +1,7 @@
 """States of a replay as they come, block by block: measured, explained, and kept in files."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from splatctrl_cli.control.audit import AuditTrace, Clearance, audited, moving_c
 from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
 from splatctrl_cli.control.limits import MotionLimits
-from splatctrl_cli.control.near_space import NearSpace, Seen
+from splatctrl_cli.control.near_space import NearFigures, NearSpace, Seen
 from splatctrl_cli.control.preconditions import static_clearance
 from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep
@@ -23,6 +23,9 @@ from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_gaps
+
+NEAR_NAMES = tuple(field.name for field in fields(NearFigures))
+AGES = ("age", "ahead")  # of them, where times of seeing are known
 
 
 class ReplayRecord:
@@ -237,8 +240,7 @@ class ReplayRecord:
     def _look_around(self, part: AuditTrace) -> None:
         """What was known of the space about the arm, at some of the states."""
         num = len(part.stamp_ns)
-        unseen, blind, age, ahead, unanswered, hidden, edge = np.full((7, num), np.nan)
-        place, hidden_place, edge_place = np.full((3, num, 3), np.nan)
+        columns = {name: np.full((num, 3) if "place" in name else num, np.nan) for name in NEAR_NAMES}
         if self._scene.has_seen_times:
             self.hindsight.add(part.stamp_ns, part.position)
         for at in self._near.due(part.stamp_ns):
@@ -247,25 +249,12 @@ class ReplayRecord:
             if known is not None:
                 exact = self._scene.at(stamp).distances["exact"]
                 figures = self._near.look(stamp, part.position[at], known, exact)
-                unseen[at], blind[at] = figures.unseen, figures.blind
-                unanswered[at], place[at] = figures.unanswered, figures.place
-                hidden[at], hidden_place[at] = figures.hidden, figures.hidden_place
-                edge[at], edge_place[at] = figures.edge, figures.edge_place
+                for name in NEAR_NAMES:
+                    if self._scene.has_seen_times or name not in AGES:
+                        columns[name][at] = getattr(figures, name)
                 if self._scene.has_seen_times:
-                    age[at], ahead[at] = figures.age, figures.ahead
                     self.hindsight.looked(stamp, figures.age)
-        self.near.append(
-            unseen=unseen,
-            blind=blind,
-            age=age,
-            ahead=ahead,
-            unanswered=unanswered,
-            place=place,
-            hidden=hidden,
-            hidden_place=hidden_place,
-            edge=edge,
-            edge_place=edge_place,
-        )
+        self.near.append(**columns)
 
     def _tell_represented(self, part: AuditTrace) -> None:
         """The clearance (T,) [m] without the balls of voxels that have no splat, where these make a difference."""

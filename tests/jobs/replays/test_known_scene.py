@@ -8,9 +8,10 @@ import pytest
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.grid_files.npz_grid import read_npz, write_npz
 from splatctrl_cli.jobs.replays.known_scene import KnownScene, fields_at, known_space
-from splatctrl_cli.voxels import SWEPT, OccupancyGrid, VoxelState
+from splatctrl_cli.voxels import SWEPT, VoxelState
 from tests.cli.replay_desk import SECOND
 from tests.jobs.stage import FAR, Stage, decisive, passing
+from tests.plain import plain_grid
 
 
 def test_a_scene_is_known_from_its_latency_on_until_the_next_is() -> None:
@@ -35,11 +36,8 @@ def test_a_field_of_one_moment_is_as_old_as_it_is_far_off(stamp_ns: int, age_s: 
 
 def test_space_that_a_camera_saw_or_the_robot_was_in_is_known() -> None:
     shape = (3, 1, 1)
-    seen, entity = np.zeros(shape, np.uint16), np.zeros(shape, np.uint8)
-    seen[0], entity[1] = 4, SWEPT
-    grid = OccupancyGrid(
-        origin=np.zeros(3), voxel=0.1, log_odds=np.zeros(shape, np.float32), num_updates=seen, entity=entity
-    )
+    seen, entity = np.reshape([4, 0, 0], shape), np.reshape([0, SWEPT, 0], shape)
+    grid = plain_grid(shape, 0.1, 0.0, log_odds=0.0, num_updates=seen, entity=entity)
     points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [9.0, 0, 0]])
     assert known_space(grid)(points).tolist() == [1, 1, 0, 0]
 

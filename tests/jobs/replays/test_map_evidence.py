@@ -24,6 +24,7 @@ from splatctrl_cli.records import Float64, Intrinsics, Record, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import time_steps
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, FakeSource, clearance, logged, splats_of, write_scene
+from tests.plain import plain_frame
 
 pytestmark = pytest.mark.usefixtures("coverage_once", "without_plots")
 SIZE = (8, 6)
@@ -56,14 +57,8 @@ def test_what_is_within_reach_of_a_sphere_anywhere_in_its_cell_is_near() -> None
 
 def view(stamp_ns: int, depth: float | Float64, eye: Float64 = FROM, camera: str = "cam9") -> RgbdFrame:
     """A narrow view straight down."""
-    return RgbdFrame(
-        stamp_ns=stamp_ns,
-        camera=camera,
-        color=np.zeros((*SIZE[::-1], 3), np.uint8),
-        depth=np.broadcast_to(np.float32(depth), SIZE[::-1]).copy(),
-        intrinsics=LENS,
-        T_world_camera=look_at(eye, eye - [0.0, 0.0, 1.0], up=(0.0, 1.0, 0.0)),
-    )
+    T_world_camera = look_at(eye, eye - [0.0, 0.0, 1.0], up=(0.0, 1.0, 0.0))
+    return plain_frame(depth, LENS, T_world_camera, stamp_ns=stamp_ns, camera=camera)
 
 
 def showing(misses: Float64) -> list[RgbdFrame]:
