@@ -28,8 +28,7 @@ from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, cali
 from splatctrl_cli.logs.mcap_writer import mcap_log
 from splatctrl_cli.records import Float64, JointState, Record, RgbdFrame, by_stamp
 from splatctrl_cli.simulate import tabletop
-from splatctrl_cli.simulate.arm import HAND
-from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.arm import HAND, Motion
 from splatctrl_cli.simulate.recording import (
     JOINT_RATE,
     NOISES,

@@ -38,8 +38,7 @@ from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64, JointState
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep
-from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
-from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.arm import Motion, arm_spheres_yaml, arm_urdf
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.recording import NOISES, START_NS, Recording, RecordingOptions, Scene
 from splatctrl_cli.simulate.tabletop import WAYPOINTS, furniture

@@ -18,12 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
+from splatctrl_cli.kernels import Float32, Float64
 from splatctrl_cli.kernels.cuda.card import CudaDevice
 from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.cuda.memory import Graph
 from splatctrl_cli.kernels.raster import (
-    Float32,
-    Float64,
     LossWeights,
     Moments,
     OptimiserSettings,

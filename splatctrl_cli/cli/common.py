@@ -11,6 +11,7 @@ from splatctrl_cli.cli.envelope import enveloped
 from splatctrl_cli.cli.options import names_of
 from splatctrl_cli.cli.reports import reports_of
 from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.files.output import plain
 from splatctrl_cli.records import Label
 
 _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
@@ -35,7 +36,7 @@ class Console:
     def result(self, result: Mapping[str, Any], lines: Iterable[str], *, code: int = 0) -> None:
         """The command's result, which ends with exit code `code`: `result` as JSON with --json, else `lines`."""
         if self.is_json:
-            text = json.dumps(enveloped(result, code), indent=2, allow_nan=False, default=_plain)
+            text = json.dumps(enveloped(result, code), indent=2, allow_nan=False, default=plain)
             self._args.is_printed = True
             print(text)
         else:
@@ -99,9 +100,3 @@ def labels_of(text: str) -> frozenset[Label]:
     """The labels in a field: objects, and those that ``--include`` names. Raises UsageError for another name."""
     names = () if text.strip() == "none" else names_of(text, ("robot", "human"), "--include")
     return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})
-
-
-def _plain(value: object) -> object:
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    return str(value)

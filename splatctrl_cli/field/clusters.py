@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.kernels.field import LANES, SPARE_OFFSET, SPARE_PLACE, Clusters, Float32, Offsets
-from splatctrl_cli.records import Box, Float64, UInt8
+from splatctrl_cli.kernels.field import LANES, SPARE_OFFSET, SPARE_PLACE, Clusters, Offsets
+from splatctrl_cli.records import Box, Float32, Float64, UInt8
 
 _BITS = 10  # of each coordinate in a Hilbert code
 _GROUPS = 8  # their number is a multiple of this

@@ -6,6 +6,7 @@ import errno
 import fcntl
 import hashlib
 import json
+import math
 import os
 import platform
 import shutil
@@ -327,7 +328,7 @@ def write_run(
 
 def write_json(path: Path, value: object) -> None:
     """Indented JSON without NaN, ending in a newline."""
-    path.write_text(json.dumps(value, indent=2, allow_nan=False, default=_plain) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(value, indent=2, allow_nan=False, default=plain) + "\n", encoding="utf-8")
 
 
 def sha256(path: Path) -> str:
@@ -335,7 +336,13 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _plain(value: object) -> object:
+def plain(value: object) -> object:
+    """What JSON can hold of a value that it does not know."""
     if hasattr(value, "tolist"):
         return value.tolist()
     return str(value)
+
+
+def finite(value: float) -> float | None:
+    """The value, None where JSON has none for it."""
+    return value if math.isfinite(value) else None

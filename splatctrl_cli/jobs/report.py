@@ -42,20 +42,28 @@ MOST_PICTURES, PICTURE_WIDTH = 24, 560  # of recordings as expected: how many, h
 
 
 @dataclass(frozen=True, kw_only=True)
-class WriteReportRequest:
-    """A report on `path`, the folder of a run or of a batch, into the HTML file `out`, None for PATH.html.
+class ViewRequest:
+    """A page on `path`, a run, scene or field folder, a grid or a file of splats, into `out`, None for PATH.html.
 
-    against: an earlier run or batch, or a stored baseline, since which it says what changed.
-    roots: folders in which the scenes and robots of the runs' command lines are looked for. all_scenes: of a batch,
-    every scene in 3-D and not only the failed, changed and worst.
+    roots: folders in which the scene and robot of a replay's command line are looked for.
     """
 
     path: Path
     out: Path | None = None
-    against: Path | None = None
     roots: tuple[Path, ...] = ()
-    all_scenes: bool = False
     force: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class WriteReportRequest(ViewRequest):
+    """A report on `path`, the folder of a run or of a batch, into the HTML file `out`, None for PATH.html.
+
+    against: an earlier run or batch, or a stored baseline, since which it says what changed. all_scenes: of a batch,
+    every scene in 3-D and not only the failed, changed and worst.
+    """
+
+    against: Path | None = None
+    all_scenes: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,19 +310,6 @@ def _log(batch: BatchFolder, node: Node) -> Table:
     except (OSError, InputError):
         lines = ["no log"]
     return Table(title="Log", text="\n".join(lines[-LOG_LINES:]))
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewRequest:
-    """A page on `path`, a run, scene or field folder, a grid or a file of splats, into `out`, None for PATH.html.
-
-    roots: folders in which the scene and robot of a replay's command line are looked for.
-    """
-
-    path: Path
-    out: Path | None = None
-    roots: tuple[Path, ...] = ()
-    force: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

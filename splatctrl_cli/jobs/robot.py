@@ -1,6 +1,5 @@
 """What `robot` does, from requests to results: fit spheres, measure them, list self-collision pairs, show a robot."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
-from splatctrl_cli.files.output import output_path
+from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.records import SphereSet
@@ -106,9 +105,9 @@ class PairsResult:
                 "links": list(pair.links),
                 "left_out": pair.left_out,
                 "sphere_pairs": pair.num_sphere_pairs,
-                "least_gap": _finite(pair.least_gap),
-                "largest_gap": _finite(pair.largest_gap),
-                "hit_share": _finite(pair.hit_share),
+                "least_gap": finite(pair.least_gap),
+                "largest_gap": finite(pair.largest_gap),
+                "hit_share": finite(pair.hit_share),
             }
             for pair in self.found.link_pairs
         ]
@@ -138,7 +137,7 @@ class RobotResult:
     def as_dict(self) -> dict[str, Any]:
         urdf = self.model.urdf
         joints = [
-            {"name": name, "lower": _finite(lower), "upper": _finite(upper), "velocity": _finite(velocity)}
+            {"name": name, "lower": finite(lower), "upper": finite(upper), "velocity": finite(velocity)}
             for name, lower, upper, velocity in self.joints
         ]
         return {
@@ -299,7 +298,3 @@ def _plain_link(link: LinkCoverage) -> dict[str, Any]:
         "worst_sphere": link.worst_sphere,
         "is_closed": link.is_closed,
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -19,8 +19,7 @@ from splatctrl_cli.robot.self_margins import SelfSurfaces
 from splatctrl_cli.robot.sphere_files import spheres_yaml
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
-from splatctrl_cli.simulate.arm import hand_pose
-from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.arm import Motion, hand_pose
 from splatctrl_cli.simulate.recording import START_NS, Scene
 from splatctrl_cli.simulate.truth import distance_to
 

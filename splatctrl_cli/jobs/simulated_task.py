@@ -14,8 +14,8 @@ from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import random_postures
+from splatctrl_cli.simulate.arm import Motion
 from splatctrl_cli.simulate.environments import Environment, drawn, ring_of_cameras
-from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.recording import RecordingOptions, Scene
 

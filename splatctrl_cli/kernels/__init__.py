@@ -8,6 +8,17 @@ import importlib
 import os
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+Bool = NDArray[np.bool_]
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int16 = NDArray[np.int16]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+UInt8 = NDArray[np.uint8]
+
 
 def _best() -> Any:
     forced = os.environ.get("SPLATCTRL_KERNELS", "auto")

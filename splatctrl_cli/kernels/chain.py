@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import native, num_threads
+from splatctrl_cli.kernels import Float64, Int64, native, num_threads
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 REVOLUTE, PRISMATIC = 0, 1
 
 

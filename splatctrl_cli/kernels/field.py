@@ -9,17 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import native, num_threads
+from splatctrl_cli.kernels import Float32, Float64, Int32, UInt8, native, num_threads
 
 LANES = 16
 BLOCK = 8  # cells of a block along each axis
 SPARE_OFFSET = -1e30  # of an entry so far away that nothing ever takes it
 SPARE_PLACE = 1e15
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
-UInt8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True)

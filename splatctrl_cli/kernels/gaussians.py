@@ -5,17 +5,14 @@ quaternion (4, of any length but zero), logit opacity, then 16 spherical-harmoni
 blue.
 """
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import native
+from splatctrl_cli.kernels import Float32, Float64, native
 from splatctrl_cli.kernels.raster import empty_planes
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 NUM_PARAMETERS = 59
 CENTER, LOG_SCALE, QUAT, LOGIT, HARMONICS = slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(11, 59)
@@ -90,7 +87,8 @@ class GaussianArrays:
 
 @dataclass(frozen=True, kw_only=True)
 class GaussianRates:
-    """Learning rates of one step; color is the constant harmonic's, harmonics that of the others.
+    """Learning rates of one step, in the order of the kernels; color is the constant harmonic's, harmonics that of
+    the others.
 
     regulariser: derivative of lambda_reg times the mean opacity with respect to one opacity.
     """
@@ -108,9 +106,7 @@ def gaussian_step(
     raster: GaussianRasteriser, gradients: Float32, arrays: GaussianArrays, rates: GaussianRates
 ) -> None:
     """One Adam step on `arrays`, in place, for the Gaussians of the prepared view."""
-    r = rates
-    values = np.array([r.center, r.log_scale, r.quat, r.logit_opacity, r.color, r.harmonics, r.regulariser])
     native.gaussian_step(
         raster.native, raster.degree, gradients, arrays.parameters, arrays.first, arrays.second, arrays.num_steps,
-        arrays.growth, values, raster.num_threads,
+        arrays.growth, np.array(astuple(rates)), raster.num_threads,
     )  # fmt: skip

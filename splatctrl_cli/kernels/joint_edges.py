@@ -6,13 +6,10 @@ Shapes: E edges, J joints, R rows (M moving spheres, then P pairs). All float64.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import native, num_threads
+from splatctrl_cli.kernels import Float64, Int64, native, num_threads
 from splatctrl_cli.kernels.chain import Chain
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 PART = 10  # spheres that are passed over together, at most
 
 

@@ -5,10 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import native
-
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
+from splatctrl_cli.kernels import Float64, UInt8, native
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,13 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import native
-
-Bool = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int16 = NDArray[np.int16]
-Int64 = NDArray[np.int64]
+from splatctrl_cli.kernels import Bool, Float32, Float64, Int64, native
 
 
 def back_projected(camera: Float64, depth: Float32, chosen: Bool | None = None, num_threads: int = 1) -> Float64:

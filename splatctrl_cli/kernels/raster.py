@@ -3,16 +3,13 @@
 Shapes: N splats, (H, W) pixels. `planes` are (5, H, W) float32: red, green, blue, depth [m], accumulated opacity.
 """
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import native
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
+from splatctrl_cli.kernels import Float32, Float64, native
 
 
 def pack_camera(
@@ -135,7 +132,7 @@ class ImageLoss:
 
 @dataclass(frozen=True, kw_only=True)
 class OptimiserSettings:
-    """Learning rates and limits of one step; see `SceneConfig`."""
+    """Learning rates and limits of one step, in the order of the kernels; see `SceneConfig`."""
 
     lr_center: float
     lr_log_radius: float
@@ -170,16 +167,9 @@ def optimiser_step(
 
     Parameters are centre (3) [m], log radius, colour (3), logit opacity.
     """
-    values = np.array(
-        [
-            settings.lr_center, settings.lr_log_radius, settings.lr_color, settings.lr_logit_opacity,
-            settings.regulariser, settings.noise, settings.min_opacity, settings.min_radius, settings.max_radius,
-            settings.radius_depth,
-        ]
-    )  # fmt: skip
     native.optimiser_step(
-        raster.native, gradients, parameters, moments.first, moments.second, moments.num_steps, values, seed,
-        raster.num_threads,
+        raster.native, gradients, parameters, moments.first, moments.second, moments.num_steps,
+        np.array(astuple(settings)), seed, raster.num_threads,
     )  # fmt: skip
 
 

@@ -3,13 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.kernels import native
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int16 = NDArray[np.int16]
+from splatctrl_cli.kernels import Float32, Float64, Int16, native
 
 BOX, CYLINDER, BALL, CAPSULE = 0.0, 1.0, 2.0, 3.0
 

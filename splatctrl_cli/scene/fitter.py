@@ -22,17 +22,15 @@ from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
-from splatctrl_cli.scene.depth_holes import unanswered_points
+from splatctrl_cli.scene.depth_holes import lost_edges, unanswered_points
 from splatctrl_cli.scene.descent import Descent
-from splatctrl_cli.scene.eviction import room_for
 from splatctrl_cli.scene.keyframes import View, Window, make_view, seen_through
 from splatctrl_cli.scene.labels import Seen, relabel
-from splatctrl_cli.scene.lost_edges import lost_edges
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
 from splatctrl_cli.scene.posture import RobotPosture, carried
 from splatctrl_cli.scene.relocation import use_idle
-from splatctrl_cli.scene.removal import REASONS, removals
+from splatctrl_cli.scene.removal import REASONS, removals, room_for
 from splatctrl_cli.scene.render import BLACK, Color, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import (
     Candidates,

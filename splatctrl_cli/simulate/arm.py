@@ -1,4 +1,5 @@
-"""The simulated arm: seven joints with the published kinematics of the Franka Emika Panda, in primitive shapes.
+"""The simulated arm: seven joints with the published kinematics of the Franka Emika Panda, in primitive shapes; and
+how it moves.
 
 Joint placements follow the published (modified) Denavit-Hartenberg table (d1 = 0.333, d3 = 0.316, a4 = 0.0825,
 a5 = -0.0825, d5 = 0.384, a7 = 0.088, flange 0.107 m) and the published position and velocity limits. The shapes are
@@ -211,3 +212,21 @@ def _turned(axis: int, angle: float, xyz: tuple[float, float, float] = (0.0, 0.0
 
 def _words(values: object) -> str:
     return " ".join(f"{value + 0.0:.12g}" for value in np.asarray(values, dtype=float))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """Waypoints (W, J) [rad], reached at rest at times (W,) [s], joined by minimum-jerk segments."""
+
+    times: Float64
+    waypoints: Float64
+
+    def at(self, time: float) -> tuple[Float64, Float64]:
+        """Positions (J,) [rad] and velocities (J,) [rad/s]; at rest before the first and after the last waypoint."""
+        time = float(np.clip(time, self.times[0], self.times[-1]))
+        index = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2))
+        span = self.times[index + 1] - self.times[index]
+        s = (time - self.times[index]) / span
+        step = self.waypoints[index + 1] - self.waypoints[index]
+        position = self.waypoints[index] + step * (10 * s**3 - 15 * s**4 + 6 * s**5)
+        return position, step * (30 * s**2 - 60 * s**3 + 30 * s**4) / span

@@ -11,8 +11,8 @@ from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, UInt8, by_stamp
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import shared_workspace, tabletop
+from splatctrl_cli.simulate.arm import Motion
 from splatctrl_cli.simulate.environments import ENVIRONMENTS
-from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.render import Camera, DepthNoise, Renderer
 from splatctrl_cli.simulate.truth import distance_to

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from splatctrl_cli.records import Float64
-from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.arm import Motion
 from splatctrl_cli.simulate.primitives import Primitive, Texture, Track
 from splatctrl_cli.simulate.tabletop import PALETTE
 

@@ -12,7 +12,7 @@ from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Bool, Float64, Intrinsics, RgbdFrame
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
-from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.arm import Motion
 from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture
 from splatctrl_cli.simulate.render import Camera, Meshes, Renderer
 

@@ -17,8 +17,7 @@ from splatctrl_cli.geometry import invert_transform, look_at
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
-from splatctrl_cli.simulate.arm import HAND
-from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.arm import HAND, Motion
 from splatctrl_cli.simulate.recording import RecordingOptions, Scene
 from tests.calibration.scan import printed, with_board
 

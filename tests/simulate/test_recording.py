@@ -13,7 +13,7 @@ from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import tabletop
-from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.arm import Motion
 from splatctrl_cli.simulate.primitives import Primitive, Texture, luminance_std
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.render import DepthNoise, Renderer

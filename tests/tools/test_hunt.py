@@ -9,8 +9,7 @@ import pytest
 from splatctrl_cli.config import Config
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.simulate.arm import Capsule
-from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.arm import Capsule, Motion
 from splatctrl_cli.simulate.primitives import Primitive, Texture, signed_distance
 from splatctrl_cli.sources.source import open_source
 from tools.hunt.clearance import TrueArm, interpolated, least_clearance

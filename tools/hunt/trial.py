@@ -22,8 +22,7 @@ from splatctrl_cli.robot.coverage import CoverageReport, coverage_of_solids
 from splatctrl_cli.robot.link_meshes import Solid
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
-from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
-from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.arm import Motion, arm_spheres_yaml, arm_urdf
 from splatctrl_cli.simulate.primitives import Primitive, Track
 from splatctrl_cli.simulate.render import Camera
 from splatctrl_cli.sources.source import open_source

@@ -8,8 +8,7 @@ import numpy as np
 from splatctrl_cli.geometry import invert_transform, look_at, project, transform_points
 from splatctrl_cli.records import Box, Float64, Intrinsics
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.simulate.arm import Capsule
-from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.arm import Capsule, Motion
 from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture, Track
 from splatctrl_cli.simulate.recording import START_NS
 from splatctrl_cli.simulate.render import Camera

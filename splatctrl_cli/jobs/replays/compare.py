@@ -15,6 +15,7 @@ from splatctrl_cli.control.open_loop import is_shaped
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.metrics import DESCRIBES, GAP, TIME, Better, Scale
+from splatctrl_cli.files.output import finite
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replays.goal import goal_waypoints
 from splatctrl_cli.jobs.replays.known_scene import KnownFields
@@ -285,18 +286,14 @@ def _motion_values(figures: MotionFigures | None) -> dict[str, float | None]:
         "joint_path_rad": figures.joint_path,
         "effector_path_m": figures.effector_path,
         "effector_path_deg": figures.effector_turn,
-        "min_clearance_barrier": _finite(figures.clearance["barrier"]),
-        "min_clearance": _finite(figures.clearance["exact"]),
-        "min_clearance_proved": _finite(figures.proved),
-        "min_clearance_true": None if figures.true_clearance is None else _finite(figures.true_clearance),
+        "min_clearance_barrier": finite(figures.clearance["barrier"]),
+        "min_clearance": finite(figures.clearance["exact"]),
+        "min_clearance_proved": finite(figures.proved),
+        "min_clearance_true": None if figures.true_clearance is None else finite(figures.true_clearance),
         "num_interventions": figures.num_interventions,
     }
 
 
 def _plan_values(plan: PlannedPath) -> dict[str, float | None]:
-    values = (plan.seconds, _finite(plan.margin), _finite(plan.self_margin), plan.num_edges, plan.num_proved)
+    values = (plan.seconds, finite(plan.margin), finite(plan.self_margin), plan.num_edges, plan.num_proved)
     return dict(zip(PLAN, values, strict=True))
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

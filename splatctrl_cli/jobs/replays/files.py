@@ -14,7 +14,7 @@ from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event, first_intervention
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.verdict import Verdict
-from splatctrl_cli.files.output import Stopwatch, write_json, write_run
+from splatctrl_cli.files.output import Stopwatch, finite, write_json, write_run
 from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.jobs.replays.compare import document_of, draw_methods
 from splatctrl_cli.jobs.replays.metrics import Metrics
@@ -218,11 +218,6 @@ def _event_document(event: Event) -> dict[str, Any]:
     for name in ("worst", "worst_s", "start_s", "end_s"):
         document[name] = finite(document[name])
     return document
-
-
-def finite(value: float) -> float | None:
-    """The value, None where JSON has none for it."""
-    return value if math.isfinite(value) else None
 
 
 def write_steps(path: Path, chunks: Iterable[Mapping[str, Sequence[object]]]) -> None:

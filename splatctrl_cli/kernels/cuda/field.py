@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatctrl_cli.kernels import Float32, Float64, Int32
 from splatctrl_cli.kernels.cuda.memory import FIELD, Array, Launch, Memory
-from splatctrl_cli.kernels.field import LANES, Clusters, Float32, Float64, GridSpan, Int32, LogSumExp, Offsets
+from splatctrl_cli.kernels.field import LANES, Clusters, GridSpan, LogSumExp, Offsets
 
 # As field.h and field_query.cuh lay them out.
 CLUSTERS = np.dtype([("counts", "i4", 2), ("centers", "u8", 3), ("boxes", "u8", 6)], align=True)

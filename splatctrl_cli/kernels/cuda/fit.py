@@ -5,22 +5,15 @@ grow where they turn out too short, and the run is then repeated from where it b
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.kernels import Float32, Float64
 from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Graph, Launch, Memory, OutOfMemory
-from splatctrl_cli.kernels.raster import (
-    Float32,
-    Float64,
-    LossTerms,
-    LossWeights,
-    Moments,
-    OptimiserSettings,
-    TargetView,
-)
+from splatctrl_cli.kernels.raster import LossTerms, LossWeights, Moments, OptimiserSettings, TargetView
 
 # As fit.h lays them out.
 CAMERA = np.dtype([("floats", "f4", 4), ("size", "i4", 2), ("T_camera_world", "f4", 12)])
@@ -278,11 +271,8 @@ class DeviceFit:
         """Put a schedule before the next launches; without weights and settings to render only."""
         run = np.zeros((), RUN)
         if settings is not None and weights is not None:
-            s, w = settings, weights
-            run["settings"] = (
-                s.lr_center, s.lr_log_radius, s.lr_color, s.lr_logit_opacity, s.regulariser, s.noise, s.min_opacity,
-                s.min_radius, s.max_radius, s.radius_depth,
-            )  # fmt: skip
+            w = weights
+            run["settings"] = astuple(settings)
             run["seed"] = seed
             run["weights"] = w.dssim, w.color, w.depth, w.opacity
             run["normalised"], run["background"] = w.normalised, w.background
