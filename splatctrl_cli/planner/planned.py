@@ -42,12 +42,19 @@ class PlannedPath:
 
 
 def planned_path(
-    model: ArmModel, scene: HasDistance, task: ReplayTask, planner: PlannerConfig, control: ControlConfig
+    model: ArmModel,
+    scene: HasDistance,
+    task: ReplayTask,
+    planner: PlannerConfig,
+    control: ControlConfig,
+    *,
+    approach: float = 0.0,
 ) -> PlannedPath:
     """A path from the task's start to its goal pose, at most as fast as the controller may drive its frame.
 
     scene gives a lower bound of a 1-Lipschitz distance: then every edge is proved. The postures at the goal are
-    sought from the task's home, the start, and random ones.
+    sought from the task's home, the start, and random ones. approach [m]: the last that a hand comes straight along
+    the z axis of its frame, as far as that is free.
     """
     began = time.perf_counter()
     start, frame = task.start, task.frame
@@ -64,10 +71,8 @@ def planned_path(
     path, num_proved, num_edges = None, 0, 0
     if min(margin, own) > 0:
         room = Clearance.of(model, scene, margin=margin + extra, self_margin=own)
-        found = path_to_nearest(room, np.clip(start, model.lower, model.upper), goals, planner)
-        outcome = found.outcome
-        if found.outcome is PlanOutcome.SOLVED:
-            way = found.waypoints
+        outcome, way = _found(room, task, goals, approach, planner, control)
+        if outcome is PlanOutcome.SOLVED:
             rates = effector_rates(
                 model, way, frame, max_linear=control.max_linear_speed, max_angular=control.max_angular_speed
             )
@@ -86,6 +91,19 @@ def planned_path(
     )
 
 
+def _found(
+    room: Clearance, task: ReplayTask, goals: Float64, approach: float, planner: PlannerConfig, control: ControlConfig
+) -> tuple[PlanOutcome, Float64]:
+    """How the search for a path to one of goals (G, J) ended, and its waypoints (W, J), none where there is none."""
+    last = [approach_to(room, task.frame, goal, approach, planner, control) for goal in goals]
+    before = np.array([way[0] for way in last])
+    found = path_to_nearest(room, np.clip(task.start, room.model.lower, room.model.upper), before, planner)
+    if not found.is_solved:
+        return found.outcome, found.waypoints
+    ending = last[int(np.argmin(np.linalg.norm(before - found.waypoints[-1], axis=1)))]
+    return found.outcome, np.concatenate([found.waypoints, ending[1:]])
+
+
 def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: PlannerConfig) -> Plan:
     """A path to the goal (G, J) nearest to the start, where `NEAREST_ITERATIONS` find one; else to any of them.
 
@@ -95,6 +113,26 @@ def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: Pl
     few = replace(planner, max_iterations=min(fixed.NEAREST_ITERATIONS, planner.max_iterations))
     found = plan(room, start, nearest[:1], few, seed=planner.seed)
     return found if found.is_solved else plan(room, start, nearest, planner, seed=planner.seed)
+
+
+def approach_to(
+    room: Clearance, frame: str, goal: Float64, length: float, planner: PlannerConfig, control: ControlConfig
+) -> Float64:
+    """(W, J) postures to a goal (J,) straight along the z axis of its frame, from at most `length` [m] before it: as
+    far as postures lead there and the edges between them are free.
+    """
+    model, way = room.model, [goal]
+    T_world_goal = model.frame_pose(goal, frame)
+    for back in np.arange(fixed.APPROACH_STEP, length + 1e-9, fixed.APPROACH_STEP):
+        T = T_world_goal.copy()
+        T[:3, 3] -= back * T[:3, 2]
+        q = _solved(model, frame, T, way[0], control)
+        if q is None or np.max(np.abs(q - way[0])) > fixed.APPROACH_TURN:
+            break
+        if not check_edges(room, q[None], way[0][None], contact=planner.contact).is_free[0]:
+            break
+        way.insert(0, q)
+    return np.array(way)
 
 
 def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlConfig) -> tuple[float, float, Float64]:

@@ -156,7 +156,7 @@ def gaussian_map(problem: Problem, views: Views, config: Config, threads: int) -
     if not len(radii):
         raise NotEvaluableError("3D-GS: no Gaussian is left")
     field = SphereField(centers, radii, threads=threads)
-    return Map(scene=Asked(distance=_less_rounding(field)), num_parts=len(splats))
+    return Map(scene=Asked(distance=_less_rounding(field)), num_parts=len(splats), things=(centers, radii))
 
 
 def tsdf_map(problem: Problem, views: Views, config: Config) -> Map:

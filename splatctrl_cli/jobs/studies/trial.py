@@ -26,7 +26,7 @@ from splatctrl_cli.jobs.studies.maps import (
 )
 from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.jobs.studies.views import Views, views_of
-from splatctrl_cli.jobs.studies.ways import plain_ways
+from splatctrl_cli.jobs.studies.ways import Way, plain_ways
 from splatctrl_cli.planner.configuration_clearance import HasDistance
 from splatctrl_cli.planner.path import joint_length
 from splatctrl_cli.planner.planned import GOAL_BLOCKED, START_BLOCKED, planned_detours, planned_path
@@ -42,7 +42,9 @@ METHODS = (*FULL, QP_IK, QP_IK_DETOURS, PAPER, GAUSSIANS, OCCUPANCY)
 SUBSET = 20  # problems of each drawn environment that go through every method
 CAMERAS = (2, 4, 6)
 DETOURS = 3
+APPROACH = 0.12  # [m] that the hand comes straight to its goal: as deep as it reaches about a thing
 NO_MARGIN = 1e-4  # [m]
+PLANS, LITTLE = 6, 1e-4  # of a way through unseen space; [m^3] of that for which one plan does
 SEARCH = 1500  # iterations for each of a map's ways
 BLOCKED = {START_BLOCKED: judge.START_BLOCKED, GOAL_BLOCKED: judge.GOAL_BLOCKED}
 NUM_STEPS = 5  # of each camera, the arm at rest
@@ -261,18 +263,39 @@ def _judged(rig: Rig, trial: Trial, attempt: Attempt, known: Map, robot: Measure
 
 
 def by_planner(rig: Rig, known: Map) -> Attempt:
-    """A planned path, followed in joint space: the first of the map's ways that leads to the goal."""
-    attempt = Attempt(position=None, cause=judge.NO_PLAN)
+    """A planned path, followed in joint space: the first of the map's ways that leads to the goal, each tried with
+    samples of its own; where none does, the last with others.
+    """
+    attempt, seed = Attempt(position=None, cause=judge.NO_PLAN), rig.config.planner.seed
     for way in known.ways() if known.ways is not None else plain_ways(known.scene, rig.config):
+        attempt = _least_unseen(rig, way, range(seed, seed + PLANS), gives_up=True)
+        if attempt.position is not None:
+            return attempt
+        seed += PLANS
+    return _least_unseen(rig, way, range(seed, seed + PLANS), gives_up=False)
+
+
+def _least_unseen(rig: Rig, way: Way, seeds: Sequence[int], *, gives_up: bool) -> Attempt:
+    """Of the plans that samples of these seeds lead to, the one that comes to least space that no camera saw; the
+    first where that is at most `LITTLE`, or is not known. gives_up: none where the first seed leads to none.
+    """
+    best, least = Attempt(position=None, cause=judge.NO_PLAN), np.inf
+    for seed in seeds:
         config = replace(
             rig.config,
-            planner=replace(rig.config.planner, max_iterations=SEARCH),
+            planner=replace(rig.config.planner, max_iterations=SEARCH, seed=seed),
             control=replace(rig.config.control, margin=way.margin),
         )
         attempt = replace(_planned(rig, way.scene, config), in_known_space=way.in_known_space)
         if attempt.position is not None:
+            unseen = 0.0 if way.unseen_on is None else way.unseen_on(attempt.position)
+            if unseen < least:
+                best, least = attempt, unseen
+        elif best.position is None:
+            best = attempt
+        if least <= LITTLE or (gives_up and best.position is None):
             break
-    return attempt
+    return best
 
 
 def as_printed(rig: Rig, known: Map) -> Attempt:
@@ -282,7 +305,7 @@ def as_printed(rig: Rig, known: Map) -> Attempt:
 
 
 def _planned(rig: Rig, scene: HasDistance, config: Config) -> Attempt:
-    plan = planned_path(rig.problem.model, scene, rig.task, config.planner, config.control)
+    plan = planned_path(rig.problem.model, scene, rig.task, config.planner, config.control, approach=APPROACH)
     if plan.path is None:
         return Attempt(position=None, cause=BLOCKED.get(plan.outcome, judge.NO_PLAN), outcome=plan.outcome)
     run = follow_joints(plan.path, plan.clearance, rig.task.frame, config.planner, config.control)

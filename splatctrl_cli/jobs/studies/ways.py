@@ -24,6 +24,7 @@ from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.jobs.replays.compare import ROUNDING
 from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.planner.configuration_clearance import HasDistance
+from splatctrl_cli.planner.path import resampled
 from splatctrl_cli.records import Bool, DistanceGrid, Float32, Float64
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
@@ -33,6 +34,7 @@ BEHIND = 0.06  # [m] from a surface of the map, within which unseen space is lik
 SHARES = (1.0, 0.4)  # of the margin asked for
 THIN = 0.008  # [m] radius of balls where nothing else leaves a way: surface is in their middle
 LEAST_SHARE = 0.15  # of the margin, at the very last
+SAMPLES = 0.05  # [rad] between postures at which the space is counted that a motion comes to
 ENDS_ROOM = 2 * START_ROOM + 1e-4  # [m] more than the margin, which a start or a goal has to keep
 
 
@@ -45,13 +47,14 @@ class Asked:
 
 @dataclass(frozen=True, kw_only=True)
 class Way:
-    """A scene to plan in with a margin [m]. in_known_space: it keeps out of what no camera saw; None where the
-    method does not tell that from free space.
+    """A scene to plan in with a margin [m]. in_known_space: it keeps out of what no camera saw, None where the method
+    does not tell that from free space; unseen_on: how much of it [m^3] a motion (T, J) comes to where it does not.
     """
 
     scene: HasDistance
     margin: float
     in_known_space: bool | None = None
+    unseen_on: Callable[[Float64], float] | None = None
 
 
 Ways = Callable[[], Iterator[Way]]
@@ -84,10 +87,37 @@ class Surroundings:
             if unseen is not None:
                 for share, thing in zip(SHARES, things, strict=True):
                     scene = Asked(distance=_least_of(thing, unseen))
-                    yield Way(scene=scene, margin=share * margin, in_known_space=is_known)
+                    yield self._way(scene, share * margin, is_known)
         for share, is_thin in ((SHARES[0], False), (SHARES[1], False), (SHARES[1], True), (LEAST_SHARE, True)):
             scene = Asked(distance=self.things(share * margin, is_thin=is_thin))
-            yield Way(scene=scene, margin=share * margin, in_known_space=self.unseen is None)
+            yield self._way(scene, share * margin, self.unseen is None)
+
+    def _way(self, scene: Asked, margin: float, is_known: bool) -> Way:
+        unseen_on = None if is_known else self.unseen_on
+        return Way(scene=scene, margin=margin, in_known_space=is_known, unseen_on=unseen_on)
+
+    def unseen_on(self, position: Float64) -> float:
+        """How much space [m^3] that no camera saw the arm comes to in a motion (T, J), without what it is in at its
+        start or its goal: by voxels, to half of one.
+        """
+        ends = self._reached(np.stack([self.problem.start, self.problem.goal]))
+        is_new = self._reached(resampled(position, SAMPLES)) & self._never_seen & ~ends
+        return float(np.sum(is_new)) * self.grid.voxel**3
+
+    def _reached(self, postures: Float64) -> Bool:
+        """Voxels (X, Y, Z) that the arm's moving spheres hold in any of postures (K, J)."""
+        model, grid = self.problem.model, self.grid
+        is_reached = np.zeros(self._never_seen.shape, dtype=np.bool_)
+        moving = np.flatnonzero(model.moving_spheres)
+        cells = np.rint((model.sphere_centers_batch(postures)[:, moving] - grid.origin) / grid.voxel).astype(np.int64)
+        for sphere, radius in enumerate(model.sphere_set.radii[moving]):
+            most = int(np.ceil(radius / grid.voxel))
+            ball = np.argwhere(np.ones((2 * most + 1,) * 3)) - most
+            ball = ball[np.linalg.norm(ball, axis=1) * grid.voxel <= radius]
+            held = (np.unique(cells[:, sphere], axis=0)[:, None] + ball).reshape(-1, 3)
+            held = held[np.all((held >= 0) & (held < is_reached.shape), axis=1)]
+            is_reached[tuple(held.T)] = True
+        return is_reached
 
     def things(self, margin: float, *, is_thin: bool = False) -> DistanceFunction:
         """The distance to the balls, those smaller that the start or the goal is nearer to than the margin [m]: a
@@ -121,11 +151,15 @@ class Surroundings:
         return self._distance_to(is_behind)
 
     @cached_property
+    def _never_seen(self) -> Bool:
+        """Voxels (X, Y, Z)."""
+        occupancy = self.config.occupancy
+        return np.asarray(self.grid.states(occupancy.free_below, occupancy.occupied_above) == VoxelState.NEVER_SEEN)
+
+    @cached_property
     def _is_unseen(self) -> Bool:
         """Voxels (X, Y, Z), without those `UNSEEN_NEAR` the arm's start and goal."""
-        grid, problem, occupancy = self.grid, self.problem, self.config.occupancy
-        states = grid.states(occupancy.free_below, occupancy.occupied_above)
-        is_unseen: Bool = states == VoxelState.NEVER_SEEN
+        grid, problem, is_unseen = self.grid, self.problem, self._never_seen.copy()
         centers = np.concatenate([problem.model.sphere_centers(q) for q in (problem.start, problem.goal)])
         radii = np.tile(problem.model.sphere_set.radii, 2)
         ends = [(centers + side * (radii + UNSEEN_NEAR)[:, None] - grid.origin) / grid.voxel for side in (-1, 1)]

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.jobs.studies.problems import Problem, read_problem
 from splatctrl_cli.jobs.studies.ways import Surroundings, beside_the_start, plain_ways
-from splatctrl_cli.records import Float64, UInt8
+from splatctrl_cli.planner.path import resampled
+from splatctrl_cli.records import Bool, Float64, UInt8
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
 MARGIN = Config().control.margin
@@ -94,3 +96,20 @@ def test_the_ways_give_up_the_margin_before_known_space_and_that_before_the_rest
     assert all(value < 0 for value in reached[:4]) and all(value > 0 for value in reached[4:])
     plain = [way.margin for way in plain_ways(problem.solids, Config())]
     assert plain[0] == MARGIN and all(a > b for a, b in pairwise(plain))
+
+
+def test_unseen_space_that_a_motion_comes_to_is_counted_but_where_the_arm_begins_and_ends(problem: Problem) -> None:
+    far = hand(problem, problem.start) + np.array([[0.0, 0.0, 0.4]])
+    around = surroundings(problem, far, 0.01, np.full(SHAPE, VoxelState.NEVER_SEEN, np.uint8))
+    position = np.stack([problem.start, problem.goal])
+    assert around.unseen_on(np.stack([problem.start, problem.start])) == 0.0
+    cells = np.argwhere(np.ones(SHAPE, bool)) * 0.02 + around.grid.origin
+    moving, radii = problem.model.moving_spheres, problem.model.sphere_set.radii
+
+    def held(postures: Float64) -> Bool:
+        balls = problem.model.sphere_centers_batch(postures)[:, moving].reshape(-1, 3)
+        return SphereField(balls, np.tile(radii[moving], len(postures))).query(cells)[0] < 0
+
+    expected = 0.02**3 * np.sum(held(resampled(position, 0.02)) & ~held(position))
+    assert expected > 0.005 and around.unseen_on(position) == pytest.approx(expected, rel=0.15)
+    assert surroundings(problem, far, 0.01).unseen_on(position) == 0.0
