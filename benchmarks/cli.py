@@ -1,14 +1,12 @@
 """Whole processes, as a person starts them."""
 
 import statistics
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks import launch
-from benchmarks.measure import ROOT, SAMPLE, Limit, Options, Result
+from benchmarks.measure import ROBOT, SAMPLE, Limit, Options, Result, measured
 
 SPLATCTRL = str(Path(sys.executable).with_name("splatctrl"))
 
@@ -45,16 +43,12 @@ def run(options: Options) -> Result:
 
 
 def _reconstruct(out: Path) -> list[str]:
-    robot = ["--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_spheres.yaml")]
-    return [SPLATCTRL, "reconstruct", str(SAMPLE / "log.mcap"), "--cameras", "cam0,cam1,cam2", *robot, "-q", "-o",
-            str(out)]  # fmt: skip
+    log = [str(SAMPLE / "log.mcap"), "--cameras", "cam0,cam1,cam2"]
+    return [SPLATCTRL, "reconstruct", *log, *ROBOT, "-q", "-o", str(out)]
 
 
 def process(command: Sequence[str]) -> tuple[float, float]:
-    """Wall time [s] and peak resident memory [MiB] of a process. Raises where it does not end well."""
-    launcher = [sys.executable, "-S", launch.__file__]
-    done = subprocess.run([*launcher, *command], cwd=ROOT, capture_output=True, text=True, check=True)
-    elapsed, peak, code = done.stdout.split()
-    if code != "0":
-        raise subprocess.CalledProcessError(int(code), list(command), stderr=done.stderr)
-    return float(elapsed), float(peak) / 1024
+    """Wall time [s] and peak resident memory [MiB] of a process that has to end well."""
+    spent = measured(command)
+    assert spent.code == 0
+    return spent.seconds, spent.mebibytes

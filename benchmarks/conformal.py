@@ -1,4 +1,4 @@
-"""`python -m benchmarks.conformal --scenes N`: the bound on a map's error beside the truth, on random tables.
+"""The bound on a map's error beside the truth, on random tables.
 
 Each seed is a table with random things, an arm that crosses it, and (every other seed) a thing that appears and
 leaves; three cameras train in lockstep and the fourth is evidence. Two questions are asked of each scene.
@@ -11,19 +11,17 @@ state that is truly nearer than `verdict.evidence_reach`? That is what the verdi
 that the held-out camera does not see as well, which nobody promises.
 """
 
-import argparse
-import json
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.measure import Options, Result
 from benchmarks.random_tabletop import random_things
-from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.config.fixed import FEWEST_STRETCHES
 from splatctrl_cli.evaluate.conformal import autocorrelation_time, conformal_rank, stretch_scores, stretches
@@ -49,6 +47,7 @@ TRAINING = ("cam0", "cam1", "cam2")
 SIZE = (80, 60)
 FPS, DURATION_S = 5.0, 8.0
 SETTINGS = ("scene.max_splats=5000", "scene.first_iterations=20", "scene.iterations_per_step=2")
+NUM_SCENES, QUICK = 200, 4
 CLEAR = 0.01  # [m] at least between the moving arm and a thing
 GUESTS = 10**6  # added to a seed for the thing that visits
 ASKED = 0.5  # confidence for a further stretch, beside as much as the stretches allow: a single one allows it
@@ -103,33 +102,20 @@ def random_scene(options: RecordingOptions, robot: RobotModel) -> Scene:
     return Scene(primitives=(*furniture(), *things, visiting), temporary=(visiting,), motion=motion)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the scenes, and print the table; a line of JSON for each scene as well where a file is named."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.conformal", description=__doc__, allow_abbrev=False)
-    parser.add_argument("--scenes", type=int, default=20, metavar="N")
-    parser.add_argument("--seed", type=int, default=0, metavar="FIRST")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="add a line for each scene, and table all in it")
-    args = parser.parse_args(argv)
-    trials = [] if args.json is None or not args.json.exists() else read_trials(args.json)
-    for seed in range(args.seed, args.seed + args.scenes):
-        if any(trial.seed == seed for trial in trials):
-            continue
-        found = trial_of(seed)
-        trials += [] if found is None else [found]
-        if args.json is not None and found is not None:
-            with args.json.open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps(asdict(found)) + "\n")
-    print("\n".join(table_of(trials)))
-    print(
-        f"{args.scenes - len(trials)} more of {args.scenes} scenes make fewer than {FEWEST_STRETCHES} stretches: "
-        "not evaluable"
+def run(options: Options) -> Result:
+    """Coverage beside its promise, and the width, by kind and of all."""
+    num = QUICK if options.is_quick else NUM_SCENES
+    trials = [found for found in map(trial_of, range(num)) if found is not None]
+    median = np.median([(trial.num_stretches, trial.length, trial.seconds) for trial in trials], axis=0)
+    return Result(
+        title=f"conformal: {num} random tables",
+        columns=("scenes", "of", "number", "promised %", "covered %", "median mm", "90 % mm"),
+        rows=rows_of(trials),
+        notes=[
+            "{:g} stretches in the median, of {:g} sets; {:.1f} s of one core a scene".format(*median),
+            f"{num - len(trials)} scenes make fewer than {FEWEST_STRETCHES} stretches: not evaluable",
+        ],
     )
-    return 0
-
-
-def read_trials(path: Path) -> list[Trial]:
-    """The scenes that an earlier run wrote."""
-    return [Trial(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def trial_of(seed: int) -> Trial | None:
@@ -255,7 +241,7 @@ def _bound(scores: Float64, confidence: float) -> tuple[float, float]:
     return max(float(np.sort(scores)[conformal_rank(len(scores), allowed) - 1]), 0.0), allowed
 
 
-def table_of(trials: Sequence[Trial]) -> list[str]:
+def rows_of(trials: Sequence[Trial]) -> list[list[str]]:
     """Coverage beside its promise, and the width, by kind and of all."""
     rows = []
     by_kind = sorted(trials, key=lambda trial: trial.kind)
@@ -271,25 +257,7 @@ def table_of(trials: Sequence[Trial]) -> list[str]:
             widths = 1e3 * np.array([getattr(trial, width) for trial in group])
             share = covered / len(group)
             spread = 1.96 * np.sqrt(share * (1 - share) / len(group))
-            rows.append(
-                (
-                    kind,
-                    what,
-                    len(group),
-                    f"{100 * promised:.1f}",
-                    f"{100 * share:.1f} +- {100 * spread:.1f}",
-                    f"{np.median(widths):.1f}",
-                    f"{np.percentile(widths, 90):.1f}",
-                )
-            )
-    head = ("scenes", "of", "number", "promised %", "covered %", "median mm", "90 % mm")
-    num = np.median([trial.num_stretches for trial in trials])
-    return [
-        *table(head, rows),
-        f"stretches: {num:g} in the median, of {np.median([t.length for t in trials]):g} sets;"
-        f" {np.median([t.seconds for t in trials]):.1f} s of one core a scene",
-    ]
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+            figures = (f"{100 * promised:.1f}", f"{100 * share:.1f} +- {100 * spread:.1f}")
+            width_mm = (f"{np.median(widths):.1f}", f"{np.percentile(widths, 90):.1f}")
+            rows.append([kind, what, str(len(group)), *figures, *width_mm])
+    return rows

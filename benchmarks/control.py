@@ -17,7 +17,7 @@ from splatctrl_cli.field.distance import make_field
 from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.obstacles import field_splats
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.records import Box, DistanceField, Float64, SplatSet
+from splatctrl_cli.records import DistanceField, Float64, SplatSet
 
 NUM_STEPS = 200
 CLEAR = 0.04  # [m]
@@ -29,9 +29,7 @@ def run(options: Options) -> Result:
     config, model = Config(), sample_robot()
     splats = _scene()
     analytic = make_field(splats.centers, splats.radii, config.field)
-    reach = model.reach()
-    workspace = Box(lower=model.base_position - reach, upper=model.base_position + reach)
-    grid = GridField(bake(splats, workspace, config.field))
+    grid = GridField(bake(splats, model.reach_box, config.field))
     fields: dict[str, DistanceField] = {"grid": grid, "analytic": analytic}
     steps = {f"{name}_{solver}": _step(field, solver) for name, field in fields.items() for solver in SOLVERS}
     points = np.ascontiguousarray(model.sphere_centers(sample_states()[0].position))

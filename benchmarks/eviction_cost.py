@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
 
-from benchmarks.measure import SAMPLE, Limit, Options, Result
+from benchmarks.measure import ROBOT, SAMPLE, Limit, Options, Result
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.scene import fitter
 
@@ -39,13 +39,12 @@ def run(options: Options) -> Result:
 def _spent(budget: int) -> dict[str, float]:
     """Seconds by part in one reconstruction."""
     spent = dict.fromkeys((*PARTS, "steps"), 0.0)
-    robot = ["--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_spheres.yaml")]
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         for name, (owner, attribute) in {**PARTS, "steps": WHOLE}.items():
             stack.enter_context(_timed(owner, attribute, name, spent))
         stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
         cameras = ["--cameras", "cam0,cam1,cam2", "--max-splats", str(budget)]
-        assert main(["reconstruct", str(SAMPLE / "log.mcap"), *cameras, *robot, "-o", f"{folder}/scene", "-q"]) == 0
+        assert main(["reconstruct", str(SAMPLE / "log.mcap"), *cameras, *ROBOT, "-o", f"{folder}/scene", "-q"]) == 0
     return spent
 
 

@@ -14,8 +14,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from benchmarks.long_log import measured
-from benchmarks.measure import SAMPLE, Limit, Options, Result, medians
+from benchmarks.measure import SAMPLE, Limit, Options, Result, measured, medians
 from benchmarks.scenes import enlarged
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_writer import write_capture
@@ -198,4 +197,4 @@ def _peak(log: Path, out: Path) -> float:
     """Largest resident memory [MB] of `splatctrl ingest`."""
     spent = measured([sys.executable, "-m", "splatctrl_cli", "ingest", str(log), "-o", str(out), "--force", "-q"])
     assert spent.code == 0
-    return spent.megabytes
+    return spent.mebibytes

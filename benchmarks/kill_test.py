@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.measure import ROBOT, SAMPLE
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import SplatCtrlError
@@ -33,7 +34,6 @@ from splatctrl_cli.sources.source import open_source
 from splatctrl_cli.splat_files.splat_formats import FORMATS
 from tests.splat_files.test_gaussian_ply import gaussian_set
 
-SAMPLE = Path(__file__).parent.parent / "sample_data" / "tabletop"
 _OWN = ("seconds", "arguments")  # of run.json
 _TIMED = ("run.json", "SHA256SUMS")  # SHA256SUMS holds the sum of run.json where it lists it
 
@@ -55,11 +55,10 @@ class Task:
 
 def tasks(folder: Path) -> list[Task]:
     """What is killed; each task may use what the ones before it wrote."""
-    robot = ("--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_spheres.yaml"))
-    audit = ("replay", str(SAMPLE / "log.mcap"), "--field", str(folder / "field"), *robot, "--max-unknown", "1")
+    audit = ("replay", str(SAMPLE / "log.mcap"), "--field", str(folder / "field"), *ROBOT, "--max-unknown", "1")
     bake = ("sdf-bake", str(folder / "splats.ply"), "--set", "field.max_loss=1", "--no-report", "--voxel", "0.1")
     fine = (*bake[:-1], "0.06", "--threads", "1")
-    fit = ("reconstruct", str(SAMPLE / "log.mcap"), "--cameras", "cam0,cam1,cam2", *robot)
+    fit = ("reconstruct", str(SAMPLE / "log.mcap"), "--cameras", "cam0,cam1,cam2", *ROBOT)
     pack = ("capture", "pack", str(folder / "log.capture"))
     return [
         Task(name="ingest", arguments=("ingest", str(SAMPLE / "log.mcap")), out="log.capture", resumes=True),

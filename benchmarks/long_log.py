@@ -1,11 +1,9 @@
 """`python -m benchmarks.long_log FOLDER SECONDS`: a moving arm logged at 1 kHz, and what a replay of it takes."""
 
 import argparse
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +12,13 @@ from mcap.writer import CompressionType, Writer
 from numpy.lib.format import write_array_header_1_0
 from rosbags.typesys import Stores, get_typestore
 
-from benchmarks.measure import SAMPLE, Limit, Options, Result
+from benchmarks.measure import ROBOT, Limit, Options, Result, measured
 from benchmarks.scenes import sample_fitter, sample_robot
 from splatctrl_cli.config import Config
 from splatctrl_cli.field.obstacles import field_splats
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.grid_files.npz_grid import write_npz
-from splatctrl_cli.records import Box, Float64
+from splatctrl_cli.records import Float64
 
 RATE = 1000  # states per second
 FORMS = ("npz", "csv", "mcap")
@@ -30,18 +28,6 @@ MIDDLE = np.array([-0.2, 0.2, 0.0, -1.9, 0.0, 2.1, 0.8])  # [rad]
 SWING = np.array([0.6, 0.15, 0.2, 0.2, 0.3, 0.2, 0.5])  # [rad]
 PACE = np.array([0.31, 0.47, 0.23, 0.53, 0.29, 0.41, 0.37])  # [rad/s]
 NAMES = tuple(f"joint{number}" for number in range(1, 8))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Spent:
-    """What a process took: wall time [s], processor time [s] of it and the system for it, largest resident memory
-    [MB], and its exit code.
-    """
-
-    seconds: float
-    processor_s: float
-    megabytes: float
-    code: int
 
 
 def blocks(num: int) -> Iterator[tuple[Float64, Float64, Float64]]:
@@ -62,32 +48,9 @@ def write_log(folder: Path, seconds: float, form: str = "npz", *, with_velocity:
     return write(folder / f"long_{num}.{form}", num, with_velocity)
 
 
-_WAIT = """
-import resource, subprocess, sys, time
-start = time.perf_counter()
-code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
-seconds, used = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
-print(seconds, used.ru_utime + used.ru_stime, used.ru_maxrss, code)
-"""
-
-
-def measured(command: Sequence[str]) -> Spent:
-    """Run a command and wait for it, from a small process: a child's largest memory begins with its parent's."""
-    answer = subprocess.run([sys.executable, "-c", _WAIT, *command], capture_output=True, text=True, check=True)
-    seconds, processor, memory, code = answer.stdout.split()[-4:]
-    per_megabyte = 2**20 if sys.platform == "darwin" else 2**10
-    return Spent(
-        seconds=float(seconds),
-        processor_s=float(processor),
-        megabytes=float(memory) / per_megabyte,
-        code=int(code),
-    )
-
-
 def replay_command(log: Path, scene: Sequence[str], out: Path, *more: str) -> list[str]:
     """The command that replays a log of `write_log`; scene: --field or --scene with its path."""
-    robot = ["--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_spheres.yaml")]
-    call = [sys.executable, "-m", "splatctrl_cli", "replay", str(log), *robot, *scene]
+    call = [sys.executable, "-m", "splatctrl_cli", "replay", str(log), *ROBOT, *scene]
     return [*call, "-o", str(out), "--force", "-q", "--max-unknown", "1", *more]
 
 
@@ -103,11 +66,11 @@ def run(options: Options) -> Result:
             spent.append(measured(replay_command(log, ("--field", str(field)), folder / "out")))
     num = round(RATE * (lengths[1] - lengths[0]))
     rate = num / (spent[1].seconds - spent[0].seconds)
-    slope = 1e6 * (spent[1].megabytes - spent[0].megabytes) / num
+    slope = 1e6 * (spent[1].mebibytes - spent[0].mebibytes) / num
     return Result(
         title="long log: replay --mode audit of a log at 1 kHz",
         columns=("log [s]", "time [s]", "largest memory [MB]"),
-        rows=[[f"{s:g}", f"{of.seconds:.1f}", f"{of.megabytes:.0f}"] for s, of in zip(lengths, spent, strict=True)],
+        rows=[[f"{s:g}", f"{of.seconds:.1f}", f"{of.mebibytes:.0f}"] for s, of in zip(lengths, spent, strict=True)],
         figures={"states_per_s": rate, "mb_per_million_states": slope},
         limits=[
             Limit(figure="states_per_s", bound=5_000.0, is_least=True),
@@ -119,9 +82,8 @@ def run(options: Options) -> Result:
 def _baked(file: Path) -> Path:
     """The sample log's map, baked over the arm's reach."""
     model, fitter = sample_robot(), sample_fitter()
-    reach = model.reach()
-    box = Box(lower=model.base_position - reach, upper=model.base_position + reach)
-    write_npz(file, bake(field_splats(fitter.splats()), box, Config().field, occupancy=fitter.occupancy.grid()))
+    splats, occupancy = field_splats(fitter.splats()), fitter.occupancy.grid()
+    write_npz(file, bake(splats, model.reach_box, Config().field, occupancy=occupancy))
     return file
 
 
@@ -199,7 +161,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     spent, num = measured(command), round(args.seconds * RATE)
     print(
         f"{args.form} {args.mode}: {num} states in {spent.seconds:.1f} s ({num / spent.seconds:.0f} states/s), "
-        f"processor {spent.processor_s:.1f} s ({num / spent.processor_s:.0f} states/s), {spent.megabytes:.0f} MB, "
+        f"processor {spent.processor_s:.1f} s ({num / spent.processor_s:.0f} states/s), {spent.mebibytes:.0f} MB, "
         f"exit {spent.code}"
     )
     return spent.code

@@ -3,6 +3,8 @@
 import os
 import platform
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,6 +17,7 @@ from splatctrl_cli.records import Float64
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_data" / "tabletop"
+ROBOT = ("--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_spheres.yaml"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +92,37 @@ def medians(
             if index >= num_untimed:
                 times[name].append(elapsed)
     return {name: statistics.median(values) for name, values in times.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spent:
+    """What a process took: wall time [s], processor time [s] of it and the system for it, largest resident memory
+    [MiB], and its exit code.
+    """
+
+    seconds: float
+    processor_s: float
+    mebibytes: float
+    code: int
+
+
+_WAIT = """
+import resource, subprocess, sys, time
+start = time.perf_counter()
+code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
+seconds, used = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+print(seconds, used.ru_utime + used.ru_stime, used.ru_maxrss, code)
+"""
+
+
+def measured(command: Sequence[str]) -> Spent:
+    """Run a command and wait for it, from a small process: a child's largest memory begins with its parent's."""
+    waiting = [sys.executable, "-S", "-c", _WAIT, *command]
+    answer = subprocess.run(waiting, capture_output=True, text=True, check=True)
+    seconds, processor, memory, code = answer.stdout.split()[-4:]
+    per_mebibyte = 2**20 if sys.platform == "darwin" else 2**10
+    mebibytes = float(memory) / per_mebibyte
+    return Spent(seconds=float(seconds), processor_s=float(processor), mebibytes=mebibytes, code=int(code))
 
 
 def rms(error: Float64) -> float:

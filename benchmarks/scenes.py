@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.measure import SAMPLE
 from splatctrl_cli.config import Config
 from splatctrl_cli.kernels.raster import TargetView
-from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, JointState, Label, RgbdFrame, SplatSet
+from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, Label, RgbdFrame, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.keyframes import make_view
@@ -68,8 +68,7 @@ def wall_problem(num_splats: int) -> FitProblem:
 def sample_fitter(config: Config | None = None) -> SceneFitter:
     """The fitter after the first three time steps of the sample log, with the robot's reach as workspace."""
     robot, config = sample_robot(), config or Config()
-    reach, base = robot.reach(), robot.base_position
-    fitter = SceneFitter(config.scene, config.occupancy, Box(lower=base - reach, upper=base + reach))
+    fitter = SceneFitter(config.scene, config.occupancy, robot.reach_box)
     source = open_source(SAMPLE / "log.mcap")
     for step in islice(time_steps(source.records(), TRAINING, has_clock=source.has_clock), 3):
         fitter.step(step.frames)

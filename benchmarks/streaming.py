@@ -5,18 +5,16 @@
 
 import json
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks import launch
-from benchmarks.measure import ROOT, SAMPLE, Limit, Options, Result
+from benchmarks.measure import SAMPLE, Limit, Options, Result, measured
 from benchmarks.scenes import enlarged, sample_robot
 from splatctrl_cli.config import load_config
-from splatctrl_cli.records import Box, RgbdFrame
+from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.time_steps import time_steps
 from splatctrl_cli.sources.source import open_source
@@ -55,20 +53,15 @@ def _measured(num_steps: int) -> tuple[list[float], float, float]:
     """Seconds of each time step, and [MiB]: the decoded frames, and the peak of a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "streaming.json"
-        launcher = [sys.executable, "-S", launch.__file__]
-        command = [sys.executable, "-m", "benchmarks.streaming", str(out), str(num_steps)]
-        done = subprocess.run([*launcher, *command], cwd=ROOT, capture_output=True, text=True, check=True)
-        _, peak, code = done.stdout.split()
-        if code != "0":
-            raise subprocess.CalledProcessError(int(code), command, stderr=done.stderr)
-        measured = json.loads(out.read_text(encoding="utf-8"))
-    return measured["seconds"], measured["frames_mib"], float(peak) / 1024
+        spent = measured([sys.executable, "-m", "benchmarks.streaming", str(out), str(num_steps)])
+        assert spent.code == 0
+        found = json.loads(out.read_text(encoding="utf-8"))
+    return found["seconds"], found["frames_mib"], spent.mebibytes
 
 
 def _stream(out: Path, num_steps: int) -> None:
     config, robot = load_config(None, SETTINGS), sample_robot()
-    reach, base = robot.reach(), robot.base_position
-    fitter = SceneFitter(config.scene, config.occupancy, Box(lower=base - reach, upper=base + reach))
+    fitter = SceneFitter(config.scene, config.occupancy, robot.reach_box)
     steps = _decoded(num_steps)
     seconds = []
     for frames in steps:

@@ -33,11 +33,11 @@ class RobotModel:
     """Kinematics, limits and collision spheres of one arm; everything in the world frame, SI units, float64.
 
     joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; frame_names: what
-    `frame_pose` knows; urdf: the file it came from; left_out: links of the sphere file that the URDF does not have;
-    bare_links: links with a body in the URDF and no sphere; coverage: how the spheres cover the collision surface,
-    None where it was not measured, and then coverage_unknown says why; sphere_deficit (S,) [m]: how far outside the
-    spheres a surface point of the sphere's rigid body may be, NaN where that is not known; held: fingers that a log
-    does not move, and where they are taken to be.
+    `frame_pose` knows; chain: bodies and spheres as the kernels walk them; urdf: the file it came from; left_out:
+    links of the sphere file that the URDF does not have; bare_links: links with a body in the URDF and no sphere;
+    coverage: how the spheres cover the collision surface, None where it was not measured, and then coverage_unknown
+    says why; sphere_deficit (S,) [m]: how far outside the spheres a surface point of the sphere's rigid body may be,
+    NaN where that is not known; held: fingers that a log does not move, and where they are taken to be.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class RobotModel:
         }
         self.frame_names = tuple(link for link in urdf.links if link in self._frames)
         self._sphere_joint, self._sphere_offset = self._joint_offsets()
-        self._chain = self._as_chain()
+        self.chain = self._as_chain()
         self.moving_spheres: Bool = self._moved()
 
     @classmethod
@@ -223,6 +223,12 @@ class RobotModel:
         return len(self.joint_names)
 
     @property
+    def reach_box(self) -> Box:
+        """The box [m] around the base that the reach fills."""
+        reach = self.reach()
+        return Box(lower=self.base_position - reach, upper=self.base_position + reach)
+
+    @property
     def base_position(self) -> Float64:
         """Origin of the root link (3,) [m], world."""
         return np.array(self.T_world_base[:3, 3])
@@ -235,22 +241,22 @@ class RobotModel:
 
     def sphere_centers(self, q: Float64) -> Float64:
         """Sphere centres (S, 3) [m], world, at joint positions q (J,)."""
-        return np.asarray(self._chain.centers(self._checked(q)[None])[0])
+        return np.asarray(self.chain.centers(self._checked(q)[None])[0])
 
     def sphere_centers_batch(self, q: Float64, *, threads: int = 1) -> Float64:
         """Sphere centres (T, S, 3) [m], world, at joint positions q (T, J)."""
         postures = np.asarray(q, dtype=np.float64)
         if postures.ndim != 2 or postures.shape[1] != self.num_joints:
             raise InputError(f"joint positions: expected shape (T, {self.num_joints}), got {postures.shape}")
-        return self._chain.centers(postures, threads=threads)
+        return self.chain.centers(postures, threads=threads)
 
     def sphere_jacobians(self, q: Float64) -> Float64:
         """d centre / d q (S, 3, J), world, at q (J,)."""
-        return self._chain.jacobians(self._checked(q))[1]
+        return self.chain.jacobians(self._checked(q))[1]
 
     def spheres_at(self, q: Float64) -> tuple[Float64, Float64]:
         """`sphere_centers` (S, 3) and `sphere_jacobians` (S, 3, J) at q (J,), in one walk."""
-        return self._chain.jacobians(self._checked(q))
+        return self.chain.jacobians(self._checked(q))
 
     def frame_pose(self, q: Float64, frame: str) -> Float64:
         """T_world_frame (4, 4) of a link at q (J,). Raises InputError for a frame that is not there."""
@@ -263,16 +269,11 @@ class RobotModel:
     def _framed(self, q: Float64, frame: str) -> tuple[Float64, Float64]:
         there = self._model.frames[self._frame(frame)]
         in_body = np.ascontiguousarray(there.placement.homogeneous[:3])
-        return self._chain.frame(self._checked(q), there.parentJoint, in_body)
-
-    @property
-    def chain(self) -> Chain:
-        """The bodies and spheres as the kernels walk them."""
-        return self._chain
+        return self.chain.frame(self._checked(q), there.parentJoint, in_body)
 
     def lever_arms(self) -> Float64:
         """(S, J) upper bounds, over every posture, of how far a centre moves per radian (or metre) of a joint."""
-        return lever_arms(self._chain, self.lower, self.upper)
+        return lever_arms(self.chain, self.lower, self.upper)
 
     def reach(self) -> float:
         """Radius [m] of a ball about the base that holds every sphere in every posture (sum of link lengths)."""
@@ -318,7 +319,7 @@ class RobotModel:
     def _configuration(self, q: Float64) -> Float64:
         q = self._checked(q)
         if not self._is_wrapped.any():
-            return np.asarray(q, dtype=np.float64)
+            return q
         columns = [[np.cos(x), np.sin(x)] if w else [x] for x, w in zip(q, self._is_wrapped, strict=True)]
         return np.concatenate(columns)
 

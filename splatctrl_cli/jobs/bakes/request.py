@@ -241,7 +241,7 @@ def covered(request: BakeRequest, source: BakeSource, previous: Previous | None)
         return request.box
     if request.urdf is not None:
         robot = RobotModel.from_urdf(request.urdf, request.spheres)
-        return Box(lower=robot.base_position - robot.reach(), upper=robot.base_position + robot.reach())
+        return robot.reach_box
     if previous is not None:
         return previous.box
     return bounding_box(field_splats(source.splats, request.labels), request.config.field.padding)

@@ -359,8 +359,7 @@ class Reconstruction:
         if self.request.box is not None:
             return self.request.box
         if self.robot is not None:
-            reach, base = self.robot.reach(), self.robot.base_position
-            return Box(lower=base - reach, upper=base + reach)
+            return self.robot.reach_box
         if self.cloud is not None:
             return cloud_box(self.cloud)
         return depth_box(first.frames, self.config.occupancy.max_range, self.config.scene.scale or 1.0)
