@@ -28,10 +28,11 @@ COLORS = {
     WAY: "#111111",
     CAMERA: "#0072b2",
 }
-SIZE = (560, 430)  # [px] of a view
-SHADES = 5  # of a colour, by how a surface is turned
+SIZE = (520, 400)  # [px] of a view
+SHADES, LIGHT_SHADES = 5, 2  # of a colour, by how a surface is turned; of what shines through
 SHOWN = 0.45  # of what shines through: the map, the start and the goal
-LENS = Intrinsics(fx=520.0, fy=520.0, cx=(SIZE[0] - 1) / 2, cy=(SIZE[1] - 1) / 2, width=SIZE[0], height=SIZE[1])
+NEAREST = 0.4  # of the way to the place: what is light and nearer to the eye would veil the picture
+LENS = Intrinsics(fx=480.0, fy=480.0, cx=(SIZE[0] - 1) / 2, cy=(SIZE[1] - 1) / 2, width=SIZE[0], height=SIZE[1])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,16 +66,20 @@ def trial_picture(path: Path, scene: TrialScene, views: Sequence[tuple[str, Floa
 
 def _rendered(scene: TrialScene, T_world_camera: Float64) -> Float64:
     """RGB (H, W, 3) in [0, 1]."""
-    depth, color = _layer(scene.solid, T_world_camera, scene.is_seen)
+    depth, color = _layer(scene.solid, T_world_camera, SHADES, scene.is_seen)
+    nearest = NEAREST * float(np.linalg.norm(scene.place - T_world_camera[:3, 3]))
     for surface in scene.light:
-        nearer, tint = _layer(surface, T_world_camera)
-        is_before = (nearer > 0) & ((depth == 0) | (nearer < depth))
+        nearer, tint = _layer(surface, T_world_camera, LIGHT_SHADES)
+        is_before = (nearer > nearest) & ((depth == 0) | (nearer < depth))
         color[is_before] = (1 - SHOWN) * color[is_before] + SHOWN * tint[is_before]
     return color
 
 
 def _layer(
-    surface: RobotSurface, T_world_camera: Float64, is_seen: Callable[[Float64], Sequence[bool]] | None = None
+    surface: RobotSurface,
+    T_world_camera: Float64,
+    shades: int,
+    is_seen: Callable[[Float64], Sequence[bool]] | None = None,
 ) -> tuple[Float32, Float64]:
     """depth (H, W) [m], 0 = none, and RGB (H, W, 3) of one surface, white where it is not."""
     nothing = np.zeros(SIZE[::-1], np.float32)
@@ -86,7 +91,7 @@ def _layer(
         is_thing = number == names.index(THING)
         number[is_thing & ~_everywhere(is_seen, transform_points(T_world_camera, points), is_thing)] = len(names) - 2
     palette = np.array([mpl.colors.to_rgb(COLORS.get(name, "#ffffff")) for name in names])
-    return seen.depth, palette[number] * np.where(seen.link < 0, 1.0, _shade(points))[..., None]
+    return seen.depth, palette[number] * np.where(seen.link < 0, 1.0, _shade(points, shades))[..., None]
 
 
 def _everywhere(is_seen: Callable[[Float64], Sequence[bool]], points_world: Float64, is_asked: Bool) -> Bool:
@@ -96,14 +101,14 @@ def _everywhere(is_seen: Callable[[Float64], Sequence[bool]], points_world: Floa
     return coarse.repeat(2, axis=0).repeat(2, axis=1)[: is_asked.shape[0], : is_asked.shape[1]]
 
 
-def _shade(points: Float64) -> Float64:
-    """(H, W) in (0, 1]: bright where a surface faces the camera, in `SHADES` steps."""
+def _shade(points: Float64, shades: int) -> Float64:
+    """(H, W) in (0, 1]: bright where a surface faces the camera, in so many steps."""
     across, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
     normal = np.cross(across, down)
     facing = np.abs(np.sum(normal * points, axis=2))
     length = np.linalg.norm(normal, axis=2) * np.linalg.norm(points, axis=2)
     turned = np.divide(facing, length, out=np.zeros_like(facing), where=length > 0)
-    return np.asarray(0.45 + 0.55 * np.rint(turned * SHADES) / SHADES)
+    return np.asarray(0.45 + 0.55 * np.rint(turned * shades) / shades)
 
 
 def _mark(axes: "mpl.axes.Axes", scene: TrialScene, T_world_camera: Float64) -> None:
