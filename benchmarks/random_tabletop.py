@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from splatctrl_cli.geometry import pose_at, turn_about_z
 from splatctrl_cli.records import Float64
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.tabletop import PALETTE
@@ -46,9 +47,7 @@ def _size(kind: str, rng: np.random.Generator) -> tuple[float, ...]:
 def _thing(name: str, kind: str, size: tuple[float, ...], position: Float64, rng: np.random.Generator) -> Primitive:
     height = size[2] / 2 if kind == "box" else size[1] / 2 if kind == "cylinder" else size[0]
     yaw = rng.uniform(0.0, np.pi)
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T[:3, 3] = [*position, height]
+    T = pose_at([*position, height], turn_about_z(yaw))
     dark, bright = PALETTE[list(PALETTE)[int(rng.integers(len(PALETTE)))]]
     texture = Texture(
         pattern=PATTERNS[int(rng.integers(len(PATTERNS)))],

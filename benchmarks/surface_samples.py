@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.cloud import drawn_on
+from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.mesh_distance import TriangleMesh
 from splatctrl_cli.records import Float64
 
@@ -32,16 +34,10 @@ def sample_mesh(mesh: TriangleMesh, spacing: float, *, seed: int) -> SurfaceSamp
     Raises UsageError for a spacing that is not above 0.
     """
     check_spacing(spacing)
-    rng = np.random.default_rng(seed)
-    corners = mesh.corners
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = face_normals(mesh.corners)
     doubled = np.linalg.norm(cross, axis=1)
     num = int(np.ceil(CANDIDATES * 0.5 * doubled.sum() / spacing**2)) + 1
-    face = rng.choice(len(corners), num, p=doubled / doubled.sum())
-    u, v = rng.random((2, num))
-    flip = u + v > 1
-    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    points = np.einsum("nk,nka->na", np.stack([1 - u - v, u, v], axis=1), corners[face])
+    points, face = drawn_on(mesh, num, np.random.default_rng(seed))
     kept = thin(points, spacing)
     return SurfaceSamples(points=points[kept], normals=cross[face[kept]] / doubled[face[kept], None])
 

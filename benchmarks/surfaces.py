@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.measure import ROOT
 from benchmarks.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh
-from splatctrl_cli.geometry import invert_transform, transform_points
+from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
 from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.records import Box, Float64
 from splatctrl_cli.simulate.primitives import Primitive, Texture, closest_point, normals
@@ -168,8 +168,7 @@ def _box(size: tuple[float, float, float], middle: tuple[float, float, float]) -
 
 
 def _solid(kind: str, size: tuple[float, ...], middle: tuple[float, float, float]) -> Primitive:
-    T = np.eye(4)
-    T[:3, 3] = middle
+    T = pose_at(middle)
     grey = Texture(pattern="noise", feature=0.05, dark=(0.5, 0.5, 0.5), bright=(0.5, 0.5, 0.5))
     return Primitive(name=kind, kind=kind, size=size, T_world_shape=T, texture=grey)
 

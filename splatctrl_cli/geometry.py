@@ -50,12 +50,39 @@ def quat_from_rotation(R: Float64) -> Float64:
     return np.asarray(-quat if quat[3] < 0 else quat)
 
 
+def pose_at(position: ArrayLike, R: ArrayLike | None = None) -> Float64:
+    """T (4, 4) from a position (3,) [m] and a rotation (3, 3), without one not turned."""
+    T = np.eye(4)
+    T[:3, 3] = position
+    if R is not None:
+        T[:3, :3] = R
+    return T
+
+
+def turn_about_z(angle: float) -> Float64:
+    """Rotation (3, 3) by an angle [rad] about z."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def frame_along(axis: Float64) -> Float64:
+    """A rotation (3, 3) whose z axis points along `axis` (3,)."""
+    z = axis / np.linalg.norm(axis)
+    x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def face_normals(corners: Float64) -> Float64:
+    """Of triangles (F, 3, 3) their normals times twice the area (F, 3), outward where corners go round
+    counter-clockwise seen from outside.
+    """
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
 def transform_from(position: ArrayLike, quat_xyzw: ArrayLike) -> Float64:
     """T (4, 4) from a position (3,) [m] and a quaternion (x, y, z, w)."""
-    T = np.eye(4)
-    T[:3, :3] = rotation_from_quat(quat_xyzw)
-    T[:3, 3] = position
-    return T
+    return pose_at(position, rotation_from_quat(quat_xyzw))
 
 
 def interpolate_transform(T_a: Float64, T_b: Float64, fraction: float) -> Float64:
@@ -79,10 +106,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, np.asarray(up, dtype=np.float64))
     right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
-    T[:3, 3] = eye_world
-    return T
+    return pose_at(eye_world, np.column_stack([right, np.cross(forward, right), forward]))
 
 
 def strided_lens(lens: Intrinsics, stride: int) -> Intrinsics:

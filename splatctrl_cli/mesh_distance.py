@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Bool, Float64
 
@@ -203,7 +204,7 @@ class _Normals:
 
     def __init__(self, mesh: TriangleMesh) -> None:
         corners, faces = mesh.corners, mesh.faces
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        cross = face_normals(corners)
         self.of_face = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
         self._faces = faces
         self._of_vertex = np.zeros_like(mesh.vertices)

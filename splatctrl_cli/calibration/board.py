@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.geometry import transform_points
+from splatctrl_cli.geometry import pose_at, transform_points
 from splatctrl_cli.records import Float32, Float64, Intrinsics, RgbdFrame, UInt8
 
 MARKERS = ("DICT_4X4_250", "DICT_5X5_250", "DICT_6X6_250", "DICT_7X7_250", "DICT_ARUCO_ORIGINAL")
@@ -146,8 +146,7 @@ def _sighting(board: Board, frame: RgbdFrame, pixels: Float64) -> Sighting | Non
     _, turns, moves, errors = cv2.solvePnPGeneric(board.points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
     fits: list[tuple[float, Float64, float | None]] = []
     for turn, move, error in zip(turns, moves, np.ravel(errors), strict=True):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(move)
+        T = pose_at(np.ravel(move), cv2.Rodrigues(turn)[0])
         ratios = _depth_ratios(frame.depth, pixels, transform_points(T, board.points)[:, 2])
         bend = float(np.std(ratios)) if len(ratios) >= len(pixels) // 2 else 0.0
         middle = float(np.median(ratios)) if len(ratios) >= len(pixels) // 2 else None

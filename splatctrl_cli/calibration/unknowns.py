@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.records import Float64
 
 Index = NDArray[np.int64]
@@ -82,9 +82,7 @@ class Unknowns:
 
 def transform_of(twist: Float64) -> Float64:
     """T (4, 4) of a turn [rad] and a move [m] (6,)."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(np.asarray(twist[:3], np.float64))[0], twist[3:]
-    return T
+    return pose_at(twist[3:], cv2.Rodrigues(np.asarray(twist[:3], np.float64))[0])
 
 
 def twist_of(T: Float64) -> Float64:

@@ -13,7 +13,7 @@ from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.config.fixed import STATES_STILL
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import blocks_of, ranges
-from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_messages import STATE_TYPES, JointStream
@@ -218,9 +218,7 @@ def _explained(poses: Float64, logged: Float64) -> tuple[Float64, Spread]:
     """The constant X (4, 4) of logged = poses X, by the mean rotation and median position, and what remains."""
     relative = _inverse(poses) @ logged
     U, _, Vt = np.linalg.svd(relative[:, :3, :3].sum(axis=0))
-    X = np.eye(4)
-    X[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    X[:3, 3] = np.median(relative[:, :3, 3], axis=0)
+    X = pose_at(np.median(relative[:, :3, 3], axis=0), U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
     return X, _spread(poses @ X, logged)
 
 

@@ -9,7 +9,6 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
-from splatctrl_cli.control.qp import QpSolver
 from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController, VelocityMargin
 from splatctrl_cli.control.terms import RowKind
@@ -60,7 +59,6 @@ def open_loop(
     *,
     has_distance: Bool,
     scene_step_at: SceneStepAt | None = None,
-    solver: QpSolver | None = None,
     commander: Commander = OURS,
 ) -> OpenLoopTrace:
     """Ask the commander at every logged state, each in the field known at its stamp; nothing is integrated.
@@ -70,7 +68,7 @@ def open_loop(
     scene_step_at as in `closed_loop`.
     """
     field = field_at(int(motion.stamp_ns[0]))
-    controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
+    controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
     steps: list[ControlStep | None] = []
     margins: list[VelocityMargin | None] = []
     commanded = np.full(motion.velocity.shape, np.nan)

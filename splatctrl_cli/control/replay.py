@@ -21,7 +21,6 @@ from splatctrl_cli.control.preconditions import (
     sphere_clearance,
     static_violations,
 )
-from splatctrl_cli.control.qp import QpSolver
 from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
 from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController
 from splatctrl_cli.records import DistanceField, Float64, FloatRows, Stamps
@@ -161,7 +160,6 @@ def closed_loop(
     field_at: FieldAt,
     *,
     scene_step_at: SceneStepAt | None = None,
-    solver: QpSolver | None = None,
     plan_detour: PlanDetour | None = None,
     record: StepRecord | None = None,
     commander: Commander = OURS,
@@ -174,7 +172,7 @@ def closed_loop(
     start outside the limits or a goal out of reach, NotEvaluableError for a start in collision or outside the field.
     """
     field = field_at(task.stamp_ns)
-    q, controller = _ready(model, config, task, field, solver)
+    q, controller = _ready(model, config, task, field)
     statics = static_violations(model, field, q, scene_margin(model, config))
     course, last_velocity = _Course(model, config, task, plan_detour), np.zeros(len(q))
     kept: StepRecord = InMemory() if record is None else record
@@ -220,14 +218,14 @@ def closed_loop(
 
 
 def _ready(
-    model: ArmModel, config: ControlConfig, task: ReplayTask, field: DistanceField, solver: QpSolver | None
+    model: ArmModel, config: ControlConfig, task: ReplayTask, field: DistanceField
 ) -> tuple[Float64, QpIkController]:
     """The posture (J,) [rad] at the start and our controller. Raises as `closed_loop` does."""
     q = checked_posture(model, task.start, what="start")
     check_within_limits(model, q, config.limit_tolerance)
     for waypoint in (*task.via, Waypoint(T_world_goal=task.T_world_goal)):
         check_goal(model, waypoint.T_world_goal)
-    controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
+    controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
     check_free(model, field, q)
     return q, controller
 

@@ -19,7 +19,7 @@ from splatctrl_cli.datasets.dtu import DtuScan, DtuView, Shrink, check_lengths, 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
 from splatctrl_cli.files.image_file import write_pfm
-from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.records import MILLIMETRES, Float64, Intrinsics
 
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
@@ -129,10 +129,7 @@ def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
     K, R = cv2.decomposeProjectionMatrix(P if determinant > 0 else -P)[:2]
     signs = np.where(np.diag(K) < 0, -1.0, 1.0)  # K diag(signs), diag(signs) R: a camera with a positive focal length
     K, R = np.asarray(K, np.float64) * signs, signs[:, None] * np.asarray(R, np.float64)
-    T_world_camera = np.eye(4)
-    T_world_camera[:3, :3] = R.T
-    T_world_camera[:3, 3] = -np.linalg.solve(M, P[:, 3]) / MILLIMETRES
-    return K / K[2, 2], T_world_camera
+    return K / K[2, 2], pose_at(-np.linalg.solve(M, P[:, 3]) / MILLIMETRES, R.T)
 
 
 def _numbered(folder: Path, num: int) -> dict[int, Path]:

@@ -16,7 +16,7 @@ from splatctrl_cli.datasets.folder_description import CameraTable, Description, 
 from splatctrl_cli.datasets.layout import Layout, Lenses, described, images_of, paired_by_stamp
 from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_rows, stamp_of_text
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
@@ -78,10 +78,7 @@ def _poses(path: Path) -> dict[str, Float64]:
                 f"{where}: expected seconds, a rotation vector and a translation, got {' '.join(words)!r}",
                 remedy="copy the file again",
             )
-        T_camera_world = np.eye(4)
-        T_camera_world[:3, :3] = cv2.Rodrigues(np.array(values[1:4]))[0]
-        T_camera_world[:3, 3] = values[4:]
-        poses[words[0]] = invert_transform(T_camera_world)
+        poses[words[0]] = invert_transform(pose_at(values[4:], cv2.Rodrigues(np.array(values[1:4]))[0]))
     return poses
 
 

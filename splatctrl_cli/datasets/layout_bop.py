@@ -22,6 +22,7 @@ from splatctrl_cli.datasets.layout import (
     read_json,
 )
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import MILLIMETRE, Float64
 
@@ -106,10 +107,10 @@ def _pose(entry: dict[str, Any]) -> Float64 | None:
     """World to camera [m], None where the scene does not say."""
     if "cam_R_w2c" not in entry or "cam_t_w2c" not in entry:
         return None
-    T = np.eye(4)
-    T[:3, :3] = np.array(entry["cam_R_w2c"], dtype=np.float64).reshape(3, 3)
-    T[:3, 3] = np.array(entry["cam_t_w2c"], dtype=np.float64) * MILLIMETRE
-    return T
+    return pose_at(
+        np.array(entry["cam_t_w2c"], dtype=np.float64) * MILLIMETRE,
+        np.array(entry["cam_R_w2c"], dtype=np.float64).reshape(3, 3),
+    )
 
 
 _DOCS = """

@@ -12,7 +12,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import POSE_TOLERANCE_NS
 from splatctrl_cli.config.ranges import MAX_PLACE
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import invert_transform, quat_from_rotation, transform_from
+from splatctrl_cli.geometry import invert_transform, pose_at, quat_from_rotation, transform_from
 from splatctrl_cli.logs.tf_tree import TfTree
 from splatctrl_cli.records import Float64
 
@@ -51,10 +51,7 @@ def rigid(matrix: Float64, where: str) -> Float64:
     U, _, Vt = np.linalg.svd(matrix[:3, :3])
     if np.linalg.det(U @ Vt) < 0:
         raise InputError(f"{where}: expected a rotation, got a mirror image", remedy="check [poses] axes")
-    T = np.eye(4)
-    T[:3, :3] = U @ Vt
-    T[:3, 3] = matrix[:3, 3]
-    return T
+    return pose_at(matrix[:3, 3], U @ Vt)
 
 
 def read_matrix_blocks(path: Path, heading: str) -> dict[str, Float64]:

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_GOOD_OVERLAP, CLOUD_NO_OVERLAP
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
+from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.mesh_distance import TriangleMesh
 from splatctrl_cli.records import Bool, Float64
 
@@ -122,7 +123,7 @@ CLOUD_SCALES = {  # by the names of `CloudScore.figures`
 }
 
 
-def spaced(points: Float64, spacing: float, *, seed: int = 0) -> Float64:
+def spaced(points: Float64, spacing: float) -> Float64:
     """Of the points (P, 3), taken in random order, those farther than `spacing` [m] from all that were kept before.
 
     As DTU's evaluation thins (DTUeval-python, eval.py): where points scatter about a surface, every layer of them
@@ -133,7 +134,7 @@ def spaced(points: Float64, spacing: float, *, seed: int = 0) -> Float64:
     some = thinned(points, spacing / 2)
     if len(some) > MAX_SPACED:
         some = thinned(points, spacing)
-    some = some[np.random.default_rng(seed).permutation(len(some))]
+    some = some[np.random.default_rng(0).permutation(len(some))]
     low, high = (cKDTree(some).query_pairs(spacing, output_type="ndarray") if len(some) else NO_PAIRS).T
     is_open, kept = np.ones(len(some), np.bool_), np.zeros(len(some), np.bool_)
     while is_open.any():  # who waits for no earlier one stays, and all near those go: what taking them in turn leaves
@@ -167,17 +168,20 @@ def _check_spacing(spacing: float) -> None:
         raise UsageError(f"--cloud-spacing: expected a distance above 0 m, got {spacing:g}")
 
 
-def points_on(mesh: TriangleMesh, spacing: float, *, seed: int = 0) -> Float64:
+def points_on(mesh: TriangleMesh, spacing: float) -> Float64:
     """Random points (P, 3) [m] on a mesh, even by area: four for each square of `spacing` [m], 2 million at most."""
-    corners = mesh.corners
-    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    num = min(math.ceil(4 * 0.5 * doubled.sum() / spacing**2), MAX_POINTS)
-    rng = np.random.default_rng(seed)
+    num = min(math.ceil(4 * 0.5 * np.linalg.norm(face_normals(mesh.corners), axis=1).sum() / spacing**2), MAX_POINTS)
+    return drawn_on(mesh, num, np.random.default_rng(0))[0]
+
+
+def drawn_on(mesh: TriangleMesh, num: int, rng: np.random.Generator) -> tuple[Float64, NDArray[np.int64]]:
+    """Random points (num, 3) [m] on a mesh, even by area, and the triangle of each (num,)."""
+    corners, doubled = mesh.corners, np.linalg.norm(face_normals(mesh.corners), axis=1)
     face = rng.choice(len(corners), num, p=doubled / doubled.sum())
     u, v = rng.random((2, num))
     flip = u + v > 1
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    return np.asarray(np.einsum("nk,nka->na", np.stack([1 - u - v, u, v], axis=1), corners[face]))
+    return np.einsum("nk,nka->na", np.stack([1 - u - v, u, v], axis=1), corners[face]), face
 
 
 def _nearest(points: Float64, others: Float64, limit: float, threads: int) -> Float64:

@@ -191,9 +191,9 @@ def verdict_of(
     )
 
 
-def noted(criterion: str, sentence: str, *, remedy: str = "") -> Reason:
+def noted(criterion: str, sentence: str) -> Reason:
     """A `note` without a figure."""
-    return note(criterion=criterion, sentence=sentence, remedy=remedy)
+    return note(criterion=criterion, sentence=sentence)
 
 
 def _plain(reason: Reason) -> dict[str, Any]:

@@ -50,14 +50,14 @@ class Sight:
         return (self.moment.stamp_ns - self.frame.stamp_ns) * 1e-9
 
 
-def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int, apart_s: float = APART) -> list[int]:
-    """Indices of at most `num` states with least clearance (T,), the least first: each the least within `apart_s` on
+def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
+    """Indices of at most `num` states with least clearance (T,), the least first: each the least within `APART` on
     either side, so that the flank of an event is not another one. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
     beside = np.concatenate([[np.inf], values, [np.inf]])
     lowest = np.flatnonzero((values < beside[:-2]) & (values <= beside[2:]) & np.isfinite(values))
-    apart_ns = round(apart_s * 1e9)
+    apart_ns = round(APART * 1e9)
     chosen: list[int] = []
     for index in lowest[np.argsort(values[lowest], kind="stable")]:
         if len(chosen) == num:

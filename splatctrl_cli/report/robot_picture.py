@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.report.pictures import INK, SPHERE_EDGE, drawn_figure, save_figure
@@ -50,7 +51,7 @@ def _draw_shapes(view: Any, triangles: Float64, is_bare: Bool, plane: tuple[int,
     """Triangles painted from far to near, lit from the viewer."""
     order = np.argsort(triangles.mean(axis=1) @ viewer, kind="stable")
     seen = triangles[order]
-    normal = np.cross(seen[:, 1] - seen[:, 0], seen[:, 2] - seen[:, 0])
+    normal = face_normals(seen)
     light = 0.55 + 0.45 * np.abs(normal @ viewer) / np.linalg.norm(normal, axis=1)
     colors = np.where(is_bare[order, None], UNCOVERED, BODY) * light[:, None]
     view.add_collection(

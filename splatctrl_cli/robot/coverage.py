@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config.fixed import COVERED_EDGE, DEFICIT_GAP
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import invert_transform, transform_points
+from splatctrl_cli.geometry import face_normals, invert_transform, transform_points
 from splatctrl_cli.records import Bool, Float64, SphereSet
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance, read_solids
 from splatctrl_cli.robot.urdf import UrdfFile
@@ -210,8 +210,7 @@ def uncovered_area(
 
 def areas(triangles: Float64) -> Float64:
     """Area (F,) [m2]."""
-    edges = triangles[:, 1:] - triangles[:, :1]
-    return np.asarray(0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
+    return np.asarray(0.5 * np.linalg.norm(face_normals(triangles), axis=1))
 
 
 def refined(triangles: Float64, longest: float) -> tuple[Float64, Float64]:

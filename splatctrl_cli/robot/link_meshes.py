@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from splatctrl_cli.config.fixed import CYLINDER_SIDES, SPHERE_ROUNDS
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import transform_points
+from splatctrl_cli.geometry import face_normals, transform_points
 from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
@@ -176,7 +176,7 @@ def _hull(vertices: Float64) -> TriangleMesh | None:
         return None
     faces = hull.simplices.astype(np.int64)
     corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = face_normals(corners)
     is_inward = np.einsum("fa,fa->f", normal, hull.equations[:, :3]) < 0
     faces[is_inward] = faces[is_inward][:, ::-1]
     return TriangleMesh(vertices=vertices, faces=faces, is_closed=True)
@@ -220,7 +220,7 @@ def _ball(radius: float) -> tuple[Float64, NDArray[np.int64], float]:
         corners = np.concatenate(
             [np.stack(part, axis=1) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
         )
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = face_normals(corners)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     height = np.einsum("fa,fa->f", normal, corners[:, 0])  # of each face's plane above the centre
     vertices, inverse = np.unique(corners.reshape(-1, 3).round(12), axis=0, return_inverse=True)

@@ -23,7 +23,7 @@ from splatctrl_cli.config.fixed import (
     SELF_TOLD,
     SELF_TOUCHING,
 )
-from splatctrl_cli.geometry import invert_transform, transform_points
+from splatctrl_cli.geometry import face_normals, invert_transform, transform_points
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 from splatctrl_cli.robot.model import RobotModel
@@ -71,7 +71,7 @@ def depth_in(solid: Solid) -> Depth:
     the planes of its faces, which is the distance to its surface and takes a tenth of the time.
     """
     corners = solid.surface.corners
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = face_normals(corners)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     heights = np.einsum("fa,fa->f", normals, corners[:, 0])
     above = (solid.surface.vertices @ normals.T - heights).max()

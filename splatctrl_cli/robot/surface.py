@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.kernels.points import solid_distance
 from splatctrl_cli.kernels.surface_image import (
     BALL,
@@ -248,12 +248,8 @@ def _sizes(shape: Shape) -> tuple[float, float, float]:
 
 
 def _ball(link: str, center: Float64, radius: float) -> Shape:
-    T = np.eye(4)
-    T[:3, 3] = center
-    return Shape(link=link, kind="sphere", size=(float(radius),), T_link_shape=T)
+    return Shape(link=link, kind="sphere", size=(float(radius),), T_link_shape=pose_at(center))
 
 
 def _shifted(box: Box) -> Float64:
-    T = np.eye(4)
-    T[:3, 3] = (box.lower + box.upper) / 2
-    return T
+    return pose_at((box.lower + box.upper) / 2)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.geometry import look_at
+from splatctrl_cli.geometry import look_at, pose_at, turn_about_z
 from splatctrl_cli.records import Float64, Intrinsics
-from splatctrl_cli.simulate.primitives import Primitive, Texture
+from splatctrl_cli.simulate.primitives import Primitive, Texture, box, solid
 from splatctrl_cli.simulate.render import Camera
 from splatctrl_cli.simulate.tabletop import PALETTE
 
@@ -21,6 +21,7 @@ ENVIRONMENT_S = 12.0  # [s] of a recording in one, unless another is asked for
 BASE = 0.22  # [m] about the arm's axis that stays free
 GRASP = 0.06  # [m] at least between a tip and what is about it: half a hand
 BOARD = 0.02  # [m] a shelf's
+ALONG_X = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # of a tip, which points along z
 LOOK_AT = (0.45, 0.0, 0.25)
 EYES = (  # [m] beside the base and looking forward, to the sides, and before it: the first two see into a shelf
     (-0.30, 0.65, 0.95),
@@ -87,7 +88,8 @@ def _tabletop(rng: np.random.Generator) -> Environment:
         if rng.random() < 0.5:
             solids.append(box(f"box_{number}", tuple(size), center, drawn_texture(rng), rng.uniform(0, np.pi)))
         else:
-            solids.append(cylinder(f"cylinder_{number}", 0.5 * size[0], size[2], center, drawn_texture(rng)))
+            of = (0.5 * size[0], size[2])
+            solids.append(solid(f"cylinder_{number}", "cylinder", of, center, drawn_texture(rng)))
     places = []
     for _ in range(24):
         middle, extent, top = tables[int(rng.integers(len(tables)))]
@@ -105,8 +107,7 @@ def _shelf(rng: np.random.Generator, *, is_merged: bool) -> Environment:
     y, z = (np.concatenate([[0.0], np.cumsum(sizes)]) for sizes in (widths, heights))
     y -= 0.5 * y[-1]
     angle, yaw, near = rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3), rng.uniform(0.45, 0.60)
-    T = _turned(angle + yaw)
-    T[:3, 3] = [near * np.cos(angle), near * np.sin(angle), 0.5 * BOARD]
+    T = pose_at([near * np.cos(angle), near * np.sin(angle), 0.5 * BOARD], turn_about_z(angle + yaw))
     dividers = [("upright", n, row) for n in range(1, columns) for row in range(rows)]
     dividers += [("board", n, column) for n in range(1, rows) for column in range(columns)]
     missing = dividers[int(rng.integers(len(dividers)))] if is_merged else None
@@ -135,33 +136,16 @@ def _shelf(rng: np.random.Generator, *, is_merged: bool) -> Environment:
     for row in range(rows):
         for column in range(columns):
             for inside in (0.25, 0.6):
-                tip = _forward(rng.uniform(-np.pi, np.pi))
-                tip[:3, 3] = [inside * depth, y[column : column + 2].mean(), z[row : row + 2].mean()]
-                places.append(T @ tip)
+                forward = ALONG_X @ turn_about_z(rng.uniform(-np.pi, np.pi))
+                middle = [inside * depth, y[column : column + 2].mean(), z[row : row + 2].mean()]
+                places.append(T @ pose_at(middle, forward))
     order = rng.permutation(len(places))
     return Environment(primitives=tuple(solids), places=tuple(places[k] for k in order))
 
 
 def tip_down(position: Sequence[float], yaw: float) -> Float64:
     """A tip that points down."""
-    T = _turned(yaw)
-    T[:3, :3] = T[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-    T[:3, 3] = position
-    return T
-
-
-def _forward(roll: float) -> Float64:
-    """A tip that points along x."""
-    T = np.eye(4)
-    T[:3, :3] = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]) @ _turned(roll)[:3, :3]
-    return T
-
-
-def _turned(yaw: float) -> Float64:
-    T = np.eye(4)
-    c, s = np.cos(yaw), np.sin(yaw)
-    T[:2, :2] = [[c, -s], [s, c]]
-    return T
+    return pose_at(position, turn_about_z(yaw) @ np.diag([1.0, -1.0, -1.0]))
 
 
 def drawn_texture(rng: np.random.Generator) -> Texture:
@@ -171,15 +155,3 @@ def drawn_texture(rng: np.random.Generator) -> Texture:
     return Texture(
         pattern=pattern, feature=rng.uniform(0.05, 0.10), dark=dark, bright=bright, seed=int(rng.integers(100))
     )
-
-
-def box(name: str, size: tuple[float, ...], middle: Sequence[float], texture: Texture, yaw: float = 0.0) -> Primitive:
-    T = _turned(yaw)
-    T[:3, 3] = middle
-    return Primitive(name=name, kind="box", size=size, T_world_shape=T, texture=texture)
-
-
-def cylinder(name: str, radius: float, height: float, middle: Sequence[float], texture: Texture) -> Primitive:
-    T = np.eye(4)
-    T[:3, 3] = middle
-    return Primitive(name=name, kind="cylinder", size=(radius, height), T_world_shape=T, texture=texture)

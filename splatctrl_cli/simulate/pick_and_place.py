@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from splatctrl_cli.records import Box, Float64
-from splatctrl_cli.simulate.environments import BASE, box, cylinder, drawn_texture, ring_of_cameras, tip_down
-from splatctrl_cli.simulate.primitives import Primitive, Texture
+from splatctrl_cli.simulate.environments import BASE, drawn_texture, ring_of_cameras, tip_down
+from splatctrl_cli.simulate.primitives import Primitive, Texture, box, solid
 from splatctrl_cli.simulate.render import Camera
 from splatctrl_cli.simulate.tabletop import PALETTE, cameras
 
@@ -51,7 +51,7 @@ def drawn_scene(layout: str, number: int, attempt: int) -> PickAndPlace:
     taken = [(np.zeros(2), BASE), (pick, FREE), (bowl, FREE)]
     things = [
         box("table", (1.5, 1.5, 0.05), (0.4, 0.0, -0.025), drawn_texture(rng)),
-        cylinder("bowl", BOWL_RADIUS, rim, (*bowl, 0.5 * rim), drawn_texture(rng)),
+        solid("bowl", "cylinder", (BOWL_RADIUS, rim), (*bowl, 0.5 * rim), drawn_texture(rng)),
         *([box("block", (0.09, 0.09, base), (*pick, 0.5 * base), drawn_texture(rng), yaw)] if base > 0 else []),
         *_things(layout, HEIGHTS[number % len(HEIGHTS)], taken, rng),
     ]
@@ -114,11 +114,9 @@ def _thing(
     if kind == "box":
         yield box(name, (width, depth, height), middle, texture, rng.uniform(0, np.pi))
     elif kind == "cylinder":
-        yield cylinder(name, 0.5 * width, height, middle, texture)
+        yield solid(name, "cylinder", (0.5 * width, height), middle, texture)
     else:
-        T = np.eye(4)
-        T[:3, 3] = middle
-        yield Primitive(name=name, kind="sphere", size=(0.5 * height,), T_world_shape=T, texture=texture)
+        yield solid(name, "sphere", (0.5 * height,), middle, texture)
 
 
 def _stack(name: str, heights: tuple[float, float], taken: Taken, rng: np.random.Generator) -> Iterator[Primitive]:

@@ -4,13 +4,14 @@ A primitive's own frame has its origin in its middle; a cylinder or capsule stan
 are solid, with features of a few centimetres, smooth enough for a few thousand splats.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import interpolate_transform, invert_transform, transform_points
+from splatctrl_cli.geometry import interpolate_transform, invert_transform, pose_at, transform_points, turn_about_z
 from splatctrl_cli.records import Float64
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
@@ -143,6 +144,19 @@ class Primitive:
         if self.kind == "capsule":
             return self.size[0] + self.size[1] / 2
         return float(np.hypot(self.size[0], self.size[1] / 2)) if self.kind == "cylinder" else self.size[0]
+
+
+def solid(
+    name: str, kind: str, size: tuple[float, ...], middle: Sequence[float], texture: Texture, yaw: float | None = None
+) -> Primitive:
+    """Upright, or turned by yaw [rad] about z."""
+    T_world_shape = pose_at(middle, None if yaw is None else turn_about_z(yaw))
+    return Primitive(name=name, kind=kind, size=size, T_world_shape=T_world_shape, texture=texture)
+
+
+def box(name: str, size: tuple[float, ...], middle: Sequence[float], texture: Texture, yaw: float = 0.0) -> Primitive:
+    """Turned by yaw [rad] about z."""
+    return solid(name, "box", size, middle, texture, yaw)
 
 
 def closest_point(primitive: Primitive, points_world: Float64) -> tuple[Float64, Float64]:

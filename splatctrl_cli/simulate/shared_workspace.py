@@ -5,16 +5,16 @@ arm's pickup or its goal, and leaves. The person leans on the table's far edge; 
 with the elbow out and down, the hand a third capsule. The cubes stay where they are. World frame as in `tabletop`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from splatctrl_cli.geometry import frame_along, pose_at
 from splatctrl_cli.records import Float64
 from splatctrl_cli.simulate.arm import Motion
-from splatctrl_cli.simulate.primitives import Primitive, Texture, Track
-from splatctrl_cli.simulate.tabletop import PALETTE
+from splatctrl_cli.simulate.primitives import Primitive, Track, box, solid
+from splatctrl_cli.simulate.tabletop import texture
 
 PLACES = ("near-pickup", "near-goal")
 
@@ -89,24 +89,21 @@ def things(place: str, seed: int) -> list[Primitive]:
     rng = np.random.default_rng([seed, PLACES.index(place), 1])
     pile = visit_of(place, seed).pile
     cubes = [
-        _box(
+        box(
             f"cube.{level}",
             (CUBE, CUBE, CUBE),
             (*(pile + rng.uniform(-0.008, 0.008, 2)), CUBE * (level + 0.5)),
-            _texture("checks", 0.05, ("brick", "sand", "moss")[level], level),
+            texture("checks", 0.05, ("brick", "sand", "moss")[level], level),
             yaw=float(rng.uniform(0.0, np.pi / 2)),
         )
         for level in range(3)
     ]
     return [
         *cubes,
-        _box("parcel", (0.20, 0.14, 0.06), (0.62, 0.0, 0.03), _texture("noise", 0.055, "ocean", 5), yaw=0.3),
-        _box("block", (0.07, 0.07, 0.05), (0.48, 0.34, 0.025), _texture("stripes", 0.05, "sand", 1)),
-        Primitive(
-            name="bowl", kind="cylinder", size=(0.07, 0.05), T_world_shape=_placed((0.48, -0.34, 0.025)),
-            texture=_texture("stripes", 0.05, "grape", 2),
-        ),
-        _box("book", (0.16, 0.22, 0.04), (0.30, -0.55, 0.02), _texture("noise", 0.05, "moss", 6), yaw=-0.4),
+        box("parcel", (0.20, 0.14, 0.06), (0.62, 0.0, 0.03), texture("noise", 0.055, "ocean", 5), yaw=0.3),
+        box("block", (0.07, 0.07, 0.05), (0.48, 0.34, 0.025), texture("stripes", 0.05, "sand", 1)),
+        solid("bowl", "cylinder", (0.07, 0.05), (0.48, -0.34, 0.025), texture("stripes", 0.05, "grape", 2), 0.0),
+        box("book", (0.16, 0.22, 0.04), (0.30, -0.55, 0.02), texture("noise", 0.05, "moss", 6), yaw=-0.4),
     ]  # fmt: skip
 
 
@@ -126,7 +123,7 @@ def human_arm(visit: Visit, start_ns: int) -> list[Primitive]:
                 kind="capsule",
                 size=size,
                 T_world_shape=poses[0],
-                texture=_texture("noise", 0.05, "brick" if index == 2 else "grape", 9),
+                texture=texture("noise", 0.05, "brick" if index == 2 else "grape", 9),
                 from_ns=int(stamps[0]),
                 to_ns=int(stamps[-1]),
                 track=Track(stamp_ns=stamps, T_world_shape=poses),
@@ -180,28 +177,4 @@ def _over(place: Float64, height: float) -> Float64:
 
 def _along(start: Float64, end: Float64) -> Float64:
     """The pose (4, 4) of a capsule whose axis goes from start to end (3,)."""
-    z = (end - start) / np.linalg.norm(end - start)
-    x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [1.0, 0.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    T[:3, 3] = (start + end) / 2
-    return T
-
-
-def _placed(position: Sequence[float], yaw: float = 0.0) -> Float64:
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T[:3, 3] = position
-    return T
-
-
-def _box(
-    name: str, size: tuple[float, float, float], position: Sequence[float], texture: Texture, yaw: float = 0.0
-) -> Primitive:
-    return Primitive(name=name, kind="box", size=size, T_world_shape=_placed(position, yaw), texture=texture)
-
-
-def _texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:
-    dark, bright = PALETTE[palette]
-    return Texture(pattern=pattern, feature=feature, dark=dark, bright=bright, seed=seed)
+    return pose_at((start + end) / 2, frame_along(end - start))

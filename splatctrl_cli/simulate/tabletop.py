@@ -5,6 +5,8 @@ things from a turntable are in the manner of a DTU scan.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,7 +15,7 @@ from splatctrl_cli.records import Bool, Float64, Intrinsics, RgbdFrame
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.simulate.arm import Motion
-from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture
+from splatctrl_cli.simulate.primitives import Primitive, Texture, box, solid
 from splatctrl_cli.simulate.render import Camera, Meshes, Renderer
 
 PALETTE = {
@@ -43,46 +45,46 @@ MIDDLE = (0.60, 0.02, 0.06)  # [m] the middle of the things
 def furniture() -> list[Primitive]:
     """Table, floor and three walls; they stand for the room and are obstacles like any other."""
     return [
-        _box("table", (1.70, 1.80, 0.05), (0.30, 0.0, -0.025), _texture("noise", 0.10, "wood", 1)),
-        _box("floor", (4.0, 4.0, 0.05), (0.4, 0.0, -0.725), _texture("noise", 0.15, "slate", 2)),
-        _box("wall_back", (0.05, 4.0, 2.2), (-0.80, 0.0, 0.40), _texture("noise", 0.13, "moss", 3)),
-        _box("wall_left", (4.0, 0.05, 2.2), (1.2, 1.30, 0.40), _texture("noise", 0.13, "brick", 4)),
-        _box("wall_right", (4.0, 0.05, 2.2), (1.2, -1.30, 0.40), _texture("noise", 0.13, "ocean", 7)),
+        box("table", (1.70, 1.80, 0.05), (0.30, 0.0, -0.025), texture("noise", 0.10, "wood", 1)),
+        box("floor", (4.0, 4.0, 0.05), (0.4, 0.0, -0.725), texture("noise", 0.15, "slate", 2)),
+        box("wall_back", (0.05, 4.0, 2.2), (-0.80, 0.0, 0.40), texture("noise", 0.13, "moss", 3)),
+        box("wall_left", (4.0, 0.05, 2.2), (1.2, 1.30, 0.40), texture("noise", 0.13, "brick", 4)),
+        box("wall_right", (4.0, 0.05, 2.2), (1.2, -1.30, 0.40), texture("noise", 0.13, "ocean", 7)),
     ]
 
 
 def things() -> list[Primitive]:
     """What stands on the table from beginning to end."""
     return [
-        _box("crate", (0.14, 0.18, 0.20), (0.655, 0.315, 0.10), _texture("stripes", 0.06, "ocean", 0), 20.0),
-        _box("parcel", (0.22, 0.14, 0.10), (0.66, -0.02, 0.05), _texture("noise", 0.055, "brick", 5), -15.0),
-        _cylinder("canister", 0.055, 0.19, (0.585, -0.285, 0.095), _texture("stripes", 0.055, "moss", 1)),
-        _cylinder("tin", 0.050, 0.14, (0.78, -0.24, 0.07), _texture("checks", 0.06, "grape", 0)),
-        _sphere("ball", 0.075, (0.36, 0.40, 0.075), _texture("noise", 0.05, "sand", 6)),
+        box(
+            "crate", (0.14, 0.18, 0.20), (0.655, 0.315, 0.10), texture("stripes", 0.06, "ocean", 0), np.deg2rad(20.0)
+        ),
+        box(
+            "parcel", (0.22, 0.14, 0.10), (0.66, -0.02, 0.05), texture("noise", 0.055, "brick", 5), np.deg2rad(-15.0)
+        ),
+        solid(
+            "canister", "cylinder", (0.055, 0.19), (0.585, -0.285, 0.095), texture("stripes", 0.055, "moss", 1), 0.0
+        ),
+        solid("tin", "cylinder", (0.050, 0.14), (0.78, -0.24, 0.07), texture("checks", 0.06, "grape", 0), 0.0),
+        solid("ball", "sphere", (0.075,), (0.36, 0.40, 0.075), texture("noise", 0.05, "sand", 6), 0.0),
     ]
 
 
 def visitor(from_ns: int, to_ns: int, place: Sequence[float] = VISITOR) -> Primitive:
     """The obstacle that is there for a while only; place: x, y and radius [m]."""
     x, y, radius = place
-    texture = _texture("stripes", 0.06, "grape", 2)
-    return _cylinder("visitor", radius, 0.30, (x, y, 0.15), texture, from_ns=from_ns, to_ns=to_ns)
+    stands = solid("visitor", "cylinder", (radius, 0.30), (x, y, 0.15), texture("stripes", 0.06, "grape", 2), 0.0)
+    return replace(stands, from_ns=from_ns, to_ns=to_ns)
 
 
 def person(from_ns: int, to_ns: int, num_steps: int) -> list[Primitive]:
     """Who walks along the table's near side instead of the visitor: a place for each of the steps."""
     stamps = [from_ns + (to_ns - from_ns) * step // num_steps for step in range(num_steps + 1)]
+    grape = texture("noise", 0.05, "grape", 2)
+    places = [(0.75 - 0.40 * step / max(num_steps - 1, 1), -0.50, 0.20) for step in range(num_steps)]
     return [
-        _cylinder(
-            f"person.{step:03d}",
-            0.06,
-            0.40,
-            (0.75 - 0.40 * step / max(num_steps - 1, 1), -0.50, 0.20),
-            _texture("noise", 0.05, "grape", 2),
-            from_ns=stamps[step],
-            to_ns=stamps[step + 1],
-        )
-        for step in range(num_steps)
+        replace(solid(f"person.{step:03d}", "cylinder", (0.06, 0.40), place, grape, 0.0), from_ns=start, to_ns=end)
+        for step, (place, (start, end)) in enumerate(zip(places, pairwise(stamps), strict=True))
     ]
 
 
@@ -141,54 +143,13 @@ def arm_meshes(surface: RobotSurface) -> Meshes:
 
 
 def _link_texture(link: str) -> Texture:
-    return _texture("noise", 0.05, ("shell", "ocean")[sum(link.encode()) % 2], 20)
+    return texture("noise", 0.05, ("shell", "ocean")[sum(link.encode()) % 2], 20)
 
 
-def _texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:
+def texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:
+    """In two colours of the `PALETTE`."""
     dark, bright = PALETTE[palette]
     return Texture(pattern=pattern, feature=feature, dark=dark, bright=bright, seed=seed)
-
-
-def _placed(position: Sequence[float], yaw_deg: float = 0.0) -> Float64:
-    T = np.eye(4)
-    c, s = np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg))
-    T[:2, :2] = [[c, -s], [s, c]]
-    T[:3, 3] = position
-    return T
-
-
-def _box(
-    name: str,
-    size: tuple[float, float, float],
-    position: Sequence[float],
-    texture: Texture,
-    yaw_deg: float = 0.0,
-) -> Primitive:
-    return Primitive(name=name, kind="box", size=size, T_world_shape=_placed(position, yaw_deg), texture=texture)
-
-
-def _cylinder(
-    name: str,
-    radius: float,
-    height: float,
-    position: Sequence[float],
-    texture: Texture,
-    from_ns: int = ALWAYS[0],
-    to_ns: int = ALWAYS[1],
-) -> Primitive:
-    return Primitive(
-        name=name,
-        kind="cylinder",
-        size=(radius, height),
-        T_world_shape=_placed(position),
-        texture=texture,
-        from_ns=from_ns,
-        to_ns=to_ns,
-    )
-
-
-def _sphere(name: str, radius: float, position: Sequence[float], texture: Texture) -> Primitive:
-    return Primitive(name=name, kind="sphere", size=(radius,), T_world_shape=_placed(position), texture=texture)
 
 
 def turntable_views() -> Iterator[RgbdFrame]:

@@ -14,6 +14,7 @@ from splatctrl_cli.checks.check_times import file_findings
 from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Severity
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_logs
@@ -293,8 +294,7 @@ def test_a_good_log_has_no_finding_above_a_note(tmp_path: Path, encoding: str) -
 @pytest.mark.parametrize("offset_m", [0.0, 0.4])
 def test_the_simulated_arm_is_where_the_joints_say_or_it_is_a_warning(sample_data: Path, offset_m: float) -> None:
     tabletop = sample_data / "tabletop"
-    T = np.eye(4)
-    T[1, 3] = offset_m
+    T = pose_at([0.0, offset_m, 0.0])
     model = RobotModel.from_urdf(tabletop / "robot.urdf", tabletop / "robot_spheres.yaml", T_world_base=T)
     report = check_log(open_raw_log(tabletop / "log.mcap"), SourceOptions(), model=model, num_images=12)
     arms = [finding for finding in report.findings if finding.code == "arm"]

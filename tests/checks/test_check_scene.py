@@ -17,6 +17,7 @@ from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import Finding, Severity
 from splatctrl_cli.checks.judge_evidence import exposure_findings, usable_frames
 from splatctrl_cli.containers.log_formats import open_raw_log
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.survey import survey
@@ -141,8 +142,7 @@ def test_brightness_that_changes_slowly_over_an_image_is_gloss_and_no_flicker(ta
 def test_a_flat_wall_says_nothing_of_its_scale(table: Table) -> None:
     walls = []
     for index in range(4):
-        T = np.eye(4)
-        T[0, 3] = 0.3 * index
+        T = pose_at([0.3 * index, 0.0, 0.0])
         frame = table.frames[index]
         walls.append(replace(frame, depth=np.full_like(frame.depth, 1.2), T_world_camera=T, camera=f"cam{index % 2}"))
     assert table.views(walls).findings == []

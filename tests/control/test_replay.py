@@ -13,6 +13,7 @@ from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.goals import Detour
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop, num_on_rung
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.path import timed
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
@@ -92,8 +93,7 @@ def test_the_seven_joint_arm_passes_a_sphere_and_keeps_its_distance(sample_data:
 
 
 def test_a_goal_out_of_reach_is_refused() -> None:
-    far = np.eye(4)
-    far[:3, 3] = [2.0, 0, 0]
+    far = pose_at([2.0, 0, 0])
     with pytest.raises(InputError, match=r"goal: expected within 0.900 m of the base, got \(2.000, 0.000, 0.000\)"):
         closed_loop(PlanarArm(), CONFIG, task(T_world_goal=far), lambda _: NOTHING_NEAR)
     with pytest.raises(InputError, match="finite pose"):

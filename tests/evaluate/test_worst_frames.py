@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.evaluate.worst_frames import WORST, Moment, Sight, draw_sight, sights_of, worst_moments
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 from tests.plain import plain_frame
 
@@ -27,8 +28,7 @@ MOMENT = Moment(
 
 def frame(stamp_ns: int, camera: str = "near", *, away: float = 1.0, depth: float = 0.0, x: float = 0.0) -> RgbdFrame:
     """A camera that looks along world z from `away` before the origin; a grey image of its stamp in tenths."""
-    T = np.eye(4)
-    T[:3, 3] = [x, 0.0, -away]
+    T = pose_at([x, 0.0, -away])
     return plain_frame(depth, LENS, T, stamp_ns=stamp_ns, camera=camera, color=stamp_ns * 10 // SECOND)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.files.output import part_digests, write_json
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.grid_files.npz_grid import write_npz
 from splatctrl_cli.records import Box, Float64, JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
@@ -165,8 +166,7 @@ class Stage:
 
 
 def sphere(name: str, center: tuple[float, float, float], radius: float) -> Primitive:
-    T = np.eye(4)
-    T[:3, 3] = center
+    T = pose_at(center)
     texture = Texture(pattern="noise", feature=0.1, dark=(0.0, 0.0, 0.0), bright=(1.0, 1.0, 1.0))
     return Primitive(name=name, kind="sphere", size=(radius,), T_world_shape=T, texture=texture)
 

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.calibration import SetUp, write_log
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.geometry import back_project, invert_transform, look_at, transform_points
+from splatctrl_cli.geometry import back_project, invert_transform, look_at, pose_at, transform_points
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Bool, Float64, RgbdFrame
@@ -53,8 +53,7 @@ class Round(Partial):
     def _scene(self, seed: int, options: RecordingOptions) -> Scene:
         scene = super()._scene(seed, options)
         source = next(p for p in tabletop.things() if p.kind == self.thing)
-        T = np.eye(4)
-        T[:3, 3] = [*MIDDLE, source.T_world_shape[2, 3]]
+        T = pose_at([*MIDDLE, source.T_world_shape[2, 3]])
         alone: tuple[Primitive, ...] = (scene.primitives[0], replace(source, T_world_shape=T), scene.primitives[-1])
         return replace(scene, primitives=alone)
 

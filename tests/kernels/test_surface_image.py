@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.kernels.surface_image import (
     BALL,
     BOX,
@@ -33,9 +33,8 @@ def random_solids(rng: np.random.Generator) -> list[tuple[str, tuple[float, ...]
     solids = []
     for kind, count in {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}.items():
         for _ in range(3):
-            T = np.eye(4)
-            T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
-            T[:3, 3] = rng.uniform([-0.3, -0.2, 0.6], [0.3, 0.2, 1.2])
+            R = Rotation.random(random_state=rng).as_matrix()
+            T = pose_at(rng.uniform([-0.3, -0.2, 0.6], [0.3, 0.2, 1.2]), R)
             solids.append((kind, tuple(rng.uniform(0.03, 0.12, count)), T))
     return solids
 
@@ -107,8 +106,7 @@ def test_depth_link_and_inside_are_those_of_one_ray_at_a_time(seed: int) -> None
 
 def test_triangles_show_what_their_solid_shows_and_hold_the_same_points() -> None:
     center, radius = np.array([0.05, -0.02, 0.9]), 0.15
-    T = np.eye(4)
-    T[:3, 3] = center
+    T = pose_at(center)
     measured = np.random.default_rng(0).uniform(0.6, 1.2, (int(K[5]), int(K[4]))).astype(np.float32)
     ball = rendered(scene_of([("sphere", (radius,), T)]), measured)
     faces = rendered(scene_of([], ball_faces(center, radius)), measured)

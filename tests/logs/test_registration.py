@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.logs.registration import DepthToColor, Undistortion
 from splatctrl_cli.records import Intrinsics
 
@@ -12,9 +13,7 @@ LARGE = Intrinsics(fx=64, fy=64, cx=31.5, cy=23.5, width=64, height=48)
 
 
 def shift(x: float = 0.0, z: float = 0.0) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    T = np.eye(4)
-    T[:3, 3] = [x, 0, z]
-    return T
+    return pose_at([x, 0, z])
 
 
 def test_the_same_camera_gives_the_same_depth() -> None:

@@ -8,6 +8,7 @@ import pytest
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import ReplayTask, is_at_goal
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.studies.problems import simulated_arm
 from splatctrl_cli.planner.birrt import plan
 from splatctrl_cli.planner.configuration_clearance import Clearance
@@ -54,8 +55,7 @@ def test_goal_postures_bring_the_frame_to_the_pose_and_keep_the_limits() -> None
 
 
 def test_a_pose_out_of_reach_has_no_posture() -> None:
-    T = np.eye(4)
-    T[0, 3] = 1.5
+    T = pose_at([1.5, 0.0, 0.0])
     assert goal_postures(ARM, "tip", T, np.array([[0.1, 0.2], [1.0, 1.0]]), CONFIG, at_most=5).shape == (0, 2)
     far = replace(task(), T_world_goal=T)
     found = planned_path(ARM, one_wall(), far, PLANNER, CONFIG)

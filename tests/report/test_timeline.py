@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Label
 from splatctrl_cli.report.space import Space, SplatsAt, bodies_of, coarsened, packed, three_js
@@ -85,8 +86,7 @@ def test_the_legend_has_the_least_value_of_each_measure() -> None:
 def test_a_primitive_is_drawn_in_its_place_and_size(
     kind: str, size: tuple[float, ...], extents: tuple[float, ...]
 ) -> None:
-    T = np.eye(4)
-    T[:3, 3] = [1.0, 2.0, 3.0]
+    T = pose_at([1.0, 2.0, 3.0])
     surface = RobotSurface.from_parts([Shape(link="hand", kind=kind, size=size, T_link_shape=T)])
     vertices = bodies_of(surface)["hand"].vertices
     lower, upper = vertices.min(axis=0), vertices.max(axis=0)

@@ -14,6 +14,7 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import LEAST_OVERLAP
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop, num_on_rung
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.solid_scene import Solids
@@ -59,10 +60,7 @@ def turned(rng: np.random.Generator) -> Float64:
 
 
 def at(shift: ArrayLike, rotation: Float64 | None = None) -> Float64:
-    T = np.eye(4)
-    T[:3, 3] = shift
-    T[:3, :3] = np.eye(3) if rotation is None else rotation
-    return T
+    return pose_at(shift, np.eye(3) if rotation is None else rotation)
 
 
 def test_boxes_are_as_far_apart_as_their_faces_edges_and_corners(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from pinocchio.rpy import rpyToMatrix
 
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
 from tests.robot.shapes import arm_of, l_shape, written
@@ -58,9 +59,7 @@ def test_extents_are_those_of_the_same_shape_as_triangles(tmp_path: Path, kind: 
         shape.export(tmp_path / "ell.stl")
     model = RobotModel.from_urdf(written(tmp_path, arm_of(text, BALL, origin=TURNED)), SPHERES)
     assert model.surface.by_spheres == ()
-    T = np.eye(4)
-    T[:3, :3] = rpyToMatrix(0.4, 0.7, -0.5)
-    T[:3, 3] = 0.1, 0.2, 0.3
+    T = pose_at([0.1, 0.2, 0.3], rpyToMatrix(0.4, 0.7, -0.5))
     found = model.extents()["base"]
     np.testing.assert_allclose(found[:6], shape.apply_transform(T).bounds.ravel(), atol=2e-4)
     parts = 0.2 * np.pi * 0.3 if kind == "capsule" else 0.0  # it is a cylinder and two balls, whole

@@ -8,6 +8,7 @@ import pytest
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.config.fixed import SEED_ASKED_VIEWS
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Label, PointCloud, SplatSet, spread
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter
 from splatctrl_cli.scene.fitter import SceneFitter
@@ -36,8 +37,7 @@ def on_top(splats: SplatSet) -> int:
 
 
 def posture(x: float) -> RobotPosture:
-    T = np.eye(4)
-    T[0, 3] = x
+    T = pose_at([x, 0.0, 0.0])
     return RobotPosture(centers=np.array([[x, 0.0, 0.2]]), radii=np.array([0.12]), T_world_link=T[None])
 
 

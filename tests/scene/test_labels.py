@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.geometry import back_project, transform_points
+from splatctrl_cli.geometry import back_project, pose_at, transform_points
 from splatctrl_cli.records import Label, RgbdFrame, SplatSet, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
@@ -198,8 +198,7 @@ def test_a_person_who_walks_leaves_no_trail() -> None:
 
 def ball(z: float, radius: float = 0.1) -> RobotPosture:
     """A robot that is one ball of collision geometry, above the middle of the floor."""
-    T = np.eye(4)
-    T[2, 3] = z
+    T = pose_at([0.0, 0.0, z])
     surface = RobotSurface.from_parts([Shape(link="arm", kind="sphere", size=(radius,), T_link_shape=np.eye(4))])
     return RobotPosture(
         centers=np.array([[0.0, 0.0, z]]),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config.fixed import PAIR_LIMIT
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.scene.recording_consistency import Agreement, agreements, differences, largest_jump
 from tests.scene.wall import frame
@@ -63,9 +64,7 @@ def test_neither_the_order_of_views_nor_a_common_motion_matters() -> None:
     a, b = views(z=0.05)
     (want,) = agreements([a, b], *RANGE)
     assert agreements([b, a], *RANGE) == [want]
-    turn = np.eye(4)
-    turn[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    turn[:3, 3] = [1.0, -2.0, 0.5]
+    turn = pose_at([1.0, -2.0, 0.5], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     (got,) = agreements([replace(v, T_world_camera=turn @ v.T_world_camera) for v in (a, b)], *RANGE)
     assert got.median == pytest.approx(want.median, abs=1e-6)
 
@@ -81,9 +80,7 @@ def test_depth_that_is_missing_or_out_of_range_is_not_compared() -> None:
 def poses(*xs: float, period_ns: int = 100_000_000, camera: str = "a") -> list[tuple[int, str, Float64]]:
     found = []
     for k, x in enumerate(xs):
-        T = np.eye(4)
-        T[0, 3] = x
-        found.append((k * period_ns, camera, T))
+        found.append((k * period_ns, camera, pose_at([x, 0.0, 0.0])))
     return found
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, RgbdFrame
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
@@ -34,8 +35,7 @@ def frame(depth: Float64) -> RgbdFrame:
 
 def robot(*, by_spheres: bool = False, extra: float = 0.0) -> RobotPosture:
     """A ball as collision geometry, or as the collision sphere of a robot without."""
-    T = np.eye(4)
-    T[:3, 3] = CENTER
+    T = pose_at(CENTER)
     surface = RobotSurface.from_parts([Shape(link="arm", kind="sphere", size=(RADIUS,), T_link_shape=T)])
     return RobotPosture(
         centers=CENTER[None],

@@ -7,6 +7,7 @@ import pytest
 
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.simulated_arm import adapted_motion
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.link_meshes import read_solids
@@ -25,8 +26,7 @@ TEXTURE = Texture(pattern="noise", feature=0.05, dark=(0.1, 0.2, 0.3), bright=(0
 
 def test_a_mesh_is_seen_as_the_solid_of_the_same_shape(tmp_path: Path) -> None:
     camera = tabletop.cameras(160, 120)[0]
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]], [0.4, 0.0, 0.2]
+    T = pose_at([0.4, 0.0, 0.2], [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
     size = (0.2, 0.3, 0.25)
     box = Primitive(name="box", kind="box", size=size, T_world_shape=T, texture=TEXTURE)
     urdf = written(tmp_path, arm_of(f'<box size="{size[0]} {size[1]} {size[2]}"/>', '<sphere radius="0.1"/>'))
@@ -54,8 +54,7 @@ def test_faces_beyond_what_16_bits_number_are_seen_too(monkeypatch: pytest.Monke
     urdf = written(tmp_path, arm_of('<sphere radius="0.2"/>', '<sphere radius="0.1"/>'))
     (ball,) = read_solids(read_urdf(urdf))["base"]
     triangles = ball.surface.corners
-    T = np.eye(4)
-    T[:3, 3] = [0.4, 0.0, 0.2]
+    T = pose_at([0.4, 0.0, 0.2])
     mesh = Meshes(
         links=("base",),
         triangles=triangles,

@@ -11,6 +11,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64, JointState, RecordSource, RgbdFrame
 from splatctrl_cli.states.state_source import open_states
@@ -196,10 +197,7 @@ def pose_columns(T: Float64) -> Float64:
 
 
 def some_pose() -> Float64:
-    T = np.eye(4)
-    T[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    T[:3, 3] = [0.4, -0.1, 0.6]
-    return T
+    return pose_at([0.4, -0.1, 0.6], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 
 def franka_1(store: Any, q: Float64) -> list[Message]:

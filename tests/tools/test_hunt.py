@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import Capsule, Motion
@@ -41,9 +42,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
 
 
 def ball(place: np.ndarray, radius: float = 0.05, name: str = "target") -> Primitive:
-    T = np.eye(4)
-    T[:3, 3] = place
-    return Primitive(name=name, kind="sphere", size=(radius,), T_world_shape=T, texture=GREY)
+    return Primitive(name=name, kind="sphere", size=(radius,), T_world_shape=pose_at(place), texture=GREY)
 
 
 def world_of(target: Primitive, motion: Motion | None = None) -> World:
@@ -96,9 +95,10 @@ def test_the_clearance_is_no_more_than_that_of_any_point_of_the_surface(model: R
     world_points = points @ hand[:3, :3].T + hand[:3, 3]
     for _ in range(6):
         T = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-        pose = np.eye(4)
-        pose[:3, :3] = T * np.sign(np.linalg.det(T))
-        pose[:3, 3] = hand[:3, 3] + hand[:3, :3] @ [*rng.uniform(0.05, 0.2, 1), *rng.uniform(-0.2, 0.2, 1), 0.033]
+        pose = pose_at(
+            hand[:3, 3] + hand[:3, :3] @ [*rng.uniform(0.05, 0.2, 1), *rng.uniform(-0.2, 0.2, 1), 0.033],
+            T * np.sign(np.linalg.det(T)),
+        )
         solid = replace(ball(np.zeros(3)), kind=kind, size=size, T_world_shape=pose)
         found = arm.clearances([solid], np.array([at_s(0)]), START[None])[0]
         sampled = float(signed_distance(solid, world_points).min())

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
+from splatctrl_cli.geometry import back_project, frame_along, invert_transform, pose_at, project, transform_points
 from splatctrl_cli.logs.mcap_writer import mcap_log
 from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
@@ -226,19 +226,13 @@ def _lost(fault: Fault, shape: tuple[int, ...], rng: np.random.Generator) -> np.
 
 
 def _solid(link: str, shape: Capsule | Block, T_world_link: Float64) -> Primitive:
-    T = np.eye(4)
     if isinstance(shape, Block):
-        T[:3, 3] = shape.middle
-        return Primitive(name=link, kind="box", size=shape.size, T_world_shape=T_world_link @ T, texture=ARM_TEXTURE)
+        T = T_world_link @ pose_at(shape.middle)
+        return Primitive(name=link, kind="box", size=shape.size, T_world_shape=T, texture=ARM_TEXTURE)
     start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
-    length = float(np.linalg.norm(end - start))
-    z = (end - start) / length
-    x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [1.0, 0.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    T[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    T[:3, 3] = (start + end) / 2
-    size = (shape.radius, length)
-    return Primitive(name=link, kind="capsule", size=size, T_world_shape=T_world_link @ T, texture=ARM_TEXTURE)
+    T = T_world_link @ pose_at((start + end) / 2, frame_along(end - start))
+    size = (shape.radius, float(np.linalg.norm(end - start)))
+    return Primitive(name=link, kind="capsule", size=size, T_world_shape=T, texture=ARM_TEXTURE)
 
 
 def _order(record: Record) -> tuple[int, int, str]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import SplatCtrlError
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.reconstructions.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay import ReplayResult, replay
@@ -277,8 +278,7 @@ def _carried(draft: Draft, motion: Motion, model: RobotModel) -> Primitive:
     radius, length = draft.carried
     (solid,) = draft.make(np.zeros(3))
     seconds = np.arange(0.0, DURATION_S + 0.02, 0.02)
-    T_hand_target = np.eye(4)
-    T_hand_target[2, 3] = 0.066 + radius + length / 2 - 0.003
+    T_hand_target = pose_at([0.0, 0.0, 0.066 + radius + length / 2 - 0.003])
     poses = np.array([model.frame_pose(motion.at(float(s))[0], "hand") @ T_hand_target for s in seconds])
     track = Track(stamp_ns=np.array([at_s(float(s)) for s in seconds]), T_world_shape=poses)
     return replace(solid, T_world_shape=poses[0], track=track)

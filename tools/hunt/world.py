@@ -5,7 +5,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatctrl_cli.geometry import invert_transform, look_at, project, transform_points
+from splatctrl_cli.geometry import (
+    frame_along,
+    invert_transform,
+    look_at,
+    pose_at,
+    project,
+    transform_points,
+    turn_about_z,
+)
 from splatctrl_cli.records import Box, Float64, Intrinsics
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import Capsule, Motion
@@ -174,19 +182,12 @@ def floating(
     solid = _solid(name, kind, size, place, rng)
     if z_axis is None:
         return solid
-    z = z_axis / np.linalg.norm(z_axis)
-    x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [1.0, 0.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    T = solid.T_world_shape.copy()
-    T[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    return replace(solid, T_world_shape=T)
+    return replace(solid, T_world_shape=pose_at(place, frame_along(z_axis)))
 
 
 def shifted(solid: Primitive, place: Float64) -> Primitive:
     """The same solid with its middle at (3,) [m]."""
-    T = solid.T_world_shape.copy()
-    T[:3, 3] = place
-    return replace(solid, T_world_shape=T)
+    return replace(solid, T_world_shape=pose_at(place, solid.T_world_shape[:3, :3]))
 
 
 def moving(solid: Primitive, seconds: Sequence[float], offsets: Float64) -> Primitive:
@@ -260,12 +261,8 @@ def _shows(camera: Camera, place: Float64) -> bool:
 
 
 def _solid(name: str, kind: str, size: tuple[float, ...], place: Float64, rng: np.random.Generator) -> Primitive:
-    T = np.eye(4)
     yaw = rng.uniform(0, np.pi)
-    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T[:3, 3] = place
-    if name == "table":
-        T[:3, :3] = np.eye(3)
+    T = pose_at(place, None if name == "table" else turn_about_z(yaw))
     dark, bright = PALETTE[list(PALETTE)[int(rng.integers(len(PALETTE)))]]
     texture = Texture(
         pattern=("stripes", "checks")[int(rng.integers(2))],

@@ -18,6 +18,7 @@ from splatctrl_cli.datasets.idr import write_idr
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.cloud import spaced
 from splatctrl_cli.evaluate.protocols import score_protocol
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.open_recording import RecordingRequest, is_folder_of_views
 from splatctrl_cli.jobs.scores.reference import missing_views
 from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
@@ -287,9 +288,7 @@ def test_a_gate_on_what_was_not_scored_fails(place: Path) -> None:
 def test_another_scan_of_the_same_camera_names_is_refused_with_figures(
     place: Path, views: list[DtuView], tmp_path: Path
 ) -> None:
-    shift = np.eye(4)
-    shift[0, 3] = 0.02
-    moved = [replace(v, T_world_camera=shift @ v.T_world_camera) for v in views]
+    moved = [replace(v, T_world_camera=pose_at([0.02, 0.0, 0.0]) @ v.T_world_camera) for v in views]
     write_dtu(tmp_path / "other", "scan1", moved)
     with pytest.raises(InputError) as refused:
         scored(place, tmp_path / "other")
