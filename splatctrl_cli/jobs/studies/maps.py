@@ -4,6 +4,7 @@ Q points, world frame, metres. A distance is a lower bound of a 1-Lipschitz one,
 edge holds of it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,10 +21,17 @@ from splatctrl_cli.jobs.replays.compare import ROUNDING
 from splatctrl_cli.jobs.replays.known_scene import KnownScene, known_space, seen_of, splat_fields
 from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.jobs.studies.views import Step, Views
-from splatctrl_cli.jobs.studies.ways import Asked, Surroundings, Ways, beside_the_start
+from splatctrl_cli.jobs.studies.ways import (
+    Asked,
+    Surroundings,
+    Ways,
+    beside_the_start,
+    is_beside_the_start,
+    yielded,
+)
 from splatctrl_cli.libraries import of_extra
 from splatctrl_cli.planner.configuration_clearance import HasDistance, OnlyDistance
-from splatctrl_cli.records import Box, DistanceGrid, Float32, Float64, Label, RgbdFrame
+from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float32, Float64, Label, RgbdFrame, SplatSet
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.gaussian_fitter import GaussianFitter
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
@@ -38,13 +46,15 @@ TSDF_VOXEL, TSDF_BAND = 0.01, 0.04  # [m] edge of a voxel, and how far from a su
 @dataclass(frozen=True, kw_only=True)
 class Map:
     """scene: what the method takes for things; ways: where a planner may go in it, None for anywhere outside of
-    things. known: what a verdict and a controller look at, None without. num_parts: splats, voxels or triangles.
-    things: balls, centers (N, 3) and radii (N,) [m], that a picture shows for them; None where there is no map.
+    things. known: what a verdict looks at, barrier: what a controller keeps from; None without. num_parts: splats,
+    voxels or triangles. things: balls, centers (N, 3) and radii (N,) [m], that a picture shows for them; None where
+    there is no map.
     """
 
     scene: HasDistance
     ways: Ways | None = None
     known: KnownScene | None = None
+    barrier: Callable[[], DistanceField] | None = None
     num_parts: int = 0
     things: tuple[Float32, Float32] | None = None
 
@@ -106,6 +116,7 @@ def splat_map(problem: Problem, made: Fitted, config: Config, threads: int) -> M
         scene=Asked(distance=_less_rounding(SphereField(centers, radii, threads=threads))),
         ways=surroundings.ways,
         known=known,
+        barrier=lambda: barrier_of(problem, spheres, config, threads),
         num_parts=len(fitter.splats()),
         things=(centers, radii),
     )
@@ -113,6 +124,15 @@ def splat_map(problem: Problem, made: Fitted, config: Config, threads: int) -> M
 
 def _less_rounding(field: SphereField) -> DistanceFunction:
     return lambda points: field.query(points)[0] - ROUNDING
+
+
+def barrier_of(problem: Problem, spheres: SplatSet, config: Config, threads: int) -> DistanceField:
+    """The field of a controller over spheres of the map, by the rules of a plan of ours: without those that reach
+    into the arm where it stands; and they yield to the start and the goal, here to their centres at most.
+    """
+    kept = spheres.select(is_beside_the_start(problem, spheres.centers, spheres.radii))
+    radii = yielded(problem, kept.centers, kept.radii, config.control.margin)
+    return splat_fields(replace(kept, radii=np.maximum(radii, np.float32(0))), config, threads).barrier
 
 
 def printed_map(problem: Problem, made: Fitted, config: Config, threads: int) -> Map:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.control.goals import Detour, PlanDetour
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.evaluate.verdict import Outcome as Judgement
@@ -318,16 +319,35 @@ def by_controller(num_detours: int) -> Drive:
     def drive(rig: Rig, known: Map) -> Attempt:
         config, model, task = rig.config, rig.problem.model, rig.task
         control = replace(config.control, max_detours=num_detours, solver="daqp")
-        assert known.known is not None
-        barrier = known.known.at(task.stamp_ns).barrier
-        detour = planned_detours(
-            model, lambda stamp: known.scene, task.frame, config.planner, control, home=task.home
-        )
-        trace = closed_loop(model, control, task, lambda stamp: barrier, plan_detour=detour if num_detours else None)
+        assert known.barrier is not None
+        barrier = known.barrier()
+        detour = _way_out(rig, known) if num_detours else None
+        trace = closed_loop(model, control, task, lambda stamp: barrier, plan_detour=detour)
         cause = "" if trace.outcome is Outcome.GOAL_REACHED else judge.STALLED
         return Attempt(position=np.asarray(trace.position), cause=cause, outcome=trace.outcome, margin=control.margin)
 
     return drive
+
+
+def _way_out(rig: Rig, known: Map) -> PlanDetour:
+    """Out of a local minimum: by the safest of the map's ways that keep the margin, or else through any space."""
+    margin = rig.config.control.margin
+    scenes = [way.scene for way in known.ways() if way.margin == margin] if known.ways is not None else []
+
+    def planned_in(scene: HasDistance) -> PlanDetour:
+        planner = replace(rig.config.planner, max_iterations=SEARCH)
+        task = rig.task
+        return planned_detours(
+            rig.problem.model, lambda stamp_ns: scene, task.frame, planner, rig.config.control, home=task.home
+        )
+
+    plans = [planned_in(scene) for scene in (*scenes, known.scene)]
+
+    def way_out(stamp_ns: int, q: Float64, T_world_goal: Float64) -> Detour | None:
+        found = (plan(stamp_ns, q, T_world_goal) for plan in plans)
+        return next((each for each in found if each is not None), None)
+
+    return way_out
 
 
 def _printed(rig: Rig) -> Map:

@@ -120,17 +120,14 @@ class Surroundings:
         return is_reached
 
     def things(self, margin: float, *, is_thin: bool = False) -> DistanceFunction:
-        """The distance to the balls, those smaller that the start or the goal is nearer to than the margin [m]: a
-        ball may be as much too large, and what is given is as near as it is. The centre of a ball yields as far as
-        the arm's surface, and not inside it. is_thin: balls of at most `THIN`, and those of lost edges half as large.
+        """The distance to the balls, those `yielded` that the start or the goal is nearer to than the margin [m].
+        is_thin: balls of at most `THIN`, and those of lost edges half as large.
         """
-        least, radii = -margin, self.radii.copy()
+        radii = self.radii.copy()
         if is_thin:
             radii[: self.num_known] = np.minimum(radii[: self.num_known], np.float32(THIN))
             radii[self.num_known :] *= np.float32(0.5)
-        for q in (self.problem.start, self.problem.goal):
-            away = _body(self.problem, q).query(self.centers.astype(np.float64))[0]
-            radii = np.minimum(radii, np.maximum(away - margin - ENDS_ROOM, least).astype(np.float32))
+        radii = yielded(self.problem, self.centers, radii, margin)
         field = SphereField(self.centers, radii + np.float32(margin), threads=self.threads)  # no radius below 0
         return lambda points: field.query(points)[0] + (margin - ROUNDING)
 
@@ -188,9 +185,26 @@ def _body(problem: Problem, q: Float64) -> SphereField:
 
 
 def beside_the_start(problem: Problem, centers: Float32, radii: Float32) -> tuple[Float32, Float32]:
-    """The balls (N, 3), (N,) that are farther than `START_GAP` from the arm's moving spheres at its start."""
-    is_kept = _body(problem, problem.start).query(centers.astype(np.float64))[0] - radii > START_GAP
+    """Those balls (N, 3), (N,) that `is_beside_the_start`."""
+    is_kept = is_beside_the_start(problem, centers, radii)
     return centers[is_kept], radii[is_kept]
+
+
+def yielded(problem: Problem, centers: Float32, radii: Float32, margin: float) -> Float32:
+    """Radii (N,) [m] of balls (N, 3), (N,), less where the start or the goal is nearer than the margin [m]: a ball
+    may be as much too large, and what is given is as near as it is. The centre of a ball yields as far as the arm's
+    surface, to -margin, and not inside it.
+    """
+    for q in (problem.start, problem.goal):
+        away = _body(problem, q).query(centers.astype(np.float64))[0]
+        radii = np.minimum(radii, np.maximum(away - margin - ENDS_ROOM, -margin).astype(np.float32))
+    return radii
+
+
+def is_beside_the_start(problem: Problem, centers: Float32, radii: Float32) -> Bool:
+    """Which of balls (N, 3), (N,) are farther than `START_GAP` from the arm's moving spheres at its start."""
+    away = _body(problem, problem.start).query(centers.astype(np.float64))[0] - radii
+    return np.asarray(away > START_GAP)
 
 
 def _least_of(first: DistanceFunction, second: DistanceFunction) -> DistanceFunction:

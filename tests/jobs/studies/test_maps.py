@@ -13,6 +13,7 @@ from splatctrl_cli.jobs.studies.problems import Problem, read_problem
 from splatctrl_cli.jobs.studies.trial import Rig
 from splatctrl_cli.jobs.studies.views import Views, views_of
 from splatctrl_cli.jobs.studies.ways import Asked, Way, Ways
+from splatctrl_cli.records import SplatSet
 from splatctrl_cli.simulate.truth import distance_to
 
 
@@ -48,6 +49,27 @@ def test_the_first_way_that_leads_to_the_goal_is_taken(problem: Problem, views: 
     assert [attempt.in_known_space for attempt in taken] == [True, False, False]
     assert [attempt.position is not None for attempt in taken] == [True, True, False]
     assert taken[2].cause == judge.GOAL_BLOCKED
+
+
+def test_a_controller_keeps_from_the_map_but_where_the_arm_stands_and_is_to_go(problem: Problem) -> None:
+    """A ball in the hand at the start, one 5 mm from it at the goal, one in free space."""
+    model, config = problem.model, Config()
+    here, there = (model.sphere_centers(q)[model.moving_spheres][-1] for q in (problem.start, problem.goal))
+    body = model.sphere_centers(problem.goal)[model.moving_spheres]
+    out = (there - body.mean(axis=0)) / np.linalg.norm(there - body.mean(axis=0))
+    reach = model.sphere_set.radii[model.moving_spheres][-1]
+    centers = np.array([here, there + out * (reach + 0.005), here + np.array([0.0, 0.0, 0.6])], np.float32)
+    spheres = SplatSet(
+        centers=centers,
+        radii=np.full(3, 0.02, np.float32),
+        opacities=np.ones(3, np.float32),
+        colors=np.zeros((3, 3), np.float32),
+        labels=np.zeros(3, np.uint8),
+        density=np.ones(3, np.float32),
+    )
+    distance = maps.barrier_of(problem, spheres, config, threads=1).query(centers.astype(np.float64))[0]
+    assert distance[0] > 0.1
+    np.testing.assert_allclose(distance[1:], [0.0, -0.02], atol=1e-5)
 
 
 def test_the_gaussians_of_the_baseline_lie_on_the_things_and_not_on_the_arm(problem: Problem, views: Views) -> None:

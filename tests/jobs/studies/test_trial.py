@@ -1,12 +1,15 @@
-"""Which plan a trial takes: of those of a way the one that comes to least unseen space; others where none leads."""
+"""Which plan a trial takes: of those of a way the one that comes to least unseen space; others where none leads; and
+a controller's way out."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.control.goals import Detour, PlanDetour
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.studies import judge, trial
 from splatctrl_cli.jobs.studies.maps import Map
@@ -15,6 +18,8 @@ from splatctrl_cli.jobs.studies.trial import LITTLE, PLANS, Attempt, Rig, by_pla
 from splatctrl_cli.jobs.studies.views import Views
 from splatctrl_cli.jobs.studies.ways import Way
 from splatctrl_cli.planner.configuration_clearance import HasDistance
+from splatctrl_cli.planner.path import TimedPath
+from splatctrl_cli.records import Float64
 
 NONE = Attempt(position=None, cause=judge.NO_PLAN)
 
@@ -69,3 +74,27 @@ def test_a_way_is_given_up_after_one_search_and_the_last_after_others(
     assert attempt.position is not None and tried == [0, PLANS, 2 * PLANS, 2 * PLANS + 1]
     attempt, tried = chosen(rig, {}, monkeypatch)
     assert attempt == NONE and len(tried) == 2 + PLANS
+
+
+def test_a_way_out_is_the_safest_that_keeps_the_margin_or_else_any(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    margin, asked = rig.config.control.margin, []
+    scenes = {name: replace(rig.problem.solids) for name in ("known", "less margin", "unseen", "any")}
+    ways = [Way(scene=scenes["known"], margin=margin), Way(scene=scenes["less margin"], margin=0.4 * margin)]
+    ways.append(Way(scene=scenes["unseen"], margin=margin))
+    leads = {"any"}
+
+    def planned(model: object, scene_at: Callable[[int], HasDistance], *_: object, home: Float64) -> PlanDetour:
+        def out(stamp_ns: int, q: Float64, T_world_goal: Float64) -> Detour | None:
+            (name,) = [name for name, scene in scenes.items() if scene is scene_at(stamp_ns)]
+            asked.append(name)
+            return Detour(path=cast(TimedPath, name), wait_distance=0.05) if name in leads else None
+
+        return out
+
+    monkeypatch.setattr(trial, "planned_detours", planned)
+    way_out = trial._way_out(rig, Map(scene=scenes["any"], ways=lambda: iter(ways)))
+    for name, order in (("any", ["known", "unseen", "any"]), ("unseen", ["known", "unseen"])):
+        leads.add(name)
+        found = way_out(0, rig.problem.start, np.eye(4))
+        assert found is not None and found.path == name and asked == order
+        asked.clear()
