@@ -17,6 +17,7 @@ from splatctrl_cli.robot.urdf import Shape
 
 CLOSE, FAR = 0.50, 2.3  # [m] of the two views from what they look at
 POINTS = 150  # of the tip's way, at most
+BALLS = 6000  # of the map, at most: the seconds that a picture takes go with them
 DIRECTIONS = 300  # that are tried for a view
 
 
@@ -71,7 +72,7 @@ def _scene(failure: Failure, at: Place, eyes: Float64) -> drawn.TrialScene:
     solid += _balls(drawn.TOUCHED, centers[[at.sphere]], radii[[at.sphere]])
     solid += _balls(drawn.WAY, np.array(way), np.full(len(way), 0.004))
     solid += _balls(drawn.CAMERA, eyes, np.full(len(eyes), 0.03))
-    light = [] if failure.things is None else [_balls(drawn.MAP, *failure.things)]
+    light = [] if failure.things is None else [_balls(drawn.MAP, *_shown(problem, *failure.things))]
     light += [
         _balls(name, model.sphere_centers(q), radii)
         for name, q in ((drawn.START, problem.start), (drawn.GOAL, problem.goal))
@@ -83,6 +84,14 @@ def _scene(failure: Failure, at: Place, eyes: Float64) -> drawn.TrialScene:
         place=at.point,
         cameras=eyes,
     )
+
+
+def _shown(problem: Problem, centers: Float32, radii: Float32) -> tuple[Float32, Float32]:
+    """At most `BALLS` of balls (N, 3), (N,): of those that the arm reaches, evenly by their order."""
+    is_near = np.linalg.norm(centers - problem.model.base_position, axis=1) < problem.model.reach()
+    number = np.flatnonzero(is_near)
+    kept = number[:: max(-(-len(number) // BALLS), 1)]
+    return centers[kept], radii[kept]
 
 
 def _balls(link: str, centers: Float32 | Float64, radii: Float32 | Float64) -> list[Shape]:

@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgb
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.files.output import Stopwatch
-from splatctrl_cli.jobs.studies import judge, trial
+from splatctrl_cli.jobs.studies import failures, judge, trial
 from splatctrl_cli.jobs.studies.maps import Map
 from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.jobs.studies.trial import OURS, Attempt, Rig, trial_of
@@ -68,6 +68,18 @@ def test_what_blocks_is_shown_where_there_is_no_plan(
     assert num_pixels(path, TOUCHED) > 100
     pictured(replace(problem, start=HOME), views, replace(attempt, cause=judge.START_BLOCKED), tmp_path, monkeypatch)
     assert b"at the start" in path.read_bytes()
+
+
+def test_of_a_map_of_many_things_some_within_reach_are_shown(problem: Problem) -> None:
+    middle, reach = problem.model.base_position, problem.model.reach()
+    far = np.random.default_rng(0).normal(size=(5 * failures.BALLS, 3))
+    centers = (middle + reach * far).astype(np.float32)
+    shown, radii = failures._shown(problem, centers, np.arange(len(far), dtype=np.float32))
+    assert failures.BALLS / 2 < len(shown) <= failures.BALLS
+    assert (np.linalg.norm(shown - middle, axis=1) < reach).all()
+    np.testing.assert_array_equal(shown, centers[radii.astype(int)])
+    few = failures._shown(problem, shown[:10], radii[:10])
+    assert len(few[0]) == 10
 
 
 def test_a_success_leaves_no_picture(
