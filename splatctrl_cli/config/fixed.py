@@ -153,6 +153,7 @@ HALVED_DOWN_TO = 5e-4  # [m] of travel: shorter pieces are not halved any more
 MOTION_WINDOW = 0.05  # [s] over which a motion is averaged, so that an encoder's steps are not taken for speed
 ENCODER = 1e-3  # [rad or m] that each position may be off
 NEAR_EVERY_NS = 200_000_000  # [ns] between states that are looked at: cameras that stop are stale five times as late
+NEAR_MOVED = 0.01  # [m] the same, as soon as a sphere has moved so far: half a margin
 NEAR_APART = 0.01  # [m] a point of a shell is at least so far from every other sphere of the arm
 NEAR_NEW = 0.05  # [m] from the arm at the first state: space that the motion comes to
 NEAR_FRESH_SHARE = 0.75  # of the seen points; the arm itself hides up to a quarter of its shell for seconds

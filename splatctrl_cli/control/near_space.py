@@ -55,7 +55,7 @@ class NearFigures:
 
 
 class NearSpace:
-    """Asks for the shells of the states of a motion that are far enough apart."""
+    """Asks for the shells of the states of a motion that are far enough apart, in time or in space."""
 
     def __init__(self, model: ArmModel, margin: float) -> None:
         self._model = model
@@ -64,15 +64,24 @@ class NearSpace:
         self._margin = margin
         self._first: Float64 | None = None  # centres (S, 3) of the first state
         self._next_ns = -(2**63)
+        self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres when they were last looked about
 
-    def due(self, stamps: NDArray[np.int64]) -> list[int]:
-        """Of states at stamps (T,) [ns] that do not go back, those to look at."""
-        chosen = []
+    def due(self, stamps: NDArray[np.int64], centers: Float64) -> list[int]:
+        """Of states at stamps (T,) [ns] that do not go back, with their spheres' centres (T, S, 3), those to look at:
+        `NEAR_EVERY_NS` after the last one, or as soon as a sphere has moved by `NEAR_MOVED`.
+        """
+        chosen, moving = [], centers[:, self._moving]
         for index, stamp_ns in enumerate(stamps.tolist()):
-            if stamp_ns >= self._next_ns:
+            if stamp_ns >= self._next_ns or self._has_moved(moving[index]):
                 chosen.append(index)
-                self._next_ns = stamp_ns + fixed.NEAR_EVERY_NS
+                self._next_ns, self._looked = stamp_ns + fixed.NEAR_EVERY_NS, moving[index]
         return chosen
+
+    def _has_moved(self, centers: Float64) -> bool:
+        """Whether one of the moving spheres (M, 3) is `NEAR_MOVED` from where it was last looked about."""
+        if self._looked is None:
+            return False
+        return bool(np.sum((centers - self._looked) ** 2, axis=1).max(initial=0.0) >= fixed.NEAR_MOVED**2)
 
     def look(
         self, stamp_ns: int, q: Float64, known: Seen, distance: Callable[[Float64], Float64] | None = None

@@ -243,7 +243,7 @@ class ReplayRecord:
         columns = {name: np.full((num, 3) if "place" in name else num, np.nan) for name in NEAR_NAMES}
         if self._scene.has_seen_times:
             self.hindsight.add(part.stamp_ns, part.position)
-        for at in self._near.due(part.stamp_ns):
+        for at in self._near.due(part.stamp_ns, self._model.sphere_centers_batch(part.position)):
             stamp = int(part.stamp_ns[at])
             known = self._scene.seen_at(stamp)
             if known is not None:

@@ -134,6 +134,13 @@ def beside_a_lost_edge(stage: Stage) -> None:
     stage.last_seen = replace(voxels(), edges=edge)
 
 
+def beside_a_lost_edge_at_the_last_moment(stage: Stage) -> None:
+    """It comes there in the 0.15 s since the time at which all is looked at."""
+    move = np.linspace(0, 1, 12)[:, None] * np.array([0.6, 0, 0, 0, 0, 0, 0])
+    stage.states = states_on(START + move, step_ns=SECOND // 20)
+    beside_a_lost_edge(stage)
+
+
 def frames_that_renew_nothing(stage: Stage) -> None:
     stage.states = resting(num=21)
     stage.map_stamps = [i * QUARTER for i in range(9)]
@@ -238,6 +245,13 @@ ALONE: dict[str, Broken] = {
     "unseen side": (beside_an_unseen_side, (), "known space", "not evaluable", "mm from a surface of the map"),
     "no answer": (no_answer_beside_it, (), "known space", "not evaluable", "a place 10.0 mm from the arm"),
     "lost edge": (beside_a_lost_edge, (), "known space", "not evaluable", "lost 11.0 mm from the arm"),
+    "lost edge at last": (
+        beside_a_lost_edge_at_the_last_moment,
+        (),
+        "known space",
+        "not evaluable",
+        "lost 11.0 mm from the arm",
+    ),
     "evidence age": (
         frames_that_renew_nothing,
         (),
