@@ -66,15 +66,18 @@ class NearSpace:
         self._next_ns = -(2**63)
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres when they were last looked about
 
-    def due(self, stamps: NDArray[np.int64], centers: Float64) -> list[int]:
+    def due(self, stamps: NDArray[np.int64], centers: Float64) -> dict[int, bool]:
         """Of states at stamps (T,) [ns] that do not go back, with their spheres' centres (T, S, 3), those to look at:
-        `NEAR_EVERY_NS` after the last one, or as soon as a sphere has moved by `NEAR_MOVED`.
+        each time a sphere has moved by `NEAR_MOVED`, and True for those `NEAR_EVERY_NS` after the last such, whose
+        shares and ages count: what is allowed of these is from states so far apart.
         """
-        chosen, moving = [], centers[:, self._moving]
+        chosen, moving = dict[int, bool](), centers[:, self._moving]
         for index, stamp_ns in enumerate(stamps.tolist()):
-            if stamp_ns >= self._next_ns or self._has_moved(moving[index]):
-                chosen.append(index)
-                self._next_ns, self._looked = stamp_ns + fixed.NEAR_EVERY_NS, moving[index]
+            is_timed = stamp_ns >= self._next_ns
+            if is_timed:
+                self._next_ns = stamp_ns + fixed.NEAR_EVERY_NS
+            if is_timed or self._has_moved(moving[index]):
+                chosen[index], self._looked = is_timed, moving[index]
         return chosen
 
     def _has_moved(self, centers: Float64) -> bool:

@@ -25,6 +25,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_gaps
 
 NEAR_NAMES = tuple(field.name for field in fields(NearFigures))
+NEAR_DISTANCES = ("unanswered", "unanswered_place", "hidden", "hidden_place", "edge", "edge_place")
 AGES = ("age", "ahead")  # of them, where times of seeing are known
 
 
@@ -243,16 +244,16 @@ class ReplayRecord:
         columns = {name: np.full((num, 3) if "place" in name else num, np.nan) for name in NEAR_NAMES}
         if self._scene.has_seen_times:
             self.hindsight.add(part.stamp_ns, part.position)
-        for at in self._near.due(part.stamp_ns, self._model.sphere_centers_batch(part.position)):
+        for at, is_timed in self._near.due(part.stamp_ns, self._model.sphere_centers_batch(part.position)).items():
             stamp = int(part.stamp_ns[at])
             known = self._scene.seen_at(stamp)
             if known is not None:
                 exact = self._scene.at(stamp).distances["exact"]
                 figures = self._near.look(stamp, part.position[at], known, exact)
-                for name in NEAR_NAMES:
+                for name in NEAR_NAMES if is_timed else NEAR_DISTANCES:
                     if self._scene.has_seen_times or name not in AGES:
                         columns[name][at] = getattr(figures, name)
-                if self._scene.has_seen_times:
+                if is_timed and self._scene.has_seen_times:
                     self.hindsight.looked(stamp, figures.age)
         self.near.append(**columns)
 
