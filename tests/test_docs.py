@@ -50,7 +50,7 @@ TOO_LONG = {  # for a test: minutes; the page has their figures
     "reconstruct docs/examples/apc_shelf.toml --root SCENE --max-splats 10000 -o shelf",
     "sweep demo_output/audit --over KEY=A:B",
     "study table2 --trials 20 -o out/table2",
-    "study table2 --methods ours,truth --shard 1/3",
+    "study table2 --methods ours,tsdf,truth --shard 1/3",
     "study table2 --made docs/table2.csv -o out/table2",
     "study table2 --problem cubby-0007 -o out/one",
     "study ablation --trials 12 -o out/ablation",
