@@ -300,13 +300,14 @@ def _least_unseen(rig: Rig, way: Way, seeds: Sequence[int], *, gives_up: bool) -
 
 
 def as_printed(rig: Rig, known: Map) -> Attempt:
-    """A planned path that keeps no margin."""
+    """A planned path that keeps no margin, to the goal from anywhere."""
     config = rig.config
-    return _planned(rig, known.scene, replace(config, control=replace(config.control, margin=NO_MARGIN)))
+    config = replace(config, control=replace(config.control, margin=NO_MARGIN))
+    return _planned(rig, known.scene, config, approach=0.0)
 
 
-def _planned(rig: Rig, scene: HasDistance, config: Config) -> Attempt:
-    plan = planned_path(rig.problem.model, scene, rig.task, config.planner, config.control, approach=APPROACH)
+def _planned(rig: Rig, scene: HasDistance, config: Config, *, approach: float = APPROACH) -> Attempt:
+    plan = planned_path(rig.problem.model, scene, rig.task, config.planner, config.control, approach=approach)
     if plan.path is None:
         return Attempt(position=None, cause=BLOCKED.get(plan.outcome, judge.NO_PLAN), outcome=plan.outcome)
     run = follow_joints(plan.path, plan.clearance, rig.task.frame, config.planner, config.control)
