@@ -88,7 +88,9 @@ def read_trials(path: Path, kind: type[R]) -> list[R]:
             if rows.fieldnames != list(types):
                 raise ValueError("other columns")
             return [kind(**_values(row, types)) for row in rows]
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="check the path") from None
+    except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"{path}: is not a table of trials: {error}", remedy="run its problem again") from None
 
 
