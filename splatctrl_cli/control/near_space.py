@@ -38,8 +38,9 @@ class NearFigures:
     within which `NEAR_FRESH_SHARE` of the seen points were last seen; ahead [s] by which the last of them was seen
     after the state. NaN where there are too few points. unanswered [m]: the distance of the nearest voxel that
     cameras looked at without an answer, and its place (3,) [m]; hidden [m]: how near a point that was never seen, of
-    new space or not, is to the map's surfaces, and its place (3,) [m]; edge [m]: the distance of the nearest lost
-    edge, and its place (3,) [m]; infinite and NaN where there is none.
+    new space or not, is to the map's surfaces, and its place (3,) [m]; beyond [m]: the same of new space about a
+    sphere that comes to almost nothing else (`NEAR_BLIND`); edge [m]: the distance of the nearest lost edge, and its
+    place (3,) [m]; infinite and NaN where there is none.
     """
 
     unseen: float
@@ -50,6 +51,8 @@ class NearFigures:
     unanswered_place: Float64
     hidden: float
     hidden_place: Float64
+    beyond: float
+    beyond_place: Float64
     edge: float
     edge_place: Float64
 
@@ -112,10 +115,12 @@ class NearSpace:
             known.unanswered, centers, known.voxel / 2
         )  # from its nearest face
         edge, edge_place = self._nearest(known.edges[:, :3], centers, known.edges[:, 3])
-        hidden, hidden_place = np.inf, np.full(3, np.nan)
+        hidden, hidden_place = beyond, beyond_place = NOWHERE
         if distance is not None:
-            fine, _ = self._shell(centers, FINE)
-            hidden, hidden_place = _nearest_of(fine[known.last_ns(fine) < 0], distance)
+            fine, owners = self._shell(centers, FINE)
+            is_never = known.last_ns(fine) < 0
+            hidden, hidden_place = _nearest_of(fine[is_never], distance)
+            beyond, beyond_place = _nearest_of(fine[self._is_in_the_blind(fine, owners, is_never)], distance)
         return NearFigures(
             unseen=unseen,
             blind=blind,
@@ -125,6 +130,8 @@ class NearSpace:
             unanswered_place=unanswered_place,
             hidden=hidden,
             hidden_place=hidden_place,
+            beyond=beyond,
+            beyond_place=beyond_place,
             edge=edge,
             edge_place=edge_place,
         )
@@ -142,6 +149,18 @@ class NearSpace:
         assert self._first is not None
         return _is_outside(points, self._first, self._radii + fixed.NEAR_NEW)
 
+    def _is_in_the_blind(self, points: Float64, owners: NDArray[np.int64], is_never: Bool) -> Bool:
+        """Those of `FINE` points (Q, 3) about spheres (Q,) in new space that were never seen, as nearly all of the
+        new space about their sphere.
+        """
+        is_unknown, num = is_never.copy(), len(self._radii)
+        is_unknown[is_never] = self._is_new(points[is_never])
+        num_unknown = np.bincount(owners[is_unknown], minlength=num)
+        is_asked = (num_unknown >= fixed.NEAR_BLIND * fixed.NEAR_FEWEST_FINE)[owners]
+        num_new = np.bincount(owners[is_asked], self._is_new(points[is_asked]), minlength=num)
+        is_blind = (num_new >= fixed.NEAR_FEWEST_FINE) & (num_unknown >= fixed.NEAR_BLIND * num_new)
+        return np.asarray(is_unknown & is_blind[owners])
+
     def _nearest(self, points: Float64, centers: Float64, reach: float | Float64) -> tuple[float, Float64]:
         """The least distance [m] of balls about points (K, 3), `reach` (K,) [m] large, near the arm to its moving
         spheres, at least 0, and that point (3,).
@@ -150,7 +169,7 @@ class NearSpace:
         around = radii.max() + fixed.NEAR_NEW
         is_near = np.all((points > moving.min(axis=0) - around) & (points < moving.max(axis=0) + around), axis=1)
         if not is_near.any():
-            return np.inf, np.full(3, np.nan)
+            return NOWHERE
         points, reach = points[is_near], np.broadcast_to(reach, len(is_near))[is_near]
         away = (cdist(points, moving) - radii).min(axis=1) - reach
         least = int(np.argmin(away))
@@ -161,7 +180,7 @@ def _nearest_of(points: Float64, distance: Callable[[Float64], Float64]) -> tupl
     """The least distance [m] of points (Q, 3) to surfaces, and that point (3,)."""
     away = distance(points) if len(points) else np.full(len(points), np.nan)
     if np.isnan(away).all():
-        return np.inf, np.full(3, np.nan)
+        return NOWHERE
     least = int(np.nanargmin(away))
     return float(away[least]), points[least]
 
@@ -189,5 +208,6 @@ def _spiral(num: int) -> Float64:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
+NOWHERE = (np.inf, np.full(3, np.nan))  # a distance and its place
 DIRECTIONS = _directions()
 FINE = _spiral(fixed.NEAR_DIRECTIONS)

@@ -8,7 +8,7 @@ from splatctrl_cli.config.fixed import NEAR_EVERY_NS, NEAR_MOVED
 from splatctrl_cli.control.near_space import NearSpace, Seen
 from splatctrl_cli.records import Float64
 from tests.control.fakes import PlanarArm
-from tests.reference.intervals import blind_share, hidden, near_figures
+from tests.reference.intervals import beyond, blind_share, hidden, near_figures
 
 SECOND = 1_000_000_000
 FIRST, LATER = np.array([0.0, 0.0]), np.array([1.2, 0.6])
@@ -158,6 +158,8 @@ def test_unseen_space_at_the_margin_is_as_near_to_a_surface_as_by_the_reference(
     if np.isfinite(found.hidden):
         assert found.hidden == pytest.approx(height - found.hidden_place[2])
     assert np.isfinite(found.hidden) == (height > -0.3)
+    assert found.beyond == pytest.approx(beyond(arm, LATER, FIRST, 0.03, seen, to_sheet))
+    assert np.isfinite(found.beyond) == (height > 0.1)  # under it spheres have both sides, beneath it one
 
 
 def test_a_map_that_answers_nowhere_hides_nothing() -> None:

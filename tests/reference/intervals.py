@@ -87,6 +87,29 @@ def hidden(
     return min(found)
 
 
+def beyond(
+    arm: ArmModel,
+    q: Float64,
+    q_first: Float64,
+    margin: float,
+    last_seen: Callable[[Float64], NDArray[np.int64]],
+    distance: Callable[[Float64], Float64],
+) -> float:
+    """The least distance [m] to surfaces of the points in new space that were never seen, of shells with at least 20
+    points there, 90 % of them never seen.
+    """
+    new: dict[int, list[tuple[Float64, bool]]] = {}
+    for s, point in _shells(arm, q, margin, _spiral(200)):
+        if min(_gaps(arm, q_first, point)) > 0.05:
+            new.setdefault(s, []).append((point, int(last_seen(point[None])[0]) < 0))
+    found = [np.inf]
+    for points in new.values():
+        never = [point for point, is_never in points if is_never]
+        if len(points) >= 20 and len(never) >= 0.9 * len(points):
+            found += [float(distance(point[None])[0]) for point in never]
+    return min(found)
+
+
 def _spiral(num: int) -> list[tuple[float, float, float]]:
     """Directions by the golden angle, each a slice of equal height further down."""
     found = []

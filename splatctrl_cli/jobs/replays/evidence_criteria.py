@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from splatctrl_cli.config.fixed import (
+    BEYOND,
     BLIND,
     COARSE_VOXEL,
     HIDDEN,
@@ -24,13 +25,43 @@ from splatctrl_cli.jobs.replays.criteria_input import (
 )
 from splatctrl_cli.jobs.replays.time_criteria import clocks, evidence_age, judged_time, map_age
 
+NEAR_PLACES = (  # columns of `NearFigures`, the least [m] allowed (None: the margin), what is said, what helps
+    (
+        "hidden",  # one side of a thing says little of where the other ends
+        HIDDEN,
+        "space that no camera saw is {margin} from the arm, the margin, and {} from a surface of the map: it may go "
+        "on there, allowed {allowed}",
+        "add a camera that sees that side",
+    ),
+    (
+        "beyond",  # and where the arm comes to nothing but the unseen, a whole thing may stand
+        BEYOND,
+        "a part of the arm comes to space of which cameras saw less than a tenth, {} from a surface of the map: it "
+        "may go on there, allowed {allowed}",
+        "add a camera that sees where the arm goes",
+    ),
+    (
+        "unanswered",
+        None,
+        "cameras looked at a place {} from the arm and got no depth from it, margin {margin}",
+        "a dark, shiny or clear thing may stand there: add a camera that gets depth there",
+    ),
+    (
+        "edge",
+        None,
+        "the edge of a surface was lost {} from the arm, margin {margin}: it may go on for a pixel",
+        "keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
+    ),
+)
+
 
 def known_space(judged: Judged) -> Iterator[Reason]:
     """Cameras saw at least 53 % of the space around the moving arm; where they saw less than two thirds, at most 9 %
     of the moving spheres come to space of which less than a tenth was seen; at most `--max-unknown` of the sphere
-    centres are in space never seen; the margin about the arm reaches no unseen space within 30 mm of a surface, no
-    place where cameras looked and got no depth, and no pixel without depth into which a surface beside it may go on.
-    A baked field needs its channel `observed`.
+    centres are in space never seen; the margin about the arm reaches no unseen space within 30 mm of a surface, or
+    within 100 mm about a sphere that comes to nine tenths unseen space, no place where cameras looked and got no
+    depth, and no pixel without depth into which a surface beside it may go on. A baked field needs its channel
+    `observed`.
     """
     for column, allowed, least, words in (
         ("unseen", UNSEEN, 0.0, "of the space about the arm that the motion comes to was never seen by a camera"),
@@ -53,9 +84,7 @@ def known_space(judged: Judged) -> Iterator[Reason]:
             )
         elif near is not None:
             yield held(f"{100 * near[0]:.0f} % {words}", near[0], allowed, "", near[2])
-    yield from _hidden(judged)
-    yield from _unanswered(judged)
-    yield from _lost_edge(judged)
+    yield from _near_places(judged)
     yield from _unknown_share(judged)
 
 
@@ -80,66 +109,26 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
     )
 
 
-def _hidden(judged: Judged) -> Iterator[Reason]:
-    """Space that no camera saw, a margin away from the arm and close to a surface of the map: one side of a thing
-    says little of where the other ends.
-    """
-    distance, margin = judged.replay.near["hidden"], judged.replay.margin
-    if not np.any(distance < HIDDEN):
-        return
-    worst = int(np.nanargmin(distance))
-    yield lacking(
-        sentence=f"space that no camera saw is {mm(margin)} from the arm, the margin, and "
-        f"{mm(max(distance[worst], 0.0))} from a surface of the map: it may go on there, allowed {mm(HIDDEN)}",
-        value=float(distance[worst]),
-        threshold=HIDDEN,
-        unit="m",
-        time_s=seconds_at(judged, worst),
-        place=tuple(judged.replay.near["hidden_place"][worst].tolist()),
-        cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*judged.replay.near["hidden_place"][worst]),
-        remedy="add a camera that sees that side",
-        count=int((distance < HIDDEN).sum()),
-    )
-
-
-def _unanswered(judged: Judged) -> Iterator[Reason]:
-    """Where cameras looked and got no depth, within the margin of the arm: a dark or shiny thing may stand there."""
-    yield from _within_margin(
-        judged,
-        "unanswered",
-        "cameras looked at a place {} from the arm and got no depth from it, margin {}",
-        "a dark, shiny or clear thing may stand there: add a camera that gets depth there",
-    )
-
-
-def _lost_edge(judged: Judged) -> Iterator[Reason]:
-    """Where a surface may go on in a pixel without depth beside it, within the margin of the arm."""
-    yield from _within_margin(
-        judged,
-        "edge",
-        "the edge of a surface was lost {} from the arm, margin {}: it may go on for a pixel",
-        "keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
-    )
-
-
-def _within_margin(judged: Judged, column: str, sentence: str, remedy: str) -> Iterator[Reason]:
-    """A distance of `NearFigures` below the margin, with its place; the sentence has room for both lengths."""
-    distance, margin = judged.replay.near[column], judged.replay.margin
-    if not np.any(distance < margin):
-        return
-    worst = int(np.nanargmin(distance))
-    place = judged.replay.near[f"{column}_place"][worst]
-    yield lacking(
-        sentence=sentence.format(mm(distance[worst]), mm(margin)),
-        value=float(distance[worst]),
-        threshold=margin,
-        unit="m",
-        time_s=seconds_at(judged, worst),
-        place=tuple(place.tolist()),
-        cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*place),
-        remedy=remedy,
-        count=int(np.isfinite(distance).sum()),
-    )
+def _near_places(judged: Judged) -> Iterator[Reason]:
+    """Places near the arm that the map says too little of: each kind nearer than is allowed."""
+    margin = judged.replay.margin
+    for column, least, sentence, remedy in NEAR_PLACES:
+        distance, allowed = judged.replay.near[column], margin if least is None else least
+        if not np.any(distance < allowed):
+            continue
+        worst = int(np.nanargmin(distance))
+        place = judged.replay.near[f"{column}_place"][worst]
+        yield lacking(
+            sentence=sentence.format(mm(max(distance[worst], 0.0)), margin=mm(margin), allowed=mm(allowed)),
+            value=float(distance[worst]),
+            threshold=allowed,
+            unit="m",
+            time_s=seconds_at(judged, worst),
+            place=tuple(place.tolist()),
+            cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*place),
+            remedy=remedy,
+            count=int((distance < allowed).sum()),
+        )
 
 
 def map_error(judged: Judged) -> Iterator[Reason]:

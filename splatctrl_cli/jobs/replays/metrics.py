@@ -179,6 +179,7 @@ OF_STATES: Declared = (
     folded("max_blind_share", LARGEST, _of("near", "blind"), scale=BAD_SHARE),
     folded("min_unanswered", LEAST, _of("near", "unanswered"), num_states, scale=GAP),
     folded("min_hidden", LEAST, _of("near", "hidden"), num_states, scale=GAP),
+    folded("min_beyond", LEAST, _of("near", "beyond"), num_states, scale=GAP),
     folded("max_evidence_age_s", LARGEST, _of("near", "age"), scale=AGE),
     _single("unjudged_s", lambda r: float(r.between["unbounded"].sum()) + r.lead_in_s, _intervals, AGE),
     folded(

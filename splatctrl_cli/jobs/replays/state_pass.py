@@ -25,7 +25,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_gaps
 
 NEAR_NAMES = tuple(field.name for field in fields(NearFigures))
-NEAR_DISTANCES = ("unanswered", "unanswered_place", "hidden", "hidden_place", "edge", "edge_place")
+NEAR_DISTANCES = tuple(f"{name}{of}" for name in ("unanswered", "hidden", "beyond", "edge") for of in ("", "_place"))
 AGES = ("age", "ahead")  # of them, where times of seeing are known
 
 

@@ -17,7 +17,7 @@ from splatctrl_cli.jobs.replays.motion_criteria import surface_clearance
 
 NUM = 11
 UNKNOWN = np.full(NUM, np.nan)
-NOTHING_NEAR = dict.fromkeys(("unseen", "blind", "age", "ahead", "unanswered", "hidden", "edge"), UNKNOWN)
+NOTHING_NEAR = dict.fromkeys(("unseen", "blind", "age", "ahead", "unanswered", "hidden", "beyond", "edge"), UNKNOWN)
 
 
 def judged(**replay: Any) -> Any:
@@ -148,12 +148,27 @@ def test_the_surface_must_keep_the_whole_map_error(miss: float, outcome: Outcome
     assert outcomes(evidence.map_error, judged(map_error=found)) == [outcome]
 
 
-@pytest.mark.parametrize(("distance", "count"), [(0.031, 0), (0.029, 1), (-0.004, 1)])
-def test_the_unseen_side_of_a_seen_thing_within_the_margin_is_no_evidence(distance: float, count: int) -> None:
+@pytest.mark.parametrize(
+    ("column", "distance", "count"),
+    [
+        ("hidden", 0.031, 0),
+        ("hidden", 0.029, 1),
+        ("hidden", -0.004, 1),
+        ("beyond", 0.101, 0),
+        ("beyond", 0.099, 1),
+        ("unanswered", 0.021, 0),
+        ("unanswered", 0.019, 1),
+        ("edge", 0.021, 0),
+        ("edge", 0.019, 1),
+    ],
+)
+def test_a_place_of_which_too_little_is_known_near_the_arm_is_no_evidence(
+    column: str, distance: float, count: int
+) -> None:
     near = np.where(np.arange(NUM) == 4, distance, np.inf)
     place = np.full((NUM, 3), 0.25)
-    run = judged(near=NOTHING_NEAR | {"hidden": near, "hidden_place": place})
+    run = judged(near=NOTHING_NEAR | {column: near, f"{column}_place": place})
     found = [r for r in evidence.known_space(run) if r.outcome is Outcome.NOT_EVALUABLE]
     assert [r.count for r in found] == [1] * count
     assert not found or (found[0].time_s, found[0].place) == (pytest.approx(0.4), (0.25, 0.25, 0.25))
-    assert not found or f"{1e3 * max(distance, 0):.1f} mm from a surface of the map" in found[0].sentence
+    assert not found or f"{1e3 * max(distance, 0):.1f} mm" in found[0].sentence

@@ -8,12 +8,15 @@ import pytest
 from splatctrl_cli.config import Config
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict, held, verdict_of
 from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.jobs.replays import evidence_criteria
+from splatctrl_cli.jobs.replays.evidence_criteria import NEAR_PLACES
 from splatctrl_cli.jobs.studies import judge, trial
 from splatctrl_cli.jobs.studies.maps import Map
-from splatctrl_cli.jobs.studies.problems import Problem
+from splatctrl_cli.jobs.studies.problem_run import SETTINGS
+from splatctrl_cli.jobs.studies.problems import Problem, read_problem
 from splatctrl_cli.jobs.studies.rows import FALSE_GREEN, verdict_on_trials
 from splatctrl_cli.jobs.studies.trial import OURS, Attempt, Rig, Trial, trial_of
-from splatctrl_cli.jobs.studies.views import Views
+from splatctrl_cli.jobs.studies.views import Views, views_of
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.records import Float64
 from tests.jobs.studies.conftest import HOME, blind
@@ -48,6 +51,25 @@ def test_an_arm_that_folds_into_itself_has_hit_itself(problem: Problem, views: V
     folded = np.array([0.0, 0.0, 0.0, -3.07, 0.0, -0.01, 0.785])
     free = replace(problem, things=())
     assert judge.against_truth(free, np.array([problem.start, folded]), views).cause == judge.HIT_SELF
+
+
+@pytest.mark.parametrize("sees", [True, False])
+def test_the_back_of_a_thing_that_the_arm_at_rest_hid_from_all_cameras_is_not_safe(
+    sees: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once driven and judged safe: 9 mm from a cylinder of which the map has the far side, 70 mm away."""
+    if not sees:  # without that rule it would still pass
+        monkeypatch.setattr(evidence_criteria, "NEAR_PLACES", [p for p in NEAR_PLACES if p[0] != "beyond"])
+    hidden_back = read_problem("tabletop-0388", None)
+    views = views_of(hidden_back, 2, width=320, num_steps=5)
+    rig = Rig(problem=hidden_back, views=views, config=SETTINGS, threads=1, stopwatch=Stopwatch())
+    known, robot = rig.splats.known, judge.measured(hidden_back.model, SETTINGS)
+    end = np.array([-0.109873, 0.725588, -0.770394, -1.776587, -0.111532, 2.114366, 2.058994])
+    way = np.linspace(hidden_back.start, end, 116)
+    assert judge.against_truth(hidden_back, way, views).clearance < 0.01
+    assert known is not None
+    verdict = judge.verdict_on(robot, way, rig.task.stamp_ns, known, SETTINGS)
+    assert verdict.label == ("not evaluable" if sees else "safe")
 
 
 def passed(*_: object) -> Verdict:
