@@ -77,6 +77,7 @@ def study_options(add: Options, parser: Parser) -> None:
     add("--width PX", "of the cameras' images (default: 320; scenes 640, shared-workspace 160)", whole(32, 1280))
     add("--workers N", "problems that run at once (default: one per core)", whole(1, 256))
     add("--shard I/N", "only every N-th problem, from the I-th on", _shard)
+    add("--dask ADDRESS", "run the problems on a Dask cluster that shares this folder")
     add("--made PATH ...", "make the table of these trials (trials.csv, or a study's folder), and run none", Path)
     add("--problem NAME", "run one problem alone, such as cubby-0007, wall-0002 or near-goal-0003")
     add("--force", "replace the output of --problem if it exists")

@@ -32,8 +32,8 @@ class StudyRequest:
     """Run a study into the folder `out`, in which it goes on. trials: problems of each environment at most (None: as
     many as the paper's); problems: MotionBenchMaker's folder (None: what SPLATCTRL_REAL_DATA has, if anything);
     methods: of the study, none for all that are installed; shard: (i, n), every n-th problem from the i-th on;
-    width [px] of the images (None: the study's own). made: tables of trials or folders of studies, of which the table
-    is made instead of running a problem.
+    width [px] of the images (None: the study's own); dask: the address of a Dask scheduler that runs them. made:
+    tables of trials or folders of studies, of which the table is made instead of running a problem.
     """
 
     study: str
@@ -44,6 +44,7 @@ class StudyRequest:
     width: int | None = None
     workers: int = 1
     shard: tuple[int, int] = (1, 1)
+    dask: str | None = None
     made: tuple[Path, ...] = ()
 
 
@@ -81,7 +82,7 @@ def run_study(request: StudyRequest, command_line: CommandLine, progress: Progre
     check_same_asked(out, FILE, asked, what="study")
     with (
         Ledger(out) as ledger,
-        scheduling(ledger, command_line.entry, progress, workers=request.workers, dask=None) as scheduler,
+        scheduling(ledger, command_line.entry, progress, workers=request.workers, dask=request.dask) as scheduler,
     ):
         write_durably(out / FILE, lambda path: write_json(path, {"format": FORMAT, "version": 1, "asked": asked}))
         (out / TRIALS).unlink(missing_ok=True)  # of fewer problems, or of an older program
