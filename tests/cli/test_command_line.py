@@ -249,13 +249,6 @@ def test_what_is_only_printed_is_as_the_schema_says(work: Work, words: str) -> N
     assert done.returncode == 0, done.stderr
 
 
-def test_a_failed_gate_is_an_object_with_its_verdict(work: Work, tmp_path: Path) -> None:
-    done = here.splatctrl(
-        *work.arguments("reconstruct", tmp_path / "scene"), "-q", "--json", "--require", "splats>1000000"
-    )
-    assert done.returncode == 1 and here.checked(done.stdout, 1)["verdict"]["outcome"] == "failed"
-
-
 def test_an_interrupted_run_is_exit_130_and_leaves_only_what_is_partial(sample_data: Path, tmp_path: Path) -> None:
     # The handler is set by hand: a shell starts background jobs with SIGINT ignored, which a child inherits.
     program = """
@@ -285,9 +278,10 @@ def test_results_that_cannot_be_printed_are_exit_6(work: Work) -> None:
     assert done.stderr == "splatctrl: output: writing failed: No space left on device; make room\n"
 
 
-def test_a_failed_gate_is_exit_1_and_keeps_the_output(work: Work, tmp_path: Path) -> None:
-    done = here.splatctrl(*work.arguments("reconstruct", tmp_path / "scene"), "-q", "--require", "splats>1000000")
-    assert done.returncode == 1
+def test_a_failed_gate_is_exit_1_an_object_with_its_verdict_and_keeps_the_output(work: Work, tmp_path: Path) -> None:
+    arguments = work.arguments("reconstruct", tmp_path / "scene")
+    done = here.splatctrl(*arguments, "-q", "--json", "--require", "splats>1000000")
+    assert done.returncode == 1 and here.checked(done.stdout, 1)["verdict"]["outcome"] == "failed"
     assert "splats is " in done.stderr
     assert (tmp_path / "scene" / "run.json").is_file()
 

@@ -30,7 +30,14 @@ REFUSED: dict[str, list[Refusal]] = {
         ("", 2, "required: COMMAND; see splatctrl --help"),
         ("scor", 2, "did you mean score?"),
     ],
-    "simulate": [("--duration 0.1", 2, "argument --duration: expected 0.5 to 600 s, got '0.1'")],
+    "simulate": [
+        ("--duration 0.1", 2, "argument --duration: expected 0.5 to 600 s, got '0.1'"),
+        (
+            "--urdf bare.urdf -o new",
+            4,
+            "expected collision geometry, got none; give a URDF with <collision> elements",
+        ),
+    ],
     "ingest": [
         ("none.mcap -o notes.txt/a/new", 2, "notes.txt is no folder; give another --out"),
         ("log.mcap --depth-scale -1", 2, "--depth-scale"),
@@ -58,6 +65,7 @@ REFUSED: dict[str, list[Refusal]] = {
         ("empty", 4, "empty: has no splats.ply"),
         ("scene --labels cat", 2, "unknown label 'cat'; known here: object, robot, human"),
         ("scene -o scene/splats.ply --force", 2, "is the input itself"),
+        ("splats.ply", 2, "splats.ply: is the input itself; give another --out"),
         ("scene -o out.stl", 2, "out.stl: expected a suffix of .ply, .splat, .spz, .glb, .usda, .usdc"),
         ("scene -o out.spz --layout full", 2, "--layout full: out.spz is not a PLY"),
         ("notes.txt", 4, "notes.txt: expected a suffix of .ply, .splat, .spz"),
@@ -67,7 +75,10 @@ REFUSED: dict[str, list[Refusal]] = {
     ],
     "reconstruct": [
         ("", 2, "expected a SOURCE or --dtu ROOT, and not both"),
-        ("log.mcap --device gpu", 2, "--device: expected auto, cpu, cuda or cuda:N, got 'gpu'"),
+        *(
+            (f"log.mcap --device {word!r}", 2, f"--device: expected auto, cpu, cuda or cuda:N, got '{word}'")
+            for word in ("gpu", "cuda:", "cuda:x", "cuda:-1", "CPU", "")
+        ),
         ("log.mcap --device cuda:99", 2, "or give --device cpu"),
         ("log.mcap --spheres x.yaml", 2, "give --urdf"),
         ("log.mcap --urdf arm.urdf --spheres ball.yaml", 4, "joints not in the log: hinge; the log has: joint_a"),
@@ -94,7 +105,7 @@ REFUSED: dict[str, list[Refusal]] = {
         ("log.mcap --seed=-1", 2, "argument --seed: expected a whole number, 0 to 2147483647"),
     ],
     GAUSSIANS: [
-        ("--device cuda", 2, "--device cuda: --method 3dgs computes on the processor; give --device cpu"),
+        ("--device cuda:0", 2, "--device cuda:0: --method 3dgs computes on the processor; give --device cpu"),
         ("--urdf robot.urdf", 2, "--urdf: does not apply"),
         ("--resume", 2, "--resume: does not apply"),
         ("--points cloud.ply", 2, "--points: does not apply"),
@@ -120,6 +131,13 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--channels sdf,colour", 2, "--channels sdf,colour: expected some of: sdf, gradient, bound"),
         ("--channels sdf --formats moveit", 2, "expected one of the channels bound, hard, got sdf"),
         ("--distance tsdf", 2, "invalid choice: 'tsdf' (choose from"),
+        ("--channels bound --set field.unknown=nan", 2, "bake the channel observed as well"),
+        ("--channels bound --set field.unknown=obstacle", 2, "bake the channel observed as well"),
+        ("--set field.unknown=nan", 5, "field.unknown = nan: expected a cell that a camera saw"),
+        ("--set field.unknown=obstacle", 5, "field.unknown = obstacle: expected a cell that a camera saw"),
+        ("--held-out log.mcap:cam9", 2, "--held-out: log.mcap has no camera cam9; it has: cam0"),
+        ("--held-out none.mcap", 4, "none.mcap: no such file"),
+        ("--reference-mesh none.ply", 4, "none.ply: no such file or folder"),
         ("--channels sdf --reference-mesh a.ply", 2, "--reference-mesh: needs the exact distance"),
         ("--previous-scene scene", 2, "belongs to --update"),
         ("--update nowhere", 4, "--update nowhere: no such folder"),
@@ -156,7 +174,7 @@ REFUSED: dict[str, list[Refusal]] = {
         ("empty far.csv", 4, "empty: expected a scene folder with splats.ply and run.json"),
         ("scene far.csv --scene scene", 2, "--scene: belongs to a field, and scene is a scene"),
         ("scene far.csv --include cat", 2, "--include cat: expected some of: robot, human"),
-        ("scene far.csv --set field.unknown=obstacle", 2, "field.unknown = obstacle: only a baked field has it"),
+        ("scene far.csv --set field.unknown=obstacle", 2, "only a baked field has it; bake it with sdf-bake"),
         ("robot.ply far.csv", 5, "none of 3 is labelled object, human"),
         ("scene far.csv -o taken.ply", 2, "taken.ply: already exists; give --force"),
     ],
@@ -208,6 +226,11 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--field x --latency 0.1", 2, "one scene for all times"),
         ("--field x --evidence cam9", 2, "a baked field does not say which cameras made it; give --scene"),
         ("--scene x --allow-disagreement", 2, "expected --lockstep"),
+        (
+            "--lockstep --evidence cam1 --cameras cam0,cam1",
+            2,
+            "--evidence cam1: --cameras names it as a training camera; leave it out of --cameras",
+        ),
         ("--scene nowhere --require min_clearence>=0", 2, "unknown metric; did you mean min_clearance"),
     ],
     REPLAY: [
@@ -322,6 +345,7 @@ def world(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
     write_mcap(folder / "states.mcap", states_of(np.tile(START, (11, 1)), joints))
     write_scene(folder / "scene", (START_NS, splats_of(BALL)))
     written(folder, arm_of(BOX, SPHERE), "arm.urdf")
+    written(folder, arm_of(BOX, SPHERE).replace("collision>", "visual>"), "bare.urdf")
     write_ply(folder / "splats.ply", ball(), {})
     (folder / "cut.ply").write_bytes((folder / "splats.ply").read_bytes()[:-5])
     robot = ball(3)

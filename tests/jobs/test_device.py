@@ -250,19 +250,6 @@ def test_a_card_that_cannot_be_used_is_refused_before_anything_is_read(
     assert not list(tmp_path.iterdir())
 
 
-def test_the_baseline_does_not_take_a_card(
-    views: Path, tmp_path: Path, on_card: EmulatedDevice, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert reconstruct(views, tmp_path / "out", "--method", "3dgs", "--device", "cuda:0") == 2
-    assert "--device cuda:0: --method 3dgs computes on the processor; give --device cpu" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("word", ["gpu", "cuda:", "cuda:x", "cuda:-1", "CPU", ""])
-def test_another_word_is_refused(word: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["reconstruct", "views.toml", "--device", word]) == 2
-    assert "expected auto, cpu, cuda or cuda:N" in capsys.readouterr().err
-
-
 def test_without_the_extra_auto_imports_nothing_and_takes_no_time() -> None:
     """A process of its own, without the extra: this one may have it."""
     code = """

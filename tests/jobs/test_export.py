@@ -51,11 +51,6 @@ def test_without_out_the_file_lies_beside_the_scene(
     assert len(read_ply(scene.parent / "scene.ply")[0]) == 400
 
 
-def test_without_out_a_splat_file_is_not_written_over_itself(scene: Path) -> None:
-    with pytest.raises(UsageError, match="is the input itself; give another --out"):
-        job.export(ExportRequest(scene=scene / "splats.ply"))
-
-
 @pytest.mark.parametrize("value", [-1e37, -1e6, 2e4, 1e37])
 @pytest.mark.parametrize("is_round", [True, False])
 def test_a_colour_that_no_picture_has_is_the_fault_of_the_input(scene: Path, value: float, is_round: bool) -> None:

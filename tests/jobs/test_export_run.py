@@ -81,8 +81,9 @@ def test_the_splats_of_each_time_are_clouds(run: Runs, tmp_path: Path) -> None:
         np.testing.assert_allclose(values["alpha"] / 255, splats.opacities, atol=0.002)
 
 
-def test_every_link_is_where_the_robot_has_it(run: Runs, arm: RobotModel) -> None:
-    found = logged(run())
+def test_every_link_is_where_the_robot_has_it_and_our_own_reader_reads_it_too(run: Runs, arm: RobotModel) -> None:
+    folder = run()
+    found = logged(folder)
     assert len(found["/tf"]) == len(passing())
     for state, (stamp, message) in zip(passing(), found["/tf"], strict=True):
         assert stamp == state.stamp_ns
@@ -97,11 +98,6 @@ def test_every_link_is_where_the_robot_has_it(run: Runs, arm: RobotModel) -> Non
     assert len(meshes) > 5
     assert (entity.frame_id, entity.frame_locked) == ("hand", True)
     assert max(entity.triangles[0].indices) < len(entity.triangles[0].points)
-
-
-def test_the_transforms_are_read_by_our_own_reader_too(run: Runs) -> None:
-    folder = run()
-    logged(folder)
     with folder.with_name("out.mcap").open("rb") as stream:
         schema, _, message = next(iter(make_reader(stream).iter_messages(topics=["/tf"])))
     assert schema is not None

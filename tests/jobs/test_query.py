@@ -153,11 +153,6 @@ def test_a_wrong_line_after_many_right_ones_leaves_no_file(scene: Path, monkeypa
     assert [path.name for path in scene.parent.iterdir()] == ["scene"]
 
 
-def test_unknown_space_that_counts_as_something_is_a_matter_of_grids(scene: Path) -> None:
-    with pytest.raises(UsageError, match="only a baked field has it; bake it with sdf-bake"):
-        asked(scene, config=replace(Config(), field=FieldConfig(unknown="obstacle")))
-
-
 def test_cells_without_a_distance_are_told(scene: Path) -> None:
     outside = (-2.5, -0.4, -0.4, 0.9, 0.4, 0.4)
     field = baked(scene, scene.parent / "field", voxel=0.1, box=outside, field={"unknown": "nan"}).out

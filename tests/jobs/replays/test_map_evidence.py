@@ -240,13 +240,6 @@ def test_evidence_that_is_none_is_refused(
     assert not (desk.folder / "out").exists()
 
 
-def test_a_table_of_states_and_a_field_have_no_evidence(
-    desk: Desk, scene: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    desk.source.cameras = ()
-    assert desk.replay(*scene, "--evidence", "cam0x") == 4
-
-
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording") / "small"
@@ -316,19 +309,6 @@ def test_a_lockstep_bounds_its_own_map(recording: Path, tmp_path: Path, evidence
     same = json.loads((tmp_path / "again" / "summary.json").read_text())["metrics"]
     assert same["map_error_bound"] == metrics["map_error_bound"]
     assert main([*log, "--scene", str(out / "scene"), "--evidence", "3", "-o", str(tmp_path / "3")]) == 2
-
-
-def test_an_evidence_camera_is_left_out_of_the_training_or_refused(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = ["replay", str(recording / "log.mcap"), "--urdf", str(recording / "robot.urdf"), "--lockstep", "-q"]
-    log += ["--spheres", str(recording / "robot_spheres.yaml"), "-o", str(tmp_path / "out"), "--evidence", "cam1"]
-    assert main([*log, "--cameras", "cam0,cam1"]) == 2
-    assert (
-        "--evidence cam1: --cameras names it as a training camera; leave it out of --cameras"
-        in capsys.readouterr().err
-    )
-    assert not (tmp_path / "out").exists()
 
 
 def test_the_map_of_evidence_is_the_one_that_states_before_it_were_judged_by(desk: Desk, scene: list[str]) -> None:

@@ -258,10 +258,3 @@ def test_stored_objects_are_those_of_a_list_over_the_borders_of_blocks() -> None
     whole = list(range(6))
     assert list(stored) == whole and stored[-1] == 5 and stored[4:1:-1] == whole[4:1:-1]
     assert all(stored[i:j] == whole[i:j] for i in range(-7, 8) for j in range(-7, 8))
-
-
-def test_a_gate_on_poses_that_the_log_lacks_fails(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    assert desk.replay("--scene", str(scene), "-q", "--require", "max_pose_position<=0.01") == 5
-    assert "max_pose_position is unknown" in capsys.readouterr().err
-    assert desk.metrics()["num_poses"] == 0
