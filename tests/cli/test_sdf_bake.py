@@ -1,6 +1,4 @@
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -25,20 +23,13 @@ from splatctrl_cli.simulate.truth import load_truth
 from splatctrl_cli.splat_files import splat_formats
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.cli import here
+from tests.cli.test_command_line import splatctrl
 from tests.field.scenes import cloud, splat_set
+from tests.jobs.stopped import interrupt
 from tests.plain import known, plain_grid
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 COARSE = ("--set", "field.max_loss=1")  # cells that are baked in no time
-
-
-def sdf_bake(*arguments: object) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(
-        [sys.executable, "-m", "splatctrl_cli", "sdf-bake", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +46,9 @@ def cloud_without_points():  # type: ignore[no-untyped-def]
 
 def test_bakes_both_formats_a_header_and_a_run(tmp_path: Path, splats: Path) -> None:
     out = tmp_path / "field"
-    result = sdf_bake(splats, "-o", out, "--json", "--voxel", 0.05, *COARSE, "--require", "num_cells>=1000")
+    result = splatctrl(
+        "sdf-bake", splats, "-o", out, "--json", "--voxel", 0.05, *COARSE, "--require", "num_cells>=1000"
+    )
     assert (result.returncode, result.stderr.count("\n")) == (0, 1)
     assert sorted(path.name for path in out.iterdir()) == [
         *("field.json", "field.npz", "field.vti", "report", "run.json")
@@ -230,7 +223,3 @@ def test_resume_goes_on_with_what_is_left(tmp_path: Path, splats: Path, monkeypa
     resumed = here.splatctrl(*given, "--resume")
     assert resumed.returncode == 0
     assert "continues after" in resumed.stderr
-
-
-def interrupt(*_: object) -> None:
-    raise KeyboardInterrupt

@@ -1,8 +1,6 @@
 """``splatctrl simulate``: the files it writes, the same bytes twice, and how it fails."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +12,9 @@ from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
 from tests.cli import here
+from tests.cli.test_command_line import splatctrl
 
 TINY = ("--duration", "0.6", "--fps", "5", "--width", "64", "--height", "48")
-
-
-def splatctrl(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "splatctrl_cli", *(str(word) for word in arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,16 @@
 """What tests of replays share with those of the command, and with those of what reads replays."""
 
+import pytest
+
+from splatctrl_cli.robot.model import RobotModel
 from tests.cli.conftest import arm, coverage_once, desk, unpainted, without_plots
+from tests.cli.replay_desk import Desk
 from tests.jobs.runs import run
+from tests.jobs.stage import Stage
 
 __all__ = ["arm", "coverage_once", "desk", "run", "unpainted", "without_plots"]
+
+
+@pytest.fixture
+def stage(desk: Desk, arm: RobotModel) -> Stage:
+    return Stage(desk=desk, arm=arm)

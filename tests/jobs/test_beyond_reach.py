@@ -16,10 +16,9 @@ from splatctrl_cli.jobs.export import ExportRequest, export
 from splatctrl_cli.jobs.query import QueryRequest, query
 from splatctrl_cli.jobs.reports.spaces import space_of_scene
 from splatctrl_cli.records import SplatSet
-from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_folder import open_scene
 from splatctrl_cli.splat_files.splats import SHELL, read_ply, write_ply
-from tests.cli.replay_desk import Desk, splats_of
+from tests.cli.replay_desk import splats_of
 from tests.jobs.bakes.baked import baked
 from tests.jobs.runs import patch_json
 from tests.jobs.scores.test_score import run as scores
@@ -35,11 +34,6 @@ def with_shell(scene: Path, shell: SplatSet) -> Path:
         write_ply(path, shell, SHELL)
     patch_json(scene / "run.json", lambda run: run | {"parts": part_digests(scene)})
     return scene
-
-
-@pytest.fixture
-def stage(desk: Desk, arm: RobotModel) -> Stage:
-    return Stage(desk=desk, arm=arm)
 
 
 def in_the_way(stage: Stage) -> SplatSet:

@@ -15,6 +15,7 @@ from splatctrl_cli.kernels.cuda.driver import Card
 from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Memory
 from splatctrl_cli.scene.fitter import SceneFitter
 from tests.cli.test_reconstruct import contents, write_folder
+from tests.jobs.stopped import failing
 from tests.kernels.cuda.emulator import EmulatedDevice
 from tests.kernels.cuda.test_driver import FakeDriver
 from tests.scene.wall import frame
@@ -98,23 +99,13 @@ class Fails(EmulatedDevice):
 def test_a_run_that_one_device_began_goes_on_on_the_other(
     views: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     on_card: EmulatedDevice,
     capsys: pytest.CaptureFixture[str],
     begins: str,
     goes_on: str,
 ) -> None:
-    step, num_steps = SceneFitter.step, 0
-
-    def stopped(*given: Any) -> Any:
-        nonlocal num_steps
-        num_steps += 1
-        if num_steps == 2:
-            raise KeyboardInterrupt
-        return step(*given)
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SceneFitter, "step", stopped)
+        patch.setattr(SceneFitter, "step", failing(SceneFitter.step, 2, KeyboardInterrupt()))
         assert reconstruct(views, tmp_path / "scene", "--device", begins) == 130
     capsys.readouterr()
     assert reconstruct(views, tmp_path / "scene", "--device", goes_on, "--resume") == 0
@@ -201,15 +192,7 @@ def test_auto_goes_on_where_the_run_was(
         cards(monkeypatch, Fails(15, DeviceError("CUDA_ERROR_DEVICE_LOST")))
         with pytest.MonkeyPatch.context() as patch:
             if begins == "cpu":
-                stop = iter([False, True])
-                step = SceneFitter.step
-
-                def stopped(*given: Any, stop: Any = stop, step: Any = step) -> Any:
-                    if next(stop):
-                        raise KeyboardInterrupt
-                    return step(*given)
-
-                patch.setattr(SceneFitter, "step", stopped)
+                patch.setattr(SceneFitter, "step", failing(SceneFitter.step, 2, KeyboardInterrupt()))
             assert reconstruct(views, tmp_path / name, "--device", begins, "-q") in (70, 130)
         cards(monkeypatch, EmulatedDevice())
         if not has_card:

@@ -16,17 +16,15 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.jobs.ingest import IngestRequest, PackRequest, ingest, pack, unpack
 from splatctrl_cli.jobs.logged_robot import differs, logged_urdf, urdf_of
-from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstructions.reconstruct import _robot
 from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replays.inputs import open_log
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.reports.spaces import space_of
-from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
-from tests.cli.replay_desk import Desk
+from tests.jobs.bakes.baked import Said
 from tests.jobs.stage import Stage
 from tests.logs.make_log import START_NS, STORE, LogRecipe, encoded, make_log, messages_of, write_bag, write_raw
 from tests.logs.make_states import joint_state
@@ -79,14 +77,6 @@ def as_parameter(text: str, kind: int = 4) -> RawMessage:
 def log_with(path: Path, *messages: RawMessage, **recipe: Any) -> Path:
     """The log of `make_log` behind these messages."""
     return write_raw(path, [*messages, *messages_of(make_log(path.with_name("plain.mcap"), LogRecipe(**recipe)))])
-
-
-class Said(Progress):
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def log(self, message: str) -> None:
-        self.lines.append(message)
 
 
 @pytest.mark.parametrize("kind", ["topic", "namespace", "parameter", "ROS 1"])
@@ -218,9 +208,8 @@ def test_a_replay_says_where_it_places_the_robot_of_the_log(tmp_path: Path) -> N
 
 
 def test_a_replay_keeps_the_robot_of_its_log_for_who_looks_at_it(
-    desk: Desk, arm: RobotModel, monkeypatch: pytest.MonkeyPatch
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stage = Stage(desk=desk, arm=arm)
     urdf, spheres = stage.desk.robot[1], stage.desk.robot[3]
     names = tuple(f"joint{i}" for i in range(1, 8))
     states = [encoded(s.stamp_ns, "/joint_states", joint_state(s.stamp_ns, names, s.position)) for s in stage.states]

@@ -26,6 +26,7 @@ from splatctrl_cli.records import Label
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.field.scenes import cloud, splat_set
 from tests.jobs.bakes.baked import Said, baked
+from tests.jobs.stopped import contents, failing
 
 ROOT = Path(__file__).parents[3]
 CHANNELS = ("gradient", "bound", "observed", "label", "se")
@@ -52,30 +53,9 @@ def whole(splats: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, A
     return contents(out)
 
 
-def contents(folder: Path) -> dict[str, Any]:
-    """Bytes by name, of run.json all but the timings and the command line."""
-    found: dict[str, Any] = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    run = json.loads(found["run.json"])
-    del run["seconds"], run["arguments"]
-    return found | {"run.json": run}
-
-
 def bake(splats: Path, out: Path, **more: Any) -> BakeResult:
     options: dict[str, Any] = {"voxel": 0.03, "channels": CHANNELS, "formats": ("npz", "vti")}
     return baked(splats, out, **(options | more))
-
-
-def stopped(monkeypatch: pytest.MonkeyPatch, error: BaseException, after: int) -> None:
-    """The slab number `after` raises instead of being written."""
-    real, calls = GridSlabs.write, []
-
-    def write(self: GridSlabs, *slab: Any) -> None:
-        calls.append(1)
-        if len(calls) == after:
-            raise error
-        real(self, *slab)
-
-    monkeypatch.setattr(GridSlabs, "write", write)
 
 
 @pytest.mark.usefixtures("small_slabs")
@@ -88,7 +68,7 @@ def test_slabs_do_not_change_a_bit(splats: Path, whole: dict[str, Any], tmp_path
 def interrupted(splats: Path, out: Path, after: int) -> str:
     """What a person is told whose bake was stopped at that slab."""
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt) as stop:
-        stopped(patch, KeyboardInterrupt(), after)
+        patch.setattr(GridSlabs, "write", failing(GridSlabs.write, after, KeyboardInterrupt()))
         bake(splats, out)
     return str(stop.value)
 
@@ -230,7 +210,7 @@ def test_a_disk_that_fills_up_is_a_failure_to_write_and_goes_on(
 ) -> None:
     full = OSError(28, "No space left on device", str(tmp_path / "field.partial" / "channels" / "sdf.npy"))
     with pytest.MonkeyPatch.context() as patch, pytest.raises(WriteError, match="--resume"):
-        stopped(patch, full, 3)
+        patch.setattr(GridSlabs, "write", failing(GridSlabs.write, 3, full))
         bake(splats, tmp_path / "field")
     bake(splats, tmp_path / "field", resume=True)
     assert contents(tmp_path / "field") == whole

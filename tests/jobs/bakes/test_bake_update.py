@@ -18,6 +18,7 @@ from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.field.scenes import cloud, splat_set
 from tests.jobs.bakes.baked import Said, baked, field_json
+from tests.jobs.stopped import interrupt
 from tests.plain import known, plain_grid
 
 BOX = (-0.6, -0.6, -0.5, 0.6, 0.6, 0.5)
@@ -91,10 +92,6 @@ def test_an_update_can_be_in_slabs_and_interrupted(
     assert npz(tmp_path / "field") == npz(fields / "2")
     bake(scene, tmp_path / "other", at=0, update=fields / "0", resume=True)
     assert npz(tmp_path / "other") == npz(fields / "0")
-
-
-def interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 def test_a_bare_file_needs_its_predecessor(tmp_path: Path) -> None:

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import load_config
-from splatctrl_cli.jobs.progress import SILENT, Progress, Silent
+from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.records import Record
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.recording import START_NS, Recording, RecordingOptions
 from tests.cli.replay_desk import START, Desk, FakeSource
+from tests.jobs.bakes.baked import Said
 from tests.jobs.stage import MOVE, Stage, states_on
 
 pytestmark = pytest.mark.usefixtures("without_plots")
@@ -23,16 +24,6 @@ HELD = '<collision><origin xyz="0 0 0.15"/><geometry><box size="0.07 0.07 0.07"/
 BOX = "[-0.045, -0.045, 0.105, 0.045, 0.045, 0.195]"
 FRAMES = 6
 RAISED = START + np.array([0.0, -0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
-
-
-class Heard(Silent):
-    """Keeps the lines."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def log(self, line: str) -> None:
-        self.lines.append(line)
 
 
 @dataclass(kw_only=True)
@@ -91,7 +82,7 @@ def mapped(stage: Stage, declare: Path | None, progress: Progress = SILENT) -> R
 def test_a_box_that_is_declared_is_no_obstacle_and_listed_by_every_verdict(stage: Stage, tmp_path: Path) -> None:
     """The declared box is a centimetre larger than the cube on every side; a second one holds nothing."""
     declare = declared(tmp_path, BOX, "[0.5, 0.5, 0.5, 0.6, 0.6, 0.6]")
-    heard = Heard()
+    heard = Said()
     found = mapped(stage, declare, heard)
     scene = stage.desk.folder / "scene"
     code, verdict = stage.judged("--declare", str(declare), scene=scene)
@@ -127,7 +118,7 @@ def test_links_that_spheres_stand_for_are_named(stage: Stage, tmp_path: Path) ->
     shape = text.index("<box", text.index("<collision>", start))
     other = tmp_path / "other.urdf"
     other.write_text(text[:shape] + '<cone radius="0.1" length="0.1"/>' + text[text.index("/>", shape) + 2 :])
-    heard = Heard()
+    heard = Said()
     mapped(stage, None, heard)
     assert not [line for line in heard.lines if "spheres stand for" in line]
     stage.desk.robot[1], stage.desk.folder = str(other), tmp_path / "again"

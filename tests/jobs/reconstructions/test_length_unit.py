@@ -21,20 +21,11 @@ from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
 from tests.datasets.make_layout import OPENGL_FROM_OPTICAL
+from tests.jobs.bakes.baked import Said
 
 CONFIG = Config(scene=SceneConfig(max_splats=600, first_iterations=20, refine_iterations=20))
 DEPTH_ONLY = {"poses": 1.0, "depths": 1000.0}
 POSES_ONLY = {"poses": 1000.0, "depths": 1.0}
-
-
-class Said(Progress):
-    is_quiet = True
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def log(self, message: str) -> None:
-        self.lines.append(message)
 
 
 @pytest.fixture(scope="module")

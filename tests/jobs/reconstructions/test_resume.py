@@ -1,12 +1,10 @@
 """``splatctrl reconstruct --resume``: whatever stops a run, the rest of it ends in the same bytes."""
 
 import json
-import os
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene_files import scene_writer
 from splatctrl_cli.scene_files.scene_folder import open_scene
+from tests.jobs.stopped import contents, failing
 
 DTU = Path(__file__).parents[3] / "sample_data" / "dtu"
 FAST = [
@@ -50,32 +49,6 @@ def command(recording: Path, kind: str, out: Path) -> list[str]:
         "dtu": ["--dtu", str(DTU), "--holdout", "2,3,4,5,6,7"],
     }
     return ["reconstruct", *given[kind], "-o", str(out), *FAST]
-
-
-def contents(folder: Path) -> dict[str, Any]:
-    """Bytes by name, of run.json all but the timings and the command line."""
-    found: dict[str, Any] = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    run = json.loads(found["run.json"])
-    del run["seconds"], run["arguments"]
-    return found | {"run.json": run}
-
-
-def failing(real: Callable[..., Any], when: int, error: BaseException) -> Callable[..., Any]:
-    """`real`, but its call number `when` does half of its work and raises."""
-    calls = 0
-
-    def call(path: Path, *rest: Any, **named: Any) -> Any:
-        nonlocal calls
-        calls += 1
-        if calls == when and not isinstance(path, Path):
-            raise error
-        result = real(path, *rest, **named)
-        if calls == when:
-            os.truncate(path, path.stat().st_size // 2)
-            raise error
-        return result
-
-    return call
 
 
 PLACES = [
