@@ -159,6 +159,7 @@ NEAR_NEW = 0.05  # [m] from the arm at the first state: space that the motion co
 NEAR_FRESH_SHARE = 0.75  # of the seen points; the arm itself hides up to a quarter of its shell for seconds
 NEAR_BLIND = 0.9  # of the new points of a sphere's shell never seen: it comes to the unknown
 NEAR_DIRECTIONS = 200  # of a sphere, in which unseen space is looked for: 20 mm apart on a shell of 80 mm
+NEAR_LAYER = 0.03  # [m] between shells about a sphere, where the margin is so wide that there are several
 NEAR_FEWEST = 5  # such points, at least
 NEAR_FEWEST_FINE = 20  # such points of those 200 directions, at least
 UNWATCHED_NS = 500_000_000  # [ns] without depth from about the arm: two frame sets of a slow recording

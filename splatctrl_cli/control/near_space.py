@@ -64,7 +64,10 @@ class NearSpace:
         self._model = model
         self._moving = np.flatnonzero(model.moving_spheres)
         self._radii = np.asarray(model.sphere_set.radii, np.float64)
-        self._margin = margin
+        self._margin, self._depths = (
+            margin,
+            np.arange(margin, 0.0, -fixed.NEAR_LAYER),
+        )  # of shells, the outermost first
         self._first: Float64 | None = None  # centres (S, 3) of the first state
         self._next_ns = -(2**63)
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres when they were last looked about
@@ -89,6 +92,12 @@ class NearSpace:
             return False
         return bool(np.sum((centers - self._looked) ** 2, axis=1).max(initial=0.0) >= fixed.NEAR_MOVED**2)
 
+    def on_the_way(self, first: Float64, last: Float64) -> Float64:
+        """Postures (K, J) between two (J,), so many that no sphere moves by `NEAR_MOVED` from one to the next."""
+        begin, end = self._model.sphere_centers_batch(np.stack([first, last]))[:, self._moving]
+        num = int(np.ceil(np.linalg.norm(end - begin, axis=1).max(initial=0.0) / fixed.NEAR_MOVED))
+        return np.asarray(first + (last - first) * (np.arange(1, num) / max(num, 1))[:, None])
+
     def look(
         self, stamp_ns: int, q: Float64, known: Seen, distance: Callable[[Float64], Float64] | None = None
     ) -> NearFigures:
@@ -96,7 +105,7 @@ class NearSpace:
         centers = self._model.sphere_centers(q)
         if self._first is None:
             self._first = centers
-        points, owners = self._shell(centers, DIRECTIONS)
+        points, owners = self._shell(centers, DIRECTIONS, self._margin)
         fewest = fixed.NEAR_LEAST_SHARE * len(self._moving) * len(DIRECTIONS)
         seen = known.last_ns(points)
         is_never = seen < 0
@@ -117,9 +126,11 @@ class NearSpace:
         edge, edge_place = self._nearest(known.edges[:, :3], centers, known.edges[:, 3])
         hidden, hidden_place = beyond, beyond_place = NOWHERE
         if distance is not None:
-            fine, owners = self._shell(centers, FINE)
+            fine, owners = self._shell(centers, FINE, self._margin)
             is_never = known.last_ns(fine) < 0
-            hidden, hidden_place = _nearest_of(fine[is_never], distance)
+            within = [self._shell(centers, FINE, away)[0] for away in self._depths[1:]]
+            never = [fine[is_never], *(points[known.last_ns(points) < 0] for points in within)]
+            hidden, hidden_place = _nearest_of(np.concatenate(never), distance)
             beyond, beyond_place = _nearest_of(fine[self._is_in_the_blind(fine, owners, is_never)], distance)
         return NearFigures(
             unseen=unseen,
@@ -136,9 +147,9 @@ class NearSpace:
             edge_place=edge_place,
         )
 
-    def _shell(self, centers: Float64, directions: Float64) -> tuple[Float64, NDArray[np.int64]]:
-        """Points (Q, 3), the margin away from moving spheres and outside of all others, and their spheres (Q,)."""
-        offsets = (self._radii[self._moving] + self._margin)[:, None, None] * directions
+    def _shell(self, centers: Float64, directions: Float64, away: float) -> tuple[Float64, NDArray[np.int64]]:
+        """Points (Q, 3), so far [m] from moving spheres and outside of all others, and their spheres (Q,)."""
+        offsets = (self._radii[self._moving] + away)[:, None, None] * directions
         points = (centers[self._moving][:, None] + offsets).reshape(-1, 3)
         owners = np.repeat(self._moving, len(directions))
         is_outside = _is_outside(points, centers, self._radii + fixed.NEAR_APART, owners)
@@ -166,7 +177,7 @@ class NearSpace:
         spheres, at least 0, and that point (3,).
         """
         moving, radii = centers[self._moving], self._radii[self._moving]
-        around = radii.max() + fixed.NEAR_NEW
+        around = radii.max() + max(fixed.NEAR_NEW, self._margin + np.max(reach, initial=0.0))
         is_near = np.all((points > moving.min(axis=0) - around) & (points < moving.max(axis=0) + around), axis=1)
         if not is_near.any():
             return NOWHERE

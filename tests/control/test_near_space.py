@@ -127,6 +127,31 @@ def test_a_lost_edge_is_as_near_as_its_ball() -> None:
     assert nothing.edge == np.inf and np.isnan(nothing.edge_place).all()
 
 
+@pytest.mark.parametrize(("away", "is_found"), [(0.09, True), (0.11, False)])
+def test_a_wide_margin_is_looked_for_as_far_as_it_reaches(away: float, is_found: bool) -> None:
+    """A place without depth, which is a lost edge too, off the end of the arm."""
+    arm = PlanarArm()
+    tip = arm.sphere_centers(LATER)[-1]
+    out = tip - arm.sphere_centers(LATER)[-2]
+    place = tip + out / np.linalg.norm(out) * (arm.sphere_set.radii[-1] + away)
+    known = Seen(last_ns=half_seen, unanswered=place[None], edges=np.array([[*place, 1e-3]]))
+    found = NearSpace(arm, 0.1).look(0, LATER, known)
+    assert found.unanswered == pytest.approx(away) or not is_found
+    assert found.edge == pytest.approx(away - 1e-3) or not is_found
+
+
+@pytest.mark.parametrize("away", [0.02, 0.05, 0.09])
+def test_an_unseen_pocket_anywhere_within_a_wide_margin_is_found(away: float) -> None:
+    arm = PlanarArm()
+    place = arm.sphere_centers(LATER)[-1] + np.array([0.0, 0.0, arm.sphere_set.radii[-1] + away])
+
+    def outside(points: Float64) -> NDArray[np.int64]:
+        return np.where(np.linalg.norm(points - place, axis=1) < 0.02, -1, 0)
+
+    found = NearSpace(arm, 0.1).look(0, LATER, Seen(last_ns=outside), lambda points: np.full(len(points), 0.01))
+    assert found.hidden == 0.01
+
+
 def test_the_share_of_blind_spheres_is_that_of_the_reference() -> None:
     arm, space = PlanarArm(), NearSpace(PlanarArm(), 0.03)
     space.look(0, FIRST, Seen(last_ns=half_seen))

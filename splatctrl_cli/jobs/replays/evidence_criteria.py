@@ -114,7 +114,7 @@ def _near_places(judged: Judged) -> Iterator[Reason]:
     margin = judged.replay.margin
     for column, least, sentence, remedy in NEAR_PLACES:
         distance, allowed = judged.replay.near[column], margin if least is None else least
-        if not np.any(distance < allowed):
+        if not np.any(distance <= allowed):
             continue
         worst = int(np.nanargmin(distance))
         place = judged.replay.near[f"{column}_place"][worst]
@@ -127,7 +127,7 @@ def _near_places(judged: Judged) -> Iterator[Reason]:
             place=tuple(place.tolist()),
             cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*place),
             remedy=remedy,
-            count=int((distance < allowed).sum()),
+            count=int((distance <= allowed).sum()),
         )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_gaps
 
 NEAR_NAMES = tuple(field.name for field in fields(NearFigures))
-NEAR_DISTANCES = tuple(f"{name}{of}" for name in ("unanswered", "hidden", "beyond", "edge") for of in ("", "_place"))
+NEAR_DISTANCES = ("unanswered", "hidden", "beyond", "edge")  # of them, each with its place
 AGES = ("age", "ahead")  # of them, where times of seeing are known
 
 
@@ -81,6 +82,7 @@ class ReplayRecord:
             np.broadcast_to(limit, model.velocity_limit.shape) if limit.any() else None,
         )
         self.near, self._near = Figures(), NearSpace(model, config.control.margin)
+        self._posture_before: Float64 | None = None  # at the end of the last block
         self.hindsight = Hindsight(scene, self._near, config.control.margin, self._clearance_in)
         self.newer_depth = NewerDepth(scene, config.control.margin - SLIGHTLY_UNDER, self._clearance_in)
         self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
@@ -239,7 +241,7 @@ class ReplayRecord:
             self.statics[name] = (first, min(least, value))
 
     def _look_around(self, part: AuditTrace) -> None:
-        """What was known of the space about the arm, at some of the states."""
+        """What was known of the space about the arm, at some of the states and on the way there."""
         num = len(part.stamp_ns)
         columns = {name: np.full((num, 3) if "place" in name else num, np.nan) for name in NEAR_NAMES}
         if self._scene.has_seen_times:
@@ -249,12 +251,19 @@ class ReplayRecord:
             known = self._scene.seen_at(stamp)
             if known is not None:
                 exact = self._scene.at(stamp).distances["exact"]
-                figures = self._near.look(stamp, part.position[at], known, exact)
-                for name in NEAR_NAMES if is_timed else NEAR_DISTANCES:
+                before, q = part.position[at - 1] if at else self._posture_before, part.position[at]
+                way = self._near.on_the_way(before, q) if before is not None and self._is_continuous else ()
+                figures, *others = (self._near.look(stamp, each, known, exact) for each in (q, *way))
+                for name in NEAR_NAMES if is_timed else ():
                     if self._scene.has_seen_times or name not in AGES:
                         columns[name][at] = getattr(figures, name)
+                for name in NEAR_DISTANCES:
+                    nearest = min((figures, *others), key=attrgetter(name))
+                    columns[name][at], place = getattr(nearest, name), getattr(nearest, f"{name}_place")
+                    columns[f"{name}_place"][at] = place
                 if is_timed and self._scene.has_seen_times:
                     self.hindsight.looked(stamp, figures.age)
+        self._posture_before = part.position[-1]
         self.near.append(**columns)
 
     def _tell_represented(self, part: AuditTrace) -> None:

@@ -172,3 +172,10 @@ def test_a_place_of_which_too_little_is_known_near_the_arm_is_no_evidence(
     assert [r.count for r in found] == [1] * count
     assert not found or (found[0].time_s, found[0].place) == (pytest.approx(0.4), (0.25, 0.25, 0.25))
     assert not found or f"{1e3 * max(distance, 0):.1f} mm" in found[0].sentence
+
+
+@pytest.mark.parametrize("column", ["unanswered", "edge"])
+def test_the_arm_in_such_a_place_is_no_evidence_without_a_margin_either(column: str) -> None:
+    near = np.where(np.arange(NUM) == 4, 0.0, np.inf)
+    run = judged(margin=0.0, near=NOTHING_NEAR | {column: near, f"{column}_place": np.zeros((NUM, 3))})
+    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == 1

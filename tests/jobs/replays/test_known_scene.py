@@ -5,9 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.events import Obstacle
+from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.grid_files.npz_grid import read_npz, write_npz
-from splatctrl_cli.jobs.replays.known_scene import KnownScene, fields_at, known_space
+from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene, fields_at, known_space
+from splatctrl_cli.jobs.replays.state_pass import ReplayRecord
+from splatctrl_cli.jobs.studies.problems import simulated_arm
+from splatctrl_cli.records import Float64
 from splatctrl_cli.voxels import SWEPT, VoxelState
 from tests.cli.replay_desk import SECOND
 from tests.jobs.stage import FAR, Stage, decisive, passing
@@ -40,6 +46,41 @@ def test_space_that_a_camera_saw_or_the_robot_was_in_is_known() -> None:
     grid = plain_grid(shape, 0.1, 0.0, log_odds=0.0, num_updates=seen, entity=entity)
     points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [9.0, 0, 0]])
     assert known_space(grid)(points).tolist() == [1, 1, 0, 0]
+
+
+@pytest.mark.parametrize("is_continuous", [True, False])
+def test_the_space_about_the_arm_is_asked_between_states_that_are_far_apart(is_continuous: bool) -> None:
+    """A tenth of a second in which the hand sweeps through a lost edge that neither state is near."""
+    model, q, turn = simulated_arm(), np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785]), 0.3 * np.eye(7)[0]
+    edge = model.sphere_centers(q)[-1]
+    nothing = Obstacle(distance=1.0, position=(np.nan, np.nan, np.nan))
+    fields = KnownFields(
+        barrier=Away(),
+        distances={"exact": away, "barrier": away},
+        median_radius=0.01,
+        obstacles=lambda points: (nothing,) * len(points),
+    )
+    seen = Seen(last_ns=lambda points: np.zeros(len(points), np.int64), edges=np.array([[*edge, 1e-3]]))
+    scene = KnownScene(
+        at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={}, seen_at=lambda _: seen
+    )
+    record = ReplayRecord(model, scene, config=Config(), max_map_age=1.0, is_continuous=is_continuous)
+    record.measured(np.array([0, SECOND // 10]), np.array([q - turn, q + turn]), np.zeros((2, 7)))
+    first, second = record.near["edge"]
+    assert first > 0.02
+    assert (second == 0.0) if is_continuous else (second > 0.02)
+    assert np.isinf(second) or record.near["edge_place"][1] == pytest.approx(edge)
+
+
+class Away:
+    """One metre from everything."""
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        return away(points), np.zeros_like(points)
+
+
+def away(points: Float64) -> Float64:
+    return np.full(len(points), 1.0)
 
 
 @pytest.mark.usefixtures("without_plots")
