@@ -129,7 +129,8 @@ def approach_to(
         q = _solved(model, frame, T, way[0], control)
         if q is None or np.max(np.abs(q - way[0])) > fixed.APPROACH_TURN:
             break
-        if not check_edges(room, q[None], way[0][None], contact=planner.contact).is_free[0]:
+        is_free = check_edges(room, q[None], way[0][None], contact=planner.contact).is_free[0]
+        if not is_free or room.at(q[None])[0] < planner.contact:
             break
         way.insert(0, q)
     return np.array(way)

@@ -96,7 +96,7 @@ def _layer(
 
 def _everywhere(is_seen: Callable[[Float64], Sequence[bool]], points_world: Float64, is_asked: Bool) -> Bool:
     """What was seen (H, W) of points (H, W, 3), asked at every second pixel of both directions."""
-    coarse = np.zeros(is_asked[::2, ::2].shape, bool)
+    coarse = np.ones(is_asked[::2, ::2].shape, bool)
     coarse[is_asked[::2, ::2]] = is_seen(points_world[::2, ::2][is_asked[::2, ::2]])
     return coarse.repeat(2, axis=0).repeat(2, axis=1)[: is_asked.shape[0], : is_asked.shape[1]]
 

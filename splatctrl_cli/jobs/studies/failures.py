@@ -6,10 +6,11 @@ from textwrap import shorten
 
 import numpy as np
 
+from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.jobs.studies import judge
 from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.jobs.studies.views import Views
-from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance
+from splatctrl_cli.planner.configuration_clearance import HasDistance
 from splatctrl_cli.records import Float32, Float64
 from splatctrl_cli.report import trial_picture as drawn
 from splatctrl_cli.robot.surface import RobotSurface
@@ -149,9 +150,7 @@ def _caption(failure: Failure, at: Place) -> str:
     """Which trial, cause, verdict, and how far the sphere is from things by the truth and by the map."""
     problem, model = failure.problem, failure.problem.model
     center, radius = model.sphere_centers(at.q)[[at.sphere]], float(model.sphere_set.radii[at.sphere])
-    names = Clearance.of(model, problem.solids).names
-    moving = np.flatnonzero(model.moving_spheres)
-    name = names[int(np.searchsorted(moving, at.sphere))]
+    name = sphere_names(model.sphere_set)[at.sphere]
     gaps = [("true", problem.solids), *([("in the map", failure.scene)] if failure.scene is not None else [])]
     said = ", ".join(f"{1e3 * float(scene.distance(center)[0] - radius):.1f} mm {what}" for what, scene in gaps)
     where = ", ".join(f"{value:.2f}" for value in at.point)

@@ -222,9 +222,10 @@ def without_robot(problem: Problem, views: Views, config: Config) -> list[RgbdFr
 
 
 def _without_robot(frame: RgbdFrame, robot: RobotPosture, config: Config) -> RgbdFrame:
-    kinds = self_mask(frame, robot, config.occupancy).kinds
-    depth = np.where(kinds == PixelKind.OBJECT, frame.depth, np.float32(0))
-    is_valid = (kinds == PixelKind.OBJECT) | (kinds == PixelKind.NOTHING)
+    mask = self_mask(frame, robot, config.occupancy)
+    is_thing = mask.kinds == PixelKind.OBJECT
+    depth = np.where(is_thing, frame.depth, np.float32(0))
+    is_valid = is_thing | ((mask.kinds == PixelKind.NOTHING) & (mask.robot_depth == 0))
     return replace(frame, depth=depth, valid=is_valid if frame.valid is None else is_valid & frame.valid)
 
 

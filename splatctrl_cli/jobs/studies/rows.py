@@ -90,7 +90,7 @@ def read_trials(path: Path, kind: type[R]) -> list[R]:
             return [kind(**_values(row, types)) for row in rows]
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="check the path") from None
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, csv.Error) as error:
         raise InputError(f"{path}: is not a table of trials: {error}", remedy="run its problem again") from None
 
 

@@ -210,14 +210,14 @@ def trial_of(rig: Rig, method: str, num_cameras: int, robot: MeasuredRobot) -> T
     if attempt.position is not None:
         with rig.stopwatch.stage(f"{method}: judge"):
             told = _judged(rig, told, attempt, known, robot)
-    if not told.success and method != TRUTH:
+    if not told.success:
         _draw(rig, told, attempt, known)
     return told
 
 
 def _draw(rig: Rig, trial: Trial, attempt: Attempt | None, known: Map | None) -> None:
     """A picture of a trial without success."""
-    if rig.out is None:
+    if rig.out is None or trial.method == TRUTH:
         return
     with rig.stopwatch.stage("pictures"):
         failures.draw(
@@ -267,7 +267,7 @@ def by_planner(rig: Rig, known: Map) -> Attempt:
     """A planned path, followed in joint space: the first of the map's ways that leads to the goal, each tried with
     samples of its own; where none does, the last with others.
     """
-    attempt, seed = Attempt(position=None, cause=judge.NO_PLAN), rig.config.planner.seed
+    seed = rig.config.planner.seed
     for way in known.ways() if known.ways is not None else plain_ways(known.scene, rig.config):
         attempt = _least_unseen(rig, way, range(seed, seed + PLANS), gives_up=True)
         if attempt.position is not None:

@@ -9,6 +9,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.studies import failures, judge, trial
 from splatctrl_cli.jobs.studies.maps import Map
@@ -68,6 +69,16 @@ def test_what_blocks_is_shown_where_there_is_no_plan(
     assert num_pixels(path, TOUCHED) > 100
     pictured(replace(problem, start=HOME), views, replace(attempt, cause=judge.START_BLOCKED), tmp_path, monkeypatch)
     assert b"at the start" in path.read_bytes()
+
+
+def test_a_sphere_is_named_whether_a_joint_moves_it_or_not(problem: Problem, views: Views) -> None:
+    failure = failures.Failure(
+        problem=problem, views=views, told="", cause="", verdict="", reason="", position=None, scene=None, things=None
+    )
+    named = sphere_names(problem.model.sphere_set)
+    for sphere in (0, len(named) - 1):
+        at = failures.Place(q=HOME, sphere=sphere, point=np.zeros(3), when="")
+        assert f"sphere {named[sphere]} at" in failures._caption(failure, at)
 
 
 def test_of_a_map_of_many_things_some_within_reach_are_shown(problem: Problem) -> None:

@@ -14,6 +14,8 @@ from splatctrl_cli.jobs.studies.trial import Rig
 from splatctrl_cli.jobs.studies.views import Views, views_of
 from splatctrl_cli.jobs.studies.ways import Asked, Way, Ways
 from splatctrl_cli.records import SplatSet
+from splatctrl_cli.scene.posture import posture_of
+from splatctrl_cli.scene.self_mask import self_mask
 from splatctrl_cli.simulate.truth import distance_to
 
 
@@ -87,11 +89,15 @@ def test_the_gaussians_of_the_baseline_lie_on_the_things_and_not_on_the_arm(prob
 
 def test_no_pixel_of_the_arm_counts_for_a_baseline(problem: Problem, views: Views) -> None:
     plain = [frame for step in views.steps for frame in step]
+    robot = posture_of(problem.model, problem.start, {frame.stamp_ns: problem.start for frame in plain})
     for frame, without in zip(plain, maps.without_robot(problem, views, Config()), strict=True):
+        shows_arm = self_mask(frame, robot, Config().occupancy).robot_depth > 0
         assert without.valid is not None
         assert (without.depth[~without.valid] == 0).all()
         assert 0 < (~without.valid).sum() < 0.2 * without.valid.size
-        assert (without.valid | (frame.depth > 0)).all()  # what has no depth may be seen
+        is_dark = frame.depth == 0
+        assert (shows_arm & is_dark).any() and not without.valid[shows_arm & is_dark].any()
+        assert without.valid[~shows_arm & is_dark].all()  # what else has no depth may be seen
 
 
 def test_the_tsdfs_surfaces_are_those_of_the_things_without_the_arm(problem: Problem) -> None:

@@ -105,3 +105,6 @@ def test_a_table_of_trials_that_is_damaged_is_refused(tmp_path: Path, old: str, 
     (tmp_path / "trials.csv").write_text(text.replace(old, new))
     with pytest.raises(InputError, match="is not a table of trials"):
         read_trials(tmp_path / "trials.csv", Trial)
+    (tmp_path / "trials.csv").write_text(200_000 * "a" + "\n")  # more than a field of a table may have
+    with pytest.raises(InputError, match="is not a table of trials"):
+        read_trials(tmp_path / "trials.csv", Trial)
