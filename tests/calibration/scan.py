@@ -5,17 +5,32 @@ drawn into frames.
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+from benchmarks.calibration import SetUp, write_log
 from splatctrl_cli.calibration.board import Board, matrix_of
 from splatctrl_cli.calibration.depth_bend import bends_alone, unbent
 from splatctrl_cli.calibration.unknowns import transform_of
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import back_project, invert_transform
+from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.records import Float64, RgbdFrame, UInt8
+
+
+def robot_in(sample_data: Path) -> dict[str, Path]:
+    """The simulated arm's files, as requests name them."""
+    folder = sample_data / "tabletop"
+    return {"urdf": folder / "robot.urdf", "spheres": folder / "robot_spheres.yaml"}
+
+
+def calibrated(setup: SetUp, folder: Path, **request: Any) -> CalibrateResult:
+    """What `calibrate` finds in the log of a set-up, which is written first."""
+    write_log(setup, folder / "log.mcap")
+    return calibrate(CalibrateRequest(**{"paths": (folder / "log.mcap",), "out": folder / "rig.toml", **request}))
 
 
 def views_of(sample_data: Path) -> list[RgbdFrame]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.calibration import T_HAND_WRIST, WRIST, SetUp, errors, write_log
+from benchmarks.calibration import T_HAND_WRIST, WRIST, SetUp, errors
 from splatctrl_cli.calibration.calibration_file import read_calibration
 from splatctrl_cli.calibration.unknowns import transform_of, twist_between
 from splatctrl_cli.checks import check_log
@@ -23,6 +23,7 @@ from splatctrl_cli.simulate.arm import HAND
 from splatctrl_cli.simulate.recording import RecordingOptions, Scene
 from splatctrl_cli.sources.source import open_source
 from splatctrl_cli.states.state_source import open_states
+from tests.calibration.scan import calibrated, robot_in
 
 SMALL = RecordingOptions(duration_s=3.0, fps=2.0, width=160, height=120, color_rays=0)
 
@@ -37,23 +38,13 @@ def setup() -> SetUp:
 
 
 @pytest.fixture(scope="module")
-def log(setup: SetUp, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("setup") / "log.mcap"
-    write_log(setup, path)
-    return path
+def result(setup: SetUp, sample_data: Path, tmp_path_factory: pytest.TempPathFactory) -> CalibrateResult:
+    return calibrated(setup, tmp_path_factory.mktemp("setup"), **robot_in(sample_data))
 
 
 @pytest.fixture(scope="module")
-def result(log: Path, sample_data: Path) -> CalibrateResult:
-    robot = sample_data / "tabletop"
-    return calibrate(
-        CalibrateRequest(
-            paths=(log,),
-            out=log.with_name("rig.toml"),
-            urdf=robot / "robot.urdf",
-            spheres=robot / "robot_spheres.yaml",
-        )
-    )
+def log(result: CalibrateResult) -> Path:
+    return result.out.with_name("log.mcap")
 
 
 def test_three_cameras_about_an_arm_are_found_without_a_marker(setup: SetUp, result: CalibrateResult) -> None:
@@ -142,11 +133,7 @@ def test_a_depth_bias_is_found_within_its_sigma_and_in_the_camera_that_has_it(
 ) -> None:
     """A scale of the same camera, or the bias of a camera that is taken as recorded, fits nearly as well."""
     setup = Biased(seed, biased)
-    write_log(setup, tmp_path / "log.mcap")
-    robot = sample_data / "tabletop"
-    files = {"urdf": robot / "robot.urdf", "spheres": robot / "robot_spheres.yaml"} if has_robot else {}
-    request: Any = {"paths": (tmp_path / "log.mcap",), "out": tmp_path / "rig.toml", **files}
-    found = calibrate(CalibrateRequest(**request))
+    found = calibrated(setup, tmp_path, **(robot_in(sample_data) if has_robot else {}))
     for name, camera in found.calibration.cameras.items():
         if name == biased:
             assert abs(camera.bias - 0.01) < 2 * camera.sigma_depth[1] < 0.005
@@ -177,23 +164,13 @@ def wrist() -> SetUp:
 
 
 @pytest.fixture(scope="module")
-def wrist_log(wrist: SetUp, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("wrist") / "log.mcap"
-    write_log(wrist, path)
-    return path
+def wrist_result(wrist: SetUp, sample_data: Path, tmp_path_factory: pytest.TempPathFactory) -> CalibrateResult:
+    return calibrated(wrist, tmp_path_factory.mktemp("wrist"), **robot_in(sample_data))
 
 
 @pytest.fixture(scope="module")
-def wrist_result(wrist_log: Path, sample_data: Path) -> CalibrateResult:
-    robot = sample_data / "tabletop"
-    return calibrate(
-        CalibrateRequest(
-            paths=(wrist_log,),
-            out=wrist_log.with_name("rig.toml"),
-            urdf=robot / "robot.urdf",
-            spheres=robot / "robot_spheres.yaml",
-        )
-    )
+def wrist_log(wrist_result: CalibrateResult) -> Path:
+    return wrist_result.out.with_name("log.mcap")
 
 
 def off_hand(setup: SetUp, stamp_ns: int, T: Float64) -> tuple[float, float]:
@@ -254,12 +231,10 @@ def test_frames_of_a_capture_that_the_clock_leaves_without_a_pose_are_counted(
     assert source.loss.without_pose == 1
 
 
-def refused(setup: SetUp, folder: Path, **request: object) -> str:
+def refused(setup: SetUp, folder: Path, **request: Any) -> str:
     """The refusal of a set-up, which leaves no file."""
-    log, out = folder / "log.mcap", folder / "rig.toml"
-    write_log(setup, log)
     with pytest.raises(NotEvaluableError) as refusal:
-        calibrate(replace(CalibrateRequest(paths=(log,), out=out), **request))
+        calibrated(setup, folder, **request)
     assert not list(folder.glob("rig.toml*"))
     return str(refusal.value)
 
@@ -287,8 +262,7 @@ class Still(SetUp):
 
 
 def test_a_robot_that_hardly_moves_is_refused(tmp_path: Path, sample_data: Path) -> None:
-    robot = sample_data / "tabletop"
-    told = refused(Still(2, SMALL), tmp_path, urdf=robot / "robot.urdf", spheres=robot / "robot_spheres.yaml")
+    told = refused(Still(2, SMALL), tmp_path, **robot_in(sample_data))
     assert "the robot hardly moves" in told
     assert "record it moving" in told
 

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.calibration import T_HAND_WRIST, WRIST, SetUp, errors, write_log
+from benchmarks.calibration import T_HAND_WRIST, WRIST, SetUp, errors
 from splatctrl_cli.calibration.board import Board, board_of, sighting_of
 from splatctrl_cli.calibration.board_start import hand_eye
 from splatctrl_cli.calibration.unknowns import transform_of, twist_between
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.geometry import invert_transform, look_at
-from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
+from splatctrl_cli.jobs.calibrate import CalibrateResult
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.simulate.arm import HAND, Motion
 from splatctrl_cli.simulate.recording import RecordingOptions, Scene
-from tests.calibration.scan import printed, with_board
+from tests.calibration.scan import calibrated, printed, robot_in, with_board
 
 OPTIONS = RecordingOptions(duration_s=3.0, fps=4.0, width=320, height=240, color_rays=0)
 BOARD = Board(columns=7, rows=4, square=0.03)
@@ -108,16 +108,6 @@ class Lying(Turning):
         T = look_at(list(0.5 * (eye[:3, 3] + EYES[0])), list(center))
         T[:3, 3] = center - T[:3, :3] @ BOARD.points.mean(axis=0)
         return T
-
-
-def calibrated(setup: SetUp, folder: Path, **request: Any) -> CalibrateResult:
-    write_log(setup, folder / "log.mcap")
-    return calibrate(CalibrateRequest(**{"paths": (folder / "log.mcap",), "out": folder / "rig.toml", **request}))
-
-
-def robot_in(sample_data: Path) -> dict[str, Path]:
-    folder = sample_data / "tabletop"
-    return {"urdf": folder / "robot.urdf", "spheres": folder / "robot_spheres.yaml"}
 
 
 def check_errors(setup: SetUp, result: CalibrateResult) -> None:

@@ -3,20 +3,19 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.calibration import SetUp, write_log
+from benchmarks.calibration import SetUp
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.geometry import back_project, invert_transform, look_at, pose_at, transform_points
-from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Bool, Float64, RgbdFrame
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.recording import RecordingOptions, Scene
+from tests.calibration.scan import calibrated, robot_in
 
 SMALL = RecordingOptions(duration_s=3.0, fps=2.0, width=160, height=120, color_rays=0)
 MIDDLE = np.array([0.45, 0.0])  # [m] of the table, where the one thing stands
@@ -74,11 +73,6 @@ class OneLink(Partial):
         return np.asarray(np.linalg.norm(points_world - pose[:3, 3], axis=-1) < 0.12)
 
 
-def calibrated(setup: SetUp, folder: Path, **request: Any) -> CalibrateResult:
-    write_log(setup, folder / "log.mcap")
-    return calibrate(CalibrateRequest(paths=(folder / "log.mcap",), out=folder / "rig.toml", **request))
-
-
 @pytest.mark.parametrize(("thing", "seed"), [("cylinder", 2), ("sphere", 3)])
 def test_turns_about_the_one_round_thing_on_a_table_are_named(thing: str, seed: int, tmp_path: Path) -> None:
     setup = Round(seed)
@@ -104,10 +98,9 @@ def test_what_is_not_observed_stays_as_recorded_and_the_rest_is_found(tmp_path: 
 
 
 def test_a_robot_of_which_one_link_is_seen_does_not_say_all(tmp_path: Path, sample_data: Path) -> None:
-    folder = sample_data / "tabletop"
-    robot = {"urdf": folder / "robot.urdf", "spheres": folder / "robot_spheres.yaml"}
+    options = SourceOptions(cameras=("cam0",))
     with pytest.raises(NotEvaluableError, match=r"not observed: translation along . of the world of cam0"):
-        calibrated(OneLink(2), tmp_path, options=SourceOptions(cameras=("cam0",)), **robot)
+        calibrated(OneLink(2), tmp_path, options=options, **robot_in(sample_data))
 
 
 def test_a_camera_that_sees_neither_what_the_others_see_nor_the_robot_is_named(
@@ -116,8 +109,7 @@ def test_a_camera_that_sees_neither_what_the_others_see_nor_the_robot_is_named(
     setup = SetUp(2, SMALL)
     away = replace(setup.cameras[2], T_world_camera=look_at([0.6, 0.9, 0.8], [1.6, 1.3, 0.3]))
     setup.cameras = (*setup.cameras[:2], away)
-    folder = sample_data / "tabletop"
     with pytest.raises(NotEvaluableError) as refusal:
-        calibrated(setup, tmp_path, urdf=folder / "robot.urdf", spheres=folder / "robot_spheres.yaml")
+        calibrated(setup, tmp_path, **robot_in(sample_data))
     assert "of cam2" in refusal.value.message or "cam0, cam1 | cam2" in refusal.value.message
     assert "of cam0" not in refusal.value.message and "of cam1" not in refusal.value.message

@@ -19,7 +19,7 @@ from splatctrl_cli.jobs.scores import reference as score_reference
 from splatctrl_cli.jobs.scores.score import ScoreRequest, score
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, ViewCorrection
-from tests.calibration.scan import a_bend, bent, disturbed, gains_of, views_of
+from tests.calibration.scan import a_bend, bent, disturbed, gains_of, robot_in, views_of
 from tests.jobs.scores.wall import FakeSource
 
 SMALL = [
@@ -90,8 +90,7 @@ def test_where_a_robot_is_judged_depth_stays_as_it_was_recorded(
     views: list[RgbdFrame], tmp_path: Path, sample_data: Path
 ) -> None:
     asked = request(bent(views, a_bend(0.05)), tmp_path / "scene")
-    robot = sample_data / "tabletop"
-    result = reconstruct(replace(asked, urdf=robot / "robot.urdf", spheres=robot / "robot_spheres.yaml"))
+    result = reconstruct(replace(asked, **robot_in(sample_data)))
     assert result.metrics["pose_residual"] > 0
     assert result.metrics["depth_bend"] is None
     assert "depth_bends" not in result.metrics

@@ -14,12 +14,12 @@ from splatctrl_cli.config import Config, SceneConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import strided_lens
 from splatctrl_cli.jobs.check import CheckRequest, check
-from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstructions.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
+from tests.calibration.scan import views_of
 from tests.datasets.make_layout import OPENGL_FROM_OPTICAL
 from tests.jobs.bakes.baked import Said
 
@@ -31,8 +31,7 @@ POSES_ONLY = {"poses": 1000.0, "depths": 1.0}
 @pytest.fixture(scope="module")
 def views(sample_data: Path) -> list[RgbdFrame]:
     """Of a table from different places, in metres; every third row and column."""
-    source = open_to_train(RecordingRequest(path=sample_data / "dtu", is_dtu=True))
-    return [smaller(record) for record in source.records() if isinstance(record, RgbdFrame)]
+    return [smaller(view) for view in views_of(sample_data)]
 
 
 def smaller(frame: RgbdFrame) -> RgbdFrame:

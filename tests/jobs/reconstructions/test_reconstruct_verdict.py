@@ -10,11 +10,12 @@ import pytest
 from splatctrl_cli.config import Config, OccupancyConfig
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
-from splatctrl_cli.jobs.open_recording import CameraAgreement, RecordingRequest, open_to_train
+from splatctrl_cli.jobs.open_recording import CameraAgreement
 from splatctrl_cli.jobs.progress import SILENT
 from splatctrl_cli.jobs.reconstructions.verdict import GATED, Reconstructed, longest_blind, reconstruct_verdict
 from splatctrl_cli.records import LossReport, RgbdFrame
 from splatctrl_cli.scene.time_steps import AuditRow, TimeStep
+from tests.calibration.scan import views_of
 
 TENTH = 100_000_000  # [ns]
 CAMERAS = ("cam0", "cam1")
@@ -157,8 +158,7 @@ def test_a_gate_on_points_inside_a_robot_that_no_pixel_showed_is_not_evaluable()
 @pytest.fixture(scope="module")
 def views(sample_data: Path) -> list[RgbdFrame]:
     """Of a still scene, from different places."""
-    source = open_to_train(RecordingRequest(path=sample_data / "dtu", is_dtu=True))
-    return [record for record in source.records() if isinstance(record, RgbdFrame)]
+    return views_of(sample_data)
 
 
 def check(views: list[RgbdFrame], factor: float, *, is_allowed: bool = False, is_still: bool = True) -> None:
