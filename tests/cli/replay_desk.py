@@ -3,7 +3,7 @@
 import csv
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.files.output import part_digests
+from splatctrl_cli.grid_files.npz_grid import write_npz
 from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
-from splatctrl_cli.records import Float64, JointState, LossReport, Record, SplatSet
+from splatctrl_cli.records import Box, Float64, JointState, LossReport, Record, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.voxels import OccupancyGrid
@@ -22,6 +25,7 @@ from tests.plain import known, plain_grid, plain_splats
 SECOND = 1_000_000_000
 START = np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.0])
 BALL = ((0.75, 0.45, 0.40), 0.05)
+AROUND = Box(lower=np.array([-0.4, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.2]))
 
 
 @dataclass(kw_only=True)
@@ -85,6 +89,23 @@ def write_scene(
     return folder
 
 
+def write_field(
+    folder: Path,
+    *balls: tuple[tuple[float, float, float], float],
+    box: Box = AROUND,
+    seen: OccupancyGrid | None = None,
+    moment_ns: int | None = None,
+    **field: Any,
+) -> Path:
+    """A field baked of balls, that of a moment where one is given; all was seen unless `seen` says otherwise."""
+    occupancy = grid_seen() if seen is None else seen
+    grid = bake(splats_of(*balls), box, FieldConfig(**field), occupancy=occupancy, threads=1)
+    header = grid.header if moment_ns is None else {**grid.header, "stamp_ns": moment_ns}
+    folder.mkdir()
+    write_npz(folder / "field.npz", replace(grid, header=header))
+    return folder
+
+
 @dataclass(kw_only=True)
 class Desk:
     """A folder to work in, a source that stands for the log, and the robot's files."""
@@ -109,6 +130,11 @@ class Desk:
     def rows(self, out: str = "out") -> list[dict[str, str]]:
         with (self.folder / out / "steps.csv").open() as stream:
             return list(csv.DictReader(stream))
+
+
+def scene_of(desk: Desk, *balls: tuple[tuple[float, float, float], float]) -> tuple[str, str]:
+    """The option that names a scene of these balls, which is written now."""
+    return "--scene", str(write_scene(desk.folder / "scene", (0, splats_of(*balls))))
 
 
 def clearance(arm: RobotModel, q: Float64, ball: tuple[tuple[float, float, float], float] = BALL) -> float:

@@ -2,17 +2,14 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.grid_files.npz_grid import write_npz
-from splatctrl_cli.records import Box, LossReport, Record
+from splatctrl_cli.records import LossReport, Record
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import (
     BALL,
@@ -23,7 +20,9 @@ from tests.cli.replay_desk import (
     clearance,
     grid_seen,
     logged,
+    scene_of,
     splats_of,
+    write_field,
     write_scene,
 )
 from tests.evaluate.test_worst_frames import frame
@@ -36,8 +35,7 @@ pytestmark = pytest.mark.usefixtures("unpainted")
 @pytest.mark.painted
 def test_an_audit_measures_every_logged_state(desk: Desk, arm: RobotModel) -> None:
     desk.source.states = logged(START + 0.3)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    assert desk.replay("--scene", str(scene), "-q") == 0
+    assert desk.replay(*scene_of(desk, BALL), "-q") == 0
     found = [float(row["clearance_exact"]) for row in desk.rows()]
     np.testing.assert_allclose(found, [clearance(arm, s.position) for s in desk.source.states], atol=1e-6)
     assert desk.metrics()["min_clearance"] == pytest.approx(min(found), abs=1e-8)
@@ -82,29 +80,22 @@ def test_states_and_a_scene_on_clocks_that_do_not_overlap_are_said_as_such(
 
 
 def test_a_baked_field_says_nearly_the_same_and_certifies_less(desk: Desk, arm: RobotModel) -> None:
-    box = Box(lower=np.array([-0.4, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.2]))
-    (desk.folder / "field").mkdir()
-    grid = bake(splats_of(BALL), box, replace(FieldConfig(), voxel=0.04), occupancy=grid_seen(), threads=1)
-    write_npz(desk.folder / "field" / "field.npz", grid)
-    assert desk.replay("--field", str(desk.folder / "field"), "-q") == 0
+    assert desk.replay("--field", str(write_field(desk.folder / "field", BALL, voxel=0.04)), "-q") == 0
     row = desk.rows()[0]
     assert float(row["clearance_exact"]) == pytest.approx(clearance(arm, START), abs=2e-3)
     assert float(row["clearance_certified"]) <= clearance(arm, START) + 1e-6
 
 
 def test_a_path_that_leaves_known_space_is_not_evaluated(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
-    box = Box(lower=np.array([-0.4, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.2]))
     seen = grid_seen()
     seen.num_updates[:, :, 15:] = 0  # above half a metre
-    config = FieldConfig(voxel=0.04, unknown="nan")
-    (desk.folder / "field").mkdir()
-    write_npz(desk.folder / "field" / "field.npz", bake(splats_of(BALL), box, config, occupancy=seen, threads=1))
-    assert desk.replay("--field", str(desk.folder / "field"), "-q", "--max-unknown", "1", is_judged=True) == 5
+    field = write_field(desk.folder / "field", BALL, seen=seen, voxel=0.04, unknown="nan")
+    known = ("--field", str(field), "-q", "--max-unknown", "1")
+    assert desk.replay(*known, is_judged=True) == 5
     assert "the path leaves known space: at 11 of 11 states a sphere is" in capsys.readouterr().err
     assert desk.metrics()["num_without_distance"] == 11
     assert {row["clearance_barrier"] for row in desk.rows()} == {""}
-    driven = ("--field", str(desk.folder / "field"), "-q", "--max-unknown", "1", "--mode", "closed-loop")
-    assert desk.replay(*driven, out="driven") == 5
+    assert desk.replay(*known, "--mode", "closed-loop", out="driven") == 5
     assert "the field has no distance there" in capsys.readouterr().err
 
 
@@ -157,14 +148,12 @@ def test_a_start_in_collision_names_the_sphere(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
     center = arm.sphere_centers(START)[-1]
-    scene = write_scene(desk.folder / "scene", (0, splats_of((tuple(center), 0.01))))
-    assert desk.replay("--scene", str(scene), "-q", "--mode", "closed-loop") == 5
+    assert desk.replay(*scene_of(desk, (tuple(center), 0.01)), "-q", "--mode", "closed-loop") == 5
     assert "got sphere hand[" in capsys.readouterr().err
 
 
 def test_a_base_that_stands_in_the_scene_is_one_line(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL, ((-0.2, 0.0, 0.05), 0.12))))
-    assert desk.replay("--scene", str(scene), "-q") == 0
+    assert desk.replay(*scene_of(desk, BALL, ((-0.2, 0.0, 0.05), 0.12)), "-q") == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "no joint moves" in line]
     listed = json.loads((desk.folder / "out" / "events.json").read_text())["static_violations"]
     nearest = min(listed, key=lambda one: one["clearance"])
@@ -199,8 +188,7 @@ def test_fingers_that_the_log_does_not_move_are_locked_with_a_note(
     urdf = desk.folder / "with_hand.urdf"
     urdf.write_text(Path(desk.robot[1]).read_text().replace("</robot>", f"{fingers}</robot>"))
     desk.robot[1] = str(urdf)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    assert desk.replay("--scene", str(scene)) == 0
+    assert desk.replay(*scene_of(desk, BALL)) == 0
     warned = [line for line in capsys.readouterr().err.splitlines() if "fingers" in line]
     assert warned == [
         "warning: fingers that the log does not move are locked in their middle: left = 0.02, right = 0.02; --lock "
@@ -215,8 +203,7 @@ WALL = tuple(((x, 0.0, z), 0.04) for x in np.arange(0.3, 0.85, 0.05) for z in np
 
 def test_a_way_is_planned_where_the_controller_stalls(desk: Desk) -> None:
     desk.source.states = logged(GOAL)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(*WALL)))
-    options = ("--scene", str(scene), "--mode", "closed-loop", "--set", "control.solver=daqp")
+    options = (*scene_of(desk, *WALL), "--mode", "closed-loop", "--set", "control.solver=daqp")
     assert desk.replay(*options, out="alone") == 0
     assert desk.metrics("alone")["stalled"] == 1 and desk.metrics("alone")["num_detours"] == 0
     assert desk.replay(*options, "--set", "control.max_detours=2", "--require", "goal_reached>=1") == 0
@@ -309,8 +296,7 @@ def test_a_replay_shows_its_worst_moments(desk: Desk, monkeypatch: pytest.Monkey
 
 
 def test_a_log_without_cameras_says_that_there_is_no_picture(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = str(write_scene(desk.folder / "scene", (0, splats_of(BALL))))
     desk.source.states = logged(START + 0.3)
-    assert desk.replay("--scene", scene) == 0
+    assert desk.replay(*scene_of(desk, BALL)) == 0
     assert "worst frames: no camera image at or before 1 of 1 moments" in capsys.readouterr().out
     assert not names(desk.folder / "out")

@@ -9,7 +9,7 @@ import pytest
 from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.records import JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
-from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, splats_of, write_scene
+from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, scene_of, splats_of, write_scene
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -43,8 +43,7 @@ def events(desk: Desk, out: str = "out") -> list[dict[str, object]]:
 @pytest.mark.painted
 def test_open_loop_commands_what_was_logged_where_nothing_is_near(desk: Desk) -> None:
     moving(desk)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05))))
-    assert desk.replay("--scene", str(scene), "-q", "--mode", "open-loop") == 0
+    assert desk.replay(*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05)), "-q", "--mode", "open-loop") == 0
     metrics = desk.metrics()
     assert metrics["intervention_share"] == 0 and metrics["max_velocity_difference"] < 1e-5
     assert metrics["min_barrier_margin_logged"] > 0 and metrics["first_intervention_s"] is None
@@ -80,9 +79,8 @@ def test_open_loop_says_when_and_why_the_logged_velocity_was_changed(
 
 def test_open_loop_may_ask_for_a_goal_instead_of_the_log(desk: Desk) -> None:
     moving(desk)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
     goal = "--goal-joints=" + ",".join(str(v) for v in START)
-    assert desk.replay("--scene", str(scene), "-q", "--mode", "open-loop", goal) == 0
+    assert desk.replay(*scene_of(desk, BALL), "-q", "--mode", "open-loop", goal) == 0
     assert float(desk.rows()[-1]["v_joint1"]) < 0 and desk.metrics()["max_velocity_difference"] > 0.5
 
 
@@ -91,8 +89,7 @@ def test_a_clearance_below_the_margin_is_one_interval_with_its_obstacle(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
     moving(desk)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05), ball_ahead(arm, -0.01))))
-    assert desk.replay("--scene", str(scene), "-q") == 0
+    assert desk.replay(*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05), ball_ahead(arm, -0.01)), "-q") == 0
     found = {(event["kind"], event["source"]): event for event in events(desk)}
     below, hit = found["below-margin", "exact"], found["in-collision", "exact"]
     assert below["end_s"] == hit["end_s"] == 1.0 and below["start_s"] < hit["start_s"]
@@ -117,8 +114,7 @@ def test_a_replay_agrees_with_its_own_steps_and_another_is_told_by_step_and_join
     desk: Desk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     moving(desk)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    drive = ("--scene", str(scene), "-q", "--mode", "closed-loop")
+    drive = (*scene_of(desk, BALL), "-q", "--mode", "closed-loop")
     golden = str(desk.folder / "golden")
     assert desk.replay(*drive, out="golden") == 0
     assert desk.replay(*drive, "--golden", golden + "/run.json") == 0
@@ -142,8 +138,7 @@ def test_a_golden_file_without_commands_is_refused(desk: Desk, capsys: pytest.Ca
 
 @pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
 def test_the_names_of_gates_are_those_of_the_metrics(desk: Desk, mode: str) -> None:
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    assert desk.replay("--scene", str(scene), "-q", "--mode", mode, out=mode) == 0
+    assert desk.replay(*scene_of(desk, BALL), "-q", "--mode", mode, out=mode) == 0
     names = metric_names(mode, ("exact", "barrier"), has_truth=False)
     assert set(desk.metrics(mode)) == set(names) and len(set(names)) == len(names)
 
@@ -152,9 +147,8 @@ def test_a_gate_that_fails_names_the_first_time_that_breaks_it(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
     moving(desk)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(ball_ahead(arm, 0.01))))
     gates = ("--require", "min_clearance>=0.03", "--require", "num_below_margin<=0", "--require", "unknown_share>=2")
-    assert desk.replay("--scene", str(scene), "-q", *gates) == 1
+    assert desk.replay(*scene_of(desk, ball_ahead(arm, 0.01)), "-q", *gates) == 1
     message = capsys.readouterr().err
     rows = desk.rows()
     first = next(row for row in rows if float(row["clearance_exact"]) < 0.03)
@@ -167,8 +161,7 @@ def test_a_gate_that_fails_names_the_first_time_that_breaks_it(
 @pytest.mark.painted
 def test_a_driven_arm_follows_the_log_and_its_divergence_is_measured(desk: Desk) -> None:
     moving(desk)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05))))
-    assert desk.replay("--scene", str(scene), "-q", "--mode", "closed-loop", "--follow") == 0
+    assert desk.replay(*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05)), "-q", "--mode", "closed-loop", "--follow") == 0
     metrics = desk.metrics()
     assert metrics["num_steps"] == 101 and metrics["goal_reached"] == 1
     assert metrics["max_divergence_joints"] < 0.01 and metrics["max_divergence_position"] < 0.005
@@ -178,8 +171,7 @@ def test_a_driven_arm_follows_the_log_and_its_divergence_is_measured(desk: Desk)
 
 def test_a_later_start_says_what_its_times_count_from(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     moving(desk)
-    scene = str(write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05)))))
-    drive = ("--scene", scene, "-q", "--mode", "closed-loop", "--follow")
+    drive = (*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05)), "-q", "--mode", "closed-loop", "--follow")
     assert desk.replay(*drive, "--start-time", "0.9") == 0
     assert "times count from the start, at 0.90 s of the log" in capsys.readouterr().out.splitlines()
     assert desk.rows()[0]["time_s"] == "0"
@@ -189,9 +181,8 @@ def test_a_later_start_says_what_its_times_count_from(desk: Desk, capsys: pytest
 
 def test_an_anchor_puts_the_arm_back_into_the_log(desk: Desk) -> None:
     moving(desk)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
     stay = "--goal-joints=" + ",".join(str(v) for v in START + np.array([0, 0, 0, 0, 0, 0, 0.5]))
-    drive = ("--scene", str(scene), "-q", "--mode", "closed-loop", stay)
+    drive = (*scene_of(desk, BALL), "-q", "--mode", "closed-loop", stay)
     assert desk.replay(*drive, "--re-anchor", "0.25", out="anchored") == 0
     assert desk.replay(*drive) == 0
     found = [float(row["divergence_joints"] or "nan") for row in desk.rows("anchored")]
@@ -210,8 +201,7 @@ def test_waypoints_are_reached_one_after_the_other(desk: Desk, arm: RobotModel, 
     else:
         rows = [",".join(arm.joint_names), *(",".join(str(v) for v in q) for q in postures)]
         file.write_text("\n".join(rows) + "\n")
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    assert desk.replay("--scene", str(scene), "-q", "--mode", "closed-loop", "--waypoints", str(file)) == 0
+    assert desk.replay(*scene_of(desk, BALL), "-q", "--mode", "closed-loop", "--waypoints", str(file)) == 0
     assert desk.metrics()["num_goals_reached"] == 2
     frame = arm.frame_names[-1]
     places = [

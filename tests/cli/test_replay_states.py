@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,21 +9,17 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.grid_files.npz_grid import write_npz
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Box, Float64, JointState
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_source
 from splatctrl_cli.states.state_source import open_states
-from tests.cli.replay_desk import BALL, START, Desk, grid_seen, splats_of, write_scene
+from tests.cli.replay_desk import BALL, START, Desk, splats_of, write_field, write_scene
 from tests.logs.make_log import LogRecipe, encoded, make_log, messages_of, write_raw
 from tests.logs.make_states import (
     NEW_CONTROLLER,
     START_NS,
-    STEP_NS,
     Message,
     header,
     joint_state,
@@ -118,18 +113,11 @@ def test_joints_in_degrees_are_refused_in_one_line(
     assert "would fit as degrees; convert them" in line
 
 
-def replayed_of(desk: Desk, q: np.ndarray, stamps: list[int], *more: str) -> int:
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    log = write_mcap(desk.folder / "x.mcap", states_of(q, JOINTS, stamps=stamps))
-    desk.source.name = "none"
-    arguments = ["replay", str(log), *desk.robot, "--scene", str(scene), "-o", str(desk.folder / "out"), *more]
-    return main([*arguments, "--max-unknown", "1"])
-
-
-def test_a_posture_outside_the_limits_is_an_event_with_its_joint(desk: Desk) -> None:
+def test_a_posture_outside_the_limits_is_an_event_with_its_joint(desk: Desk, scene: str) -> None:
     q = np.repeat(START[None], 10, axis=0)
     q[4:7, 3] = 0.5  # its limit is below 0
-    assert replayed_of(desk, q, [START_NS + i * STEP_NS for i in range(10)], "-q") == 1
+    assert replayed(desk, scene, write_mcap(desk.folder / "x.mcap", states_of(q, JOINTS)), "-q") == 0
+    assert desk.verdict()["label"] == "limits broken"
     events = json.loads((desk.folder / "out" / "events.json").read_text())["events"]
     (outside,) = [event for event in events if event["kind"] == "outside-limits"]
     assert (outside["worst_name"], outside["num_states"]) == ("joint4", 3) and outside["worst"] < -0.5
@@ -140,10 +128,8 @@ def test_a_grid_without_the_robot_is_refused_by_where_both_are(
     desk: Desk, capsys: pytest.CaptureFixture[str], tmp_path: Path, mode: str
 ) -> None:
     box = Box(lower=np.array([3.0, 3.0, 0.0]), upper=np.array([3.4, 3.4, 0.4]))
-    (tmp_path / "field").mkdir()
-    grid = bake(splats_of(BALL), box, replace(FieldConfig(), voxel=0.1), occupancy=grid_seen(), threads=1)
-    write_npz(tmp_path / "field" / "field.npz", grid)
-    assert desk.replay("--field", str(tmp_path / "field"), "-q", "--mode", mode, "--max-unknown", "1") == 5
+    field = write_field(tmp_path / "field", BALL, box=box, voxel=0.1)
+    assert desk.replay("--field", str(field), "-q", "--mode", mode, "--max-unknown", "1") == 5
     (line,) = capsys.readouterr().err.splitlines()
     assert "--field: expected the robot in the grid from (3.00, 3.00, 0.00) to (" in line
     assert "moving spheres outside it, the nearest by 2." in line and "check --base" in line
@@ -169,42 +155,29 @@ STATE, CONTROLLER = "sensor_msgs/msg/JointState", "control_msgs/msg/JointTraject
 
 def arm_messages() -> list[Message]:
     """An arm whose joints 1 to 4 are in one topic, 5 to 7 in another at other times, and all commands in a third."""
-    names = [f"joint{i}" for i in range(1, 8)]
+
+    def said(stamp: int, topic: str, names: Sequence[str], q: Sequence[float] | Float64) -> Message:
+        return Message(log_ns=stamp, topic=topic, type_name=STATE, content=joint_state(stamp, names, q))
+
     messages = []
     for i in range(NUM_STATES):
         stamp = START_NS + i * 10_000_000
         q = START + 0.3 * np.sin(0.5 * i * 0.01 + np.arange(7))
-        messages += [
-            Message(log_ns=stamp, topic="/left", type_name=STATE, content=joint_state(stamp, names[:4], q[:4])),
-            Message(
-                log_ns=stamp + 4_000_000,
-                topic="/right",
-                type_name=STATE,
-                content=joint_state(stamp + 4_000_000, names[4:], q[4:]),
-            ),
-        ]
+        messages += [said(stamp, "/left", JOINTS[:4], q[:4]), said(stamp + 4_000_000, "/right", JOINTS[4:], q[4:])]
         if i % 7 == 0:
-            messages.append(
-                Message(log_ns=stamp, topic="/left", type_name=STATE, content=joint_state(stamp, ["finger"], [0.0]))
-            )
+            messages.append(said(stamp, "/left", ["finger"], [0.0]))
     return messages
 
 
 def controller_messages() -> list[Message]:
     """A controller that reports all joints, with what it was asked for."""
-    names = [f"joint{i}" for i in range(1, 8)]
     point, kind = STORE.types["trajectory_msgs/msg/JointTrajectoryPoint"], STORE.types[CONTROLLER]
     nothing = np.zeros(0)
     since = STORE.types["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
 
     def at(position: Any, velocity: Any = nothing) -> Any:
-        return point(
-            positions=position,
-            velocities=velocity,
-            accelerations=nothing,
-            effort=nothing,
-            time_from_start=since,
-        )
+        rest = {"accelerations": nothing, "effort": nothing, "time_from_start": since}
+        return point(positions=position, velocities=velocity, **rest)
 
     messages = []
     for i in range(NUM_STATES):
@@ -212,7 +185,7 @@ def controller_messages() -> list[Message]:
         q = START + 0.3 * np.sin(0.5 * i * 0.01 + np.arange(7))
         content = kind(
             header=header(STORE, stamp),
-            joint_names=names,
+            joint_names=list(JOINTS),
             feedback=at(q, 0.01 * q),
             reference=at(q, 0.02 * q),
             **{name: at(nothing) for name in ("error", "output", "desired", "actual")},
@@ -228,31 +201,25 @@ def log_with(path: Path, messages: Sequence[Message]) -> Path:
     return write_raw(path, [*messages_of(plain), *beside])
 
 
-def audited(source: Path, arm_files: list[str], out: Path, *options: str) -> tuple[bytes, dict[str, Any], Any]:
+def audited(source: Path, desk: Desk, out: Path, *options: str) -> tuple[bytes, dict[str, Any], Any]:
     scene = out.parent / "scene"
     if not scene.exists():
         write_scene(scene, (START_NS, splats_of(BALL)))
-    words = ["replay", str(source), *arm_files, "--scene", str(scene), "-o", str(out), "-q", "--max-unknown", "1"]
+    words = ["replay", str(source), *desk.robot, "--scene", str(scene), "-o", str(out), "-q", "--max-unknown", "1"]
     assert main([*words, "--report-only", *options]) == 0
     summary = json.loads((out / "summary.json").read_text())
     return (out / "steps.csv").read_bytes(), summary["metrics"], json.loads((out / "states.json").read_text())
 
 
-@pytest.fixture
-def arm_files(sample_data: Path) -> list[str]:
-    tabletop = sample_data / "tabletop"
-    return ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
-
-
 @pytest.mark.parametrize("kind", ["two-topics", "all", "chosen"])
-def test_a_capture_is_replayed_as_its_log(tmp_path: Path, arm_files: list[str], kind: str) -> None:
+def test_a_capture_is_replayed_as_its_log(tmp_path: Path, desk: Desk, kind: str) -> None:
     messages = arm_messages() + ([] if kind == "two-topics" else controller_messages())
     log, capture = log_with(tmp_path / "log.mcap", messages), tmp_path / "x.capture"
     assert main(["ingest", str(log), "-o", str(capture), "-q"]) == 0
     options = ["--mode", "open-loop", *(["--joint-topic", "/controller"] if kind == "chosen" else [])]
-    steps, metrics, states = audited(log, arm_files, tmp_path / "of_log", *options)
+    steps, metrics, states = audited(log, desk, tmp_path / "of_log", *options)
     assert metrics["num_states"] == (NUM_STATES - 1 if kind == "two-topics" else NUM_STATES)
-    again = audited(capture, arm_files, tmp_path / "of_capture", *options)
+    again = audited(capture, desk, tmp_path / "of_capture", *options)
     assert again == (steps, metrics, states)
     assert any("interpolated" in note for note in states["loss"]["notes"]) == (kind == "two-topics")
 
@@ -282,18 +249,19 @@ def test_a_capture_keeps_commands_and_they_can_be_read_plainly(tmp_path: Path, a
 
 
 def test_a_damaged_topic_is_refused_and_an_old_capture_is_read(
-    tmp_path: Path, arm_files: list[str], arm: RobotModel, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, desk: Desk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, capture = log_with(tmp_path / "log.mcap", controller_messages()), tmp_path / "x.capture"
     assert main(["ingest", str(log), "-o", str(capture), "-q"]) == 0
     file = capture / "joint_topics" / "0" / "position.npy"
     content = file.read_bytes()
     file.write_bytes(content[:-8] + b"\0" * 8)
-    assert main(["replay", str(capture), *arm_files, "--scene", str(tmp_path / "scene")]) == 4
+    scene = [*desk.robot, "--scene", str(tmp_path / "scene")]
+    assert main(["replay", str(capture), *scene]) == 4
     assert "position.npy: missing, or its checksum differs" in capsys.readouterr().err
     old = as_of_old(capture)
-    assert audited(old, arm_files, tmp_path / "out")[1]["num_states"] == NUM_STATES
-    assert main(["replay", str(old), *arm_files, "--scene", str(tmp_path / "scene"), "--joint-topic", "/x"]) == 4
+    assert audited(old, desk, tmp_path / "out")[1]["num_states"] == NUM_STATES
+    assert main(["replay", str(old), *scene, "--joint-topic", "/x"]) == 4
     assert "--joint-topic does not apply" in capsys.readouterr().err
 
 

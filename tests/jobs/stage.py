@@ -8,18 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.files.output import part_digests, write_json
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.grid_files.npz_grid import write_npz
 from splatctrl_cli.records import Box, Float64, JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.truth import Truth, truth_document
 from splatctrl_cli.voxels import Balls, KnownVoxels
-from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
+from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of, write_field
 from tests.plain import known
 
 FAR = ((-1.0, 0.0, 1.3), 0.05)  # a ball behind the arm
@@ -116,11 +113,7 @@ class Stage:
         """Exit code and verdict of an audit of the states by a field of these balls that is of that time."""
         self.desk.source.states = self.states
         box = Box(lower=np.array([-1.2, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.4]))
-        grid = bake(splats_of(*balls), box, FieldConfig(voxel=voxel), occupancy=grid_seen(), threads=1)
-        header = dict(grid.header) | ({} if moment_ns is None else {"stamp_ns": moment_ns})
-        folder = self.desk.folder / "field"
-        folder.mkdir()
-        write_npz(folder / "field.npz", replace(grid, header=header))
+        folder = write_field(self.desk.folder / "field", *balls, box=box, moment_ns=moment_ns, voxel=voxel)
         return self.replayed("--field", str(folder))
 
     def truth(self, *balls: Ball, name: str = "ball") -> Path:

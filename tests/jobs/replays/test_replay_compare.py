@@ -7,24 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.config import Config, FieldConfig
-from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.grid_files.npz_grid import write_npz
+from splatctrl_cli.config import Config
 from splatctrl_cli.jobs.replays.compare import certified_distance, figure_scales
 from splatctrl_cli.jobs.replays.metrics import metric_names
-from splatctrl_cli.records import Box
 from splatctrl_cli.robot.model import RobotModel
-from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, grid_seen, splats_of, write_scene
+from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, scene_of, splats_of, write_field, write_scene
 from tests.cli.test_replay_modes import ball_ahead, moving, with_person
 from tests.jobs.stage import MOVE
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
 CLOSED = ("-q", "--mode", "closed-loop", "--set", "control.max_time=4")
-
-
-def scene_of(desk: Desk, *balls: tuple[tuple[float, float, float], float]) -> tuple[str, str]:
-    return "--scene", str(write_scene(desk.folder / "scene", (0, splats_of(*balls))))
 
 
 @pytest.mark.painted
@@ -146,11 +139,7 @@ def test_a_path_is_clear_of_the_splats_between_its_waypoints(desk: Desk, arm: Ro
     tip = arm.sphere_centers(START + MOVE / 2)[-1]
     ball = ((float(tip[0]), float(tip[1]), float(tip[2])), 0.03)
     if is_grid:
-        box = Box(lower=np.array([-0.4, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.2]))
-        (desk.folder / "field").mkdir()
-        grid = bake(splats_of(ball), box, FieldConfig(voxel=0.02), occupancy=grid_seen(), threads=1)
-        write_npz(desk.folder / "field" / "field.npz", grid)
-        where = ("--field", str(desk.folder / "field"))
+        where = ("--field", str(write_field(desk.folder / "field", ball, voxel=0.02)))
     else:
         where = scene_of(desk, ball)
     assert desk.replay(*where, *CLOSED, "--baseline", "birrt", "--max-unknown", "1") == 0

@@ -23,7 +23,7 @@ from splatctrl_cli.robot.coverage import coverage_deficit, refined
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import spheres_yaml
-from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, splats_of, write_scene
+from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, scene_of, splats_of, write_scene
 from tests.control.fakes import Balls
 from tests.robot.shapes import arm_of, l_shape, written
 
@@ -65,9 +65,8 @@ def surface_clearance(model: RobotModel, positions: Float64, field: Balls) -> fl
 
 
 def test_a_replay_says_what_the_spheres_leave_uncovered(desk: Desk, arm: RobotModel) -> None:
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
     with_spheres(desk, shrunk(arm.sphere_set))
-    assert desk.replay("--scene", str(scene), "-q") == 0
+    assert desk.replay(*scene_of(desk, BALL), "-q") == 0
     report = coverage_deficit(arm.urdf, shrunk(arm.sphere_set))
     assert desk.metrics()["coverage_deficit"] == pytest.approx(report.max_deficit, abs=1e-9)
     assert report.worst is not None and report.worst.link in about(desk)
@@ -161,8 +160,7 @@ def test_a_margin_that_spheres_cannot_keep_is_lowered_and_said_once(
     desk: Desk, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(self_margins, "SELF_POSTURES", 100)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    drive = ("--scene", str(scene), "--force", "--set", "control.solver=daqp", "--set", "control.max_time=0.1")
+    drive = (*scene_of(desk, BALL), "--force", "--set", "control.solver=daqp", "--set", "control.max_time=0.1")
     wide = ("--set", "control.self_margin=0.06")
     for options, said in (("--mode=closed-loop", 0), (("--mode=closed-loop", *wide), 1), (wide, 0)):
         assert desk.replay(*drive, *([options] if isinstance(options, str) else options)) == 0
