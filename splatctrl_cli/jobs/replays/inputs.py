@@ -192,14 +192,21 @@ def _check_bounded(model: RobotModel) -> None:
         raise InputError(
             f"{wanted}: {model.coverage_unknown}", remedy="or set control.coverage = report, which needs no meshes"
         )
-    bodies = model.urdf.rigid_bodies()
-    children = {child for _, child in model.urdf.parents}
-    bare = [link for link in model.coverage.bare_links if bodies[link][0] in children]
+    bare = bare_moving_links(model)
     if bare:
         raise InputError(
             f"{wanted}: expected spheres on every link that moves, got none on {', '.join(bare)}",
             remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {model.urdf.path.name}",
         )
+
+
+def bare_moving_links(model: RobotModel) -> list[str]:
+    """Links with a body, moved by a joint, that have no sphere; none where the coverage was not measured."""
+    if model.coverage is None:
+        return []
+    bodies = model.urdf.rigid_bodies()
+    children = {child for _, child in model.urdf.parents}
+    return [link for link in model.coverage.bare_links if bodies[link][0] in children]
 
 
 def _proven(link: LinkCoverage) -> float:

@@ -316,10 +316,7 @@ def _place(point: Float64) -> tuple[float, float, float]:
 
 
 def _distance(field: DistanceField) -> DistanceFunction:
-    def distance(points: Float64) -> Float64:
-        return field.query(points)[0]
-
-    return distance
+    return lambda points: field.query(points)[0]
 
 
 def _median_radius(file: Path, header: Mapping[str, object]) -> float:

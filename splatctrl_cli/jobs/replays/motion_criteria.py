@@ -23,7 +23,7 @@ from splatctrl_cli.jobs.replays.criteria_input import (
     mm,
     time_of_least,
 )
-from splatctrl_cli.jobs.replays.inputs import recorded_postures
+from splatctrl_cli.jobs.replays.inputs import bare_moving_links, recorded_postures
 from splatctrl_cli.robot.self_margins import least_gap
 
 
@@ -289,7 +289,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
             remedy="give a URDF with collision geometry (--packages finds its meshes)",
         )
         return
-    bare = _bare_moving_links(judged)
+    bare = bare_moving_links(judged.replay.model)
     if bare:
         yield lacking(
             sentence=f"no sphere on {', '.join(bare)}: nothing is known of their clearance",
@@ -344,16 +344,6 @@ def _of_body(judged: Judged) -> tuple[float, float | None, float | None]:
     if spheres is None or spheres < judged.threshold:
         return np.nan, None, None
     return spheres, least_of(judged.replay.between["surface"]), least_of(judged.replay.between["lower"])
-
-
-def _bare_moving_links(judged: Judged) -> list[str]:
-    """Links with a body, moved by a joint, that have no sphere."""
-    model = judged.replay.model
-    if model.coverage is None:
-        return []
-    bodies = model.urdf.rigid_bodies()
-    children = {child for _, child in model.urdf.parents}
-    return [link for link in model.coverage.bare_links if bodies[link][0] in children]
 
 
 OF_MOTION: tuple[Criterion[Judged], ...] = (
