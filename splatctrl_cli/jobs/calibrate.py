@@ -302,10 +302,7 @@ def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotE
 
 
 def _calibration(
-    source: FrameSource,
-    solution: Solution,
-    begin: Mapping[str, Float64],
-    unknown: Mapping[str, tuple[str, ...]],
+    source: FrameSource, solution: Solution, begin: Mapping[str, Float64], unknown: Mapping[str, tuple[str, ...]]
 ) -> Calibration:
     """begin: T_recorded_camera (4, 4) by camera, that the solution was begun at."""
     evidence, estimate, certainty = solution.adjustment.evidence, solution.estimate, solution.certainty

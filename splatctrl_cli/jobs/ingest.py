@@ -45,11 +45,7 @@ class IngestResult:
     @property
     def metrics(self) -> dict[str, Any]:
         written = self.summary
-        return {
-            "frames": written.num_frames,
-            "joint_states": written.num_joint_states,
-            "loss": asdict(written.loss),
-        }
+        return {"frames": written.num_frames, "joint_states": written.num_joint_states, "loss": asdict(written.loss)}
 
     @property
     def exit_code(self) -> int:

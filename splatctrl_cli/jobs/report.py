@@ -146,12 +146,7 @@ class _Job:
     def order(self) -> tuple[bool, bool, bool, float]:
         """Not as expected first, then changed, then not passed, then by clearance."""
         node = self.node
-        return (
-            node.state == AS_EXPECTED,
-            not self.is_changed,
-            node.outcome in ("passed", None),
-            self.least,
-        )
+        return (node.state == AS_EXPECTED, not self.is_changed, node.outcome in ("passed", None), self.least)
 
 
 def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progress) -> Page:

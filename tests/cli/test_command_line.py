@@ -234,15 +234,7 @@ def test_what_a_command_prints_as_json_is_as_the_schema_says(work: Work, tmp_pat
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        "info {log}",
-        "check {log}",
-        "config",
-        "config --schema",
-        "completion bash",
-        "robot info --urdf {urdf}",
-    ],
+    "words", ["info {log}", "check {log}", "config", "config --schema", "completion bash", "robot info --urdf {urdf}"]
 )
 def test_what_is_only_printed_is_as_the_schema_says(work: Work, words: str) -> None:
     done = here.splatctrl(*words.format(log=work.log, urdf=work.folder / "robot.urdf").split(), "--json", "-q")

@@ -155,9 +155,7 @@ def test_anisotropic_gaussians_go_to_every_format(gaussians: Path, suffix: str) 
         assert result.largest_pixel_difference <= 3 / 255
 
 
-def test_the_full_layout_has_the_62_properties_and_says_what_it_leaves_out(
-    scene: Path,
-) -> None:
+def test_the_full_layout_has_the_62_properties_and_says_what_it_leaves_out(scene: Path) -> None:
     out = scene.parent / "out.ply"
     write_ply(scene / "splats.ply", replace(ball(), density=np.ones(400, np.float32)), {})
     assert export(scene, "out.ply", layout="full").not_kept == ("labels", "density")

@@ -72,12 +72,7 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
     with (
         Ledger(out) as ledger,
         scheduling(
-            ledger,
-            command_line.entry,
-            progress,
-            workers=request.workers,
-            dask=request.dask,
-            again=request.again,
+            ledger, command_line.entry, progress, workers=request.workers, dask=request.dask, again=request.again
         ) as scheduler,
     ):
         progress.log(f"batch: {_counted(len(nodes), 'node')} into {out}")

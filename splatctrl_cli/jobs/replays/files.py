@@ -153,12 +153,7 @@ def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, robot: Mappin
     }
     if replay.outside is not None:
         words["controller"] = replay.outside.name
-    return {
-        "verdict": verdict.as_dict(),
-        "when_and_why": when_and_why(replay),
-        "about": words,
-        "metrics": metrics,
-    }
+    return {"verdict": verdict.as_dict(), "when_and_why": when_and_why(replay), "about": words, "metrics": metrics}
 
 
 def events_document(replay: Replay) -> dict[str, Any]:

@@ -132,10 +132,7 @@ OF_AUDIT: Declared = (
     _single("num_spheres", lambda replay: len(replay.model.sphere_set.radii)),
     _single("num_bare_links", lambda r: len(r.model.bare_links), lambda r: len(r.model.urdf.links), FAULTS),
     _single(
-        "coverage_deficit",
-        _deficit,
-        lambda r: 0 if r.model.coverage is None else len(r.model.coverage.links),
-        ERROR,
+        "coverage_deficit", _deficit, lambda r: 0 if r.model.coverage is None else len(r.model.coverage.links), ERROR
     ),
     _single("num_self_pairs", lambda replay: len(replay.model.self_pairs())),
     _single("num_states", num_states),

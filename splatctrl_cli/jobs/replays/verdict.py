@@ -4,10 +4,7 @@ from splatctrl_cli.control.line_process import shown
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
 from splatctrl_cli.jobs.replays.criteria_input import CONTACT, SAFE, Judged, nearby
-from splatctrl_cli.jobs.replays.evidence_criteria import (
-    OF_EVIDENCE,
-    bound_words,
-)
+from splatctrl_cli.jobs.replays.evidence_criteria import OF_EVIDENCE, bound_words
 from splatctrl_cli.jobs.replays.golden import Golden, golden_reason
 from splatctrl_cli.jobs.replays.metrics import counts_of, first_time
 from splatctrl_cli.jobs.replays.motion_criteria import OF_MOTION

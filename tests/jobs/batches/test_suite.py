@@ -183,10 +183,7 @@ def test_shards_hold_every_recording_once(tmp_path: Path) -> None:
         ("[[recordings]]\nname = 'x'\npaths = ['*.mcap']\n[jobs.check]\n", "name = 'x': 2 recordings match"),
         ("[[recordings]]\nname = '../x'\npaths = ['a.mcap']\n[jobs.check]\n", "'../x' is no name of a folder"),
         (RECORDINGS * 2 + "[jobs.check]\n", "two recordings are called 'a'"),
-        (
-            RECORDINGS + "jobs.chek.quick = 3\n[jobs.check]\n",
-            "[recordings.jobs.chek]: no job has this name; did you",
-        ),
+        (RECORDINGS + "jobs.chek.quick = 3\n[jobs.check]\n", "[recordings.jobs.chek]: no job has this name; did you"),
         (
             RECORDINGS + "only = ['info']\njobs.check.quick = 3\n[jobs.check]\n[jobs.info]\n",
             "[recordings.jobs.check]: no job has this name",

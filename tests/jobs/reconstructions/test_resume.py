@@ -211,10 +211,7 @@ def test_a_run_goes_on_only_as_what_it_was(
 
 
 def test_without_resume_a_run_starts_over_and_says_so(
-    interrupted: list[str],
-    whole: dict[str, dict[str, Any]],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    interrupted: list[str], whole: dict[str, dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
     assert main([word for word in interrupted if word != "-q"]) == 0

@@ -260,20 +260,8 @@ ALONE: dict[str, Broken] = {
         "frames without depth do not count",
     ),
     "frames ahead": (frames_of_the_future, (), "evidence age", "not evaluable", "is 2.00 s later than the state"),
-    "unwatched": (
-        came_unwatched,
-        (),
-        "evidence age",
-        "not evaluable",
-        "arm from 0.25 to 1.00 s, and then",
-    ),
-    "unwatched end": (
-        came_after_the_last_map,
-        (),
-        "evidence age",
-        "not evaluable",
-        "10.0 mm from where the arm was",
-    ),
+    "unwatched": (came_unwatched, (), "evidence age", "not evaluable", "arm from 0.25 to 1.00 s, and then"),
+    "unwatched end": (came_after_the_last_map, (), "evidence age", "not evaluable", "10.0 mm from where the arm was"),
     "late map": (
         came_before_a_late_map,
         ("--latency", "0.2"),
