@@ -149,12 +149,7 @@ def draw_certificate() -> Any:
 def fields(centers: Float64, radii: Float64, length: float) -> dict[str, DistanceField]:
     """The four fields with the default weights."""
     exact, kernel = SphereField(centers, radii), SeField(centers, radii, length)
-    return {
-        "hard": exact,
-        "gpdf": GpdfField(centers, radii, length),
-        "se": kernel,
-        "safe": SafeField(exact, kernel),
-    }
+    return {"hard": exact, "gpdf": GpdfField(centers, radii, length), "se": kernel, "safe": SafeField(exact, kernel)}
 
 
 def new_figure(columns: int = 1) -> tuple[Any, Any]:

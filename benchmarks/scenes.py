@@ -102,12 +102,7 @@ def enlarged(frame: RgbdFrame) -> RgbdFrame:
         color=np.repeat(np.repeat(frame.color, 2, axis=0), 2, axis=1),
         depth=np.repeat(np.repeat(frame.depth, 2, axis=0), 2, axis=1),
         intrinsics=Intrinsics(
-            fx=2 * k.fx,
-            fy=2 * k.fy,
-            cx=2 * k.cx + 0.5,
-            cy=2 * k.cy + 0.5,
-            width=2 * k.width,
-            height=2 * k.height,
+            fx=2 * k.fx, fy=2 * k.fy, cx=2 * k.cx + 0.5, cy=2 * k.cy + 0.5, width=2 * k.width, height=2 * k.height
         ),
     )
 

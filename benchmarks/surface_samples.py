@@ -64,11 +64,7 @@ def thin(points: Float64, spacing: float) -> NDArray[np.int64]:
 
 
 def inscribed_radii(
-    samples: SurfaceSamples,
-    largest: float,
-    nearest_surface: Callable[[Float64], Float64],
-    *,
-    tolerance: float = 2e-4,
+    samples: SurfaceSamples, largest: float, nearest_surface: Callable[[Float64], Float64], *, tolerance: float = 2e-4
 ) -> Float64:
     """Radii (N,) [m] of balls inside the surface that touch it at the samples: `largest`, or as large as fits.
 

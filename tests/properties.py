@@ -11,9 +11,5 @@ Test = TypeVar("Test", bound=Callable[..., None])
 def few(examples: int) -> Callable[[Test], Test]:
     """Settings for so many examples: derandomised, without a deadline or a data base of failures."""
     return settings(
-        max_examples=examples,
-        deadline=None,
-        derandomize=True,
-        database=None,
-        suppress_health_check=list(HealthCheck),
+        max_examples=examples, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
     )

@@ -22,13 +22,7 @@ from splatctrl_cli.kernels import Float32, Float64
 from splatctrl_cli.kernels.cuda.card import CudaDevice
 from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.cuda.memory import Graph
-from splatctrl_cli.kernels.raster import (
-    LossWeights,
-    Moments,
-    OptimiserSettings,
-    TargetView,
-    pack_camera,
-)
+from splatctrl_cli.kernels.raster import LossWeights, Moments, OptimiserSettings, TargetView, pack_camera
 
 ROOT = Path(__file__).parent.parent
 WIDTH, HEIGHT, FOCAL = 640, 480, 600.0

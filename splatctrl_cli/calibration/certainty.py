@@ -87,11 +87,7 @@ def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> 
     surely = np.maximum(values, np.maximum(error / fixed.CALIBRATION_UNKNOWN, floor))
     inverse = vectors / surely @ vectors.T
     covariance = fixed.CALIBRATION_INFLATION**2 * back @ inverse @ M @ inverse @ back.T
-    return Certainty(
-        unknowns=adjustment.unknowns,
-        covariance=0.5 * (covariance + covariance.T),
-        reach=reach,
-    )
+    return Certainty(unknowns=adjustment.unknowns, covariance=0.5 * (covariance + covariance.T), reach=reach)
 
 
 def _reach(adjustment: Adjustment, estimate: Estimate) -> Float64:

@@ -16,29 +16,13 @@ from splatctrl_cli.files.arrays import DAMAGE, npy_of
 from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.logs.joint_topics import (
-    AGAIN,
-    joints_again,
-    read_topics,
-    with_joints,
-    without_joints,
-)
+from splatctrl_cli.logs.joint_topics import AGAIN, joints_again, read_topics, with_joints, without_joints
 from splatctrl_cli.logs.messages import metres
 from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB, SourceOptions
 from splatctrl_cli.logs.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.logs.stored_frame import StoredFrame, decoded, human_mask
 from splatctrl_cli.logs.survey import RobotDescription
-from splatctrl_cli.records import (
-    Bool,
-    Float32,
-    Float64,
-    Intrinsics,
-    JointState,
-    LossReport,
-    Record,
-    UInt8,
-    by_stamp,
-)
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, UInt8, by_stamp
 
 NEEDED = ("stamp_ns", "position", "velocity")
 OPTIONAL = ("commanded_velocity", "T_base_ee", "T_world_ee")  # NaN where a state has none, absent where none has one

@@ -6,11 +6,7 @@ import numpy as np
 
 from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.checks.check_cameras import lens_findings, pose_findings
-from splatctrl_cli.checks.check_images import (
-    ImageWatch,
-    depth_findings,
-    sample_findings,
-)
+from splatctrl_cli.checks.check_images import ImageWatch, depth_findings, sample_findings
 from splatctrl_cli.checks.check_states import RobotStates, robot_states
 from splatctrl_cli.checks.check_times import TimesWatch, time_findings
 from splatctrl_cli.checks.clock_offset import ImageMotion

@@ -267,10 +267,7 @@ class CheckReport:
 def needs(*, num_cameras: int, num_frames: int, states_lack: str) -> list[Need]:
     """One for each later command, errors among the findings apart. states_lack: why there are no joint states."""
     too_few = "one camera and less than three frames: nothing can be held out; record more views"
-    lacks = {
-        "score": too_few if num_cameras == 1 and 0 < num_frames < 3 else "",
-        "replay": states_lack,
-    }
+    lacks = {"score": too_few if num_cameras == 1 and 0 < num_frames < 3 else "", "replay": states_lack}
     return [Need(command=name, lacks=tuple(filter(None, [lacks.get(name)]))) for name in ALL]
 
 

@@ -88,10 +88,7 @@ def calibrate_options(add: Options, parser: Parser) -> None:
     add("SOURCE", f"the recording to calibrate: {kinds}; {SEVERAL_LOGS}", Path, nargs="+")
     add_output(add, "TOML file that commands take as --calibration", default="calibration.toml")
     add("--urdf FILE", "place the cameras by this robot's surface, where its joint states have it", Path)
-    add(
-        "--hold CAMERA",
-        "what stays as recorded (default: the robot's base, without --urdf the first camera)",
-    )
+    add("--hold CAMERA", "what stays as recorded (default: the robot's base, without --urdf the first camera)")
     add(
         "--board COLUMNSxROWS:M",
         "begin where a board of so many inner corners (chessboard or ChArUco), squares of M metres, has the cameras",

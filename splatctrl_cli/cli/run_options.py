@@ -67,11 +67,7 @@ def study_options(add: Options, parser: Parser) -> None:
     """Of ``splatctrl study``."""
     add("STUDY", "which experiment of the paper", ("table2", "scenes", "shared-workspace", "dtu", "ablation"))
     add("-o/--out DIR", "folder of the study, where it goes on (default: STUDY)", Path)
-    add(
-        "--trials N",
-        "problems of each kind (default: as many as the paper's)",
-        whole(1, 100_000),
-    )
+    add("--trials N", "problems of each kind (default: as many as the paper's)", whole(1, 100_000))
     add("--methods A,B", "some of the study's (docs/study.md; default: all that are installed)", _names)
     add("--problems DIR", "table2: MotionBenchMaker's (default: of SPLATCTRL_REAL_DATA); dtu: a tree of scans", Path)
     add("--width PX", "of the cameras' images (default: 320; scenes 640, shared-workspace 160)", whole(32, 1280))

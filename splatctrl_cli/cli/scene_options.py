@@ -175,9 +175,7 @@ def score_options(add: Options, parser: Parser) -> None:
         Path,
     )
     more(
-        "--cloud-masks DIR",
-        "DTU's folder ObsMask (ObsMask24_10.mat, Plane24.mat): compare only where DTU does",
-        Path,
+        "--cloud-masks DIR", "DTU's folder ObsMask (ObsMask24_10.mat, Plane24.mat): compare only where DTU does", Path
     )
     more("--cloud-unit M", "metres per unit (default: 0.001 with --dtu, else 1)", real(1e-9, 1e3, "m"))
     more("--cloud-max M", "farther points count in a share, not in a mean", real(1e-6, 1e3, "m"), 0.02)

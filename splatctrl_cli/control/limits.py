@@ -145,10 +145,7 @@ class JointLimits:
         if self.acceleration is None or last_velocity is None:
             return lowest, highest
         change = self.acceleration * self.period
-        return (
-            np.clip(last_velocity - change, lowest, highest),
-            np.clip(last_velocity + change, lowest, highest),
-        )
+        return (np.clip(last_velocity - change, lowest, highest), np.clip(last_velocity + change, lowest, highest))
 
     def rest(self, last_velocity: Float64 | None) -> Float64:
         """What holding still is (J,) [rad/s]: zero, or the nearest to it that the acceleration allows."""

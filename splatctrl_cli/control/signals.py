@@ -15,11 +15,7 @@ from splatctrl_cli.records import Bool, Float64
 
 
 def audit_signals(
-    audit: AuditTrace,
-    margin: float,
-    spheres: Sequence[str],
-    joints: Sequence[str],
-    pairs: Sequence[str] = (),
+    audit: AuditTrace, margin: float, spheres: Sequence[str], joints: Sequence[str], pairs: Sequence[str] = ()
 ) -> list[Signal]:
     """What the clearances, limits and known space of T states amount to; pairs: names of what may
     collide with each other.

@@ -222,13 +222,7 @@ class QpIkController:
         """Of every row (M,)."""
         return self._builder.kinds
 
-    def margin_of(
-        self,
-        q: Float64,
-        velocity: Float64,
-        *,
-        distance_rate: float | Float64 = 0.0,
-    ) -> VelocityMargin:
+    def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
         """The room that any joint velocity (J,) [rad/s] leaves at q (J,), this controller's or not; no acceleration
         counts. Raises as `step`.
         """

@@ -144,11 +144,7 @@ def read_views(
         numbers.append(number)
         files += [path] if mask_path is None else [path, mask_path]
     return DtuScan(
-        name=scan,
-        views=tuple(views),
-        numbers=tuple(numbers),
-        files=tuple(files),
-        without_depth=tuple(without_depth),
+        name=scan, views=tuple(views), numbers=tuple(numbers), files=tuple(files), without_depth=tuple(without_depth)
     )
 
 

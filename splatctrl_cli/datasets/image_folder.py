@@ -13,15 +13,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import UNIT_BASELINE
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ImageFile, read_description, read_rig
-from splatctrl_cli.datasets.folder_views import (
-    HOLDOUT,
-    UNITS,
-    View,
-    cameras_apart,
-    find_files,
-    length_unit,
-    views_of,
-)
+from splatctrl_cli.datasets.folder_views import HOLDOUT, UNITS, View, cameras_apart, find_files, length_unit, views_of
 from splatctrl_cli.datasets.layout_nerfstudio import with_transforms
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of

@@ -94,8 +94,7 @@ def _lens(pincams: dict[int, Path], view: ListedView) -> CameraTable:
     values = read_numbers(pincams[near])
     if len(values) != 6 or not np.isfinite(values).all():
         raise InputError(
-            f"{pincams[near]}: expected width, height, fx, fy, cx, cy, got {values}",
-            remedy="copy the file again",
+            f"{pincams[near]}: expected width, height, fx, fy, cx, cy, got {values}", remedy="copy the file again"
         )
     width, height, fx, fy, cx, cy = values
     return CameraTable(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy)

@@ -11,16 +11,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.datasets.layout import (
-    CAMERA,
-    Layout,
-    Lenses,
-    Pairs,
-    described,
-    image_size,
-    images_of,
-    read_json,
-)
+from splatctrl_cli.datasets.layout import CAMERA, Layout, Lenses, Pairs, described, image_size, images_of, read_json
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.logs.source_options import SourceOptions

@@ -15,12 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.datasets.folder_description import (
-    CameraTable,
-    Description,
-    ListedView,
-    PosesTable,
-)
+from splatctrl_cli.datasets.folder_description import CameraTable, Description, ListedView, PosesTable
 from splatctrl_cli.datasets.layout import Layout, Lenses, image_size
 from splatctrl_cli.datasets.poses import read_nerfstudio
 from splatctrl_cli.errors import InputError
@@ -45,9 +40,7 @@ def read(folder: Path, options: SourceOptions) -> Description:
     options.refuse(("intrinsics",), "a folder with transforms.json", folder)
     file = next(name for name in FILES if (folder / name).is_file())
     description = Description(
-        path=folder / file,
-        root=folder,
-        poses=PosesTable(format="nerfstudio", file=file, axes="opengl"),
+        path=folder / file, root=folder, poses=PosesTable(format="nerfstudio", file=file, axes="opengl")
     )
     return with_transforms(description)
 

@@ -22,14 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ImageFile, PosesTable
-from splatctrl_cli.datasets.layout import (
-    Layout,
-    described,
-    images_of,
-    paired_by_name,
-    paired_by_stamp,
-    pinhole,
-)
+from splatctrl_cli.datasets.layout import Layout, described, images_of, paired_by_name, paired_by_stamp, pinhole
 from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_tum, rigid, stamp_of_text
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions

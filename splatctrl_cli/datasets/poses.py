@@ -73,10 +73,7 @@ def read_trajectory_log(path: Path) -> dict[str, Float64]:
         where = f"{path}: pose {index // 5}"
         head = lines[index].split()
         if len(head) != 3 or not head[0].isdigit():
-            raise InputError(
-                f"{where}: expected three integers, got {lines[index]!r}",
-                remedy=_CORRECT,
-            )
+            raise InputError(f"{where}: expected three integers, got {lines[index]!r}", remedy=_CORRECT)
         poses[str(int(head[0]))] = _matrix(lines[index + 1 : index + 5], where)
     return poses
 
@@ -88,8 +85,7 @@ def read_tum(path: Path) -> dict[str, Float64]:
         is_pose = len(values) == 8 and bool((np.abs(values[1:]) < MAX_PLACE).all())
         if not is_pose or not any(values[4:]):
             raise InputError(
-                f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}",
-                remedy=_CORRECT,
+                f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}", remedy=_CORRECT
             )
         poses[words[0]] = transform_from(values[1:4], values[4:8])
     return poses
@@ -124,10 +120,7 @@ def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
         raise InputError(f"{path}: not a transforms.json: {error}", remedy=_CORRECT) from None
     for name, matrix in matrices.items():
         if matrix.shape != (4, 4):
-            raise InputError(
-                f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}",
-                remedy=_CORRECT,
-            )
+            raise InputError(f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}", remedy=_CORRECT)
     return content, matrices
 
 
@@ -194,7 +187,4 @@ def _numbers(words: list[str], where: str) -> list[float]:
     try:
         return [np.nan if _MSVC_NAN.fullmatch(word) else float(word) for word in words]
     except ValueError:
-        raise InputError(
-            f"{where}: expected numbers, got {' '.join(words)!r}",
-            remedy=_CORRECT,
-        ) from None
+        raise InputError(f"{where}: expected numbers, got {' '.join(words)!r}", remedy=_CORRECT) from None

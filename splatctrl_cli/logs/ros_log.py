@@ -22,14 +22,7 @@ from splatctrl_cli.logs.messages import ImageMessage, color_of, depth_of, num_in
 from splatctrl_cli.logs.rig import Camera, build_cameras, nearest_gap_ns
 from splatctrl_cli.logs.source_options import SourceOptions, still_note
 from splatctrl_cli.logs.state_topics import joint_records
-from splatctrl_cli.logs.stored_frame import (
-    StoredFrame,
-    check_depth,
-    decoded,
-    human_mask,
-    is_kept,
-    is_png,
-)
+from splatctrl_cli.logs.stored_frame import StoredFrame, check_depth, decoded, human_mask, is_kept, is_png
 from splatctrl_cli.logs.survey import Survey, survey
 from splatctrl_cli.records import SECOND_NS, Float32, Float64, JointState, LossReport, Record, UInt8, by_stamp
 

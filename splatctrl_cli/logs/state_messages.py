@@ -84,11 +84,7 @@ def _joint_state(message: Any, log_time_ns: int) -> RawJoints:
             f"a JointState with {len(names)} names, {len(position)} positions and {len(velocity)} velocities"
         )
     return RawJoints(
-        stamp_ns=stamp_ns(message.header),
-        names=names,
-        position=position,
-        velocity=velocity,
-        log_time_ns=log_time_ns,
+        stamp_ns=stamp_ns(message.header), names=names, position=position, velocity=velocity, log_time_ns=log_time_ns
     )
 
 

@@ -129,12 +129,7 @@ def commands_picture(
 
 
 def open_loop_picture(
-    path: Path,
-    seconds: Float64,
-    difference: FloatRows,
-    joints: Sequence[str],
-    margin: FloatRows,
-    shaped: Intervals,
+    path: Path, seconds: Float64, difference: FloatRows, joints: Sequence[str], margin: FloatRows, shaped: Intervals
 ) -> None:
     """Write commanded less logged velocity (T, J) [rad/s] over the room (T,) [m/s] that the logged velocity left.
 

@@ -31,9 +31,7 @@ class Filled:
 
     def __add__(self, other: "Filled") -> "Filled":
         return Filled(
-            added=self.added + other.added,
-            relocated=self.relocated + other.relocated,
-            unmet=self.unmet + other.unmet,
+            added=self.added + other.added, relocated=self.relocated + other.relocated, unmet=self.unmet + other.unmet
         )
 
 

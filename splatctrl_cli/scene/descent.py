@@ -32,12 +32,7 @@ class Descent:
     """
 
     def __init__(
-        self,
-        config: SceneConfig,
-        buffer: SplatBuffer,
-        seed: int,
-        num_threads: int,
-        device: DeviceFit | None = None,
+        self, config: SceneConfig, buffer: SplatBuffer, seed: int, num_threads: int, device: DeviceFit | None = None
     ) -> None:
         self.num_iterations = 0
         self.background: Color | None = None

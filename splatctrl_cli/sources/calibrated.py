@@ -23,16 +23,7 @@ from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB, SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame, decoded
-from splatctrl_cli.records import (
-    SECOND_NS,
-    Float32,
-    Float64,
-    JointState,
-    LossReport,
-    Record,
-    RgbdFrame,
-    by_stamp,
-)
+from splatctrl_cli.records import SECOND_NS, Float32, Float64, JointState, LossReport, Record, RgbdFrame, by_stamp
 
 
 @dataclass(frozen=True, kw_only=True)

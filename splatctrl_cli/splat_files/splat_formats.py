@@ -15,13 +15,7 @@ from splatctrl_cli.records import GaussianSet, Label, SplatSet
 from splatctrl_cli.splat_files import splats
 from splatctrl_cli.splat_files.gaussian_ply import REFERENCE_PLY, gaussians_of
 from splatctrl_cli.splat_files.splat_format import Comments, SplatFormat
-from splatctrl_cli.splat_files.splats import (
-    as_gaussians,
-    as_splats,
-    check_world,
-    is_isotropic,
-    read_world_splats,
-)
+from splatctrl_cli.splat_files.splats import as_gaussians, as_splats, check_world, is_isotropic, read_world_splats
 
 __all__ = ["FORMATS", "REFERENCE_PLY", "SplatFormat", "describe_splats", "format_of", "read_spheres", "read_splats"]
 

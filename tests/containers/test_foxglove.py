@@ -125,10 +125,7 @@ def as_json(_schema: str, message: Any) -> bytes:
 
 
 def convert(
-    log: Path,
-    path: Path,
-    encoding: str,
-    spoil: Callable[[str, bytes], bytes] = lambda name, data: data,
+    log: Path, path: Path, encoding: str, spoil: Callable[[str, bytes], bytes] = lambda name, data: data
 ) -> Path:
     """The images, calibrations and transforms of a ROS 2 log in Foxglove's schemas."""
     write: Callable[[str, Any], bytes] = encoded if encoding == "protobuf" else as_json

@@ -19,10 +19,7 @@ from tests.reference import conformal as reference
 
 
 @few(200)
-@given(
-    scores=st.lists(st.integers(-5, 20).map(float), min_size=1, max_size=40),
-    percent=st.integers(50, 99),
-)
+@given(scores=st.lists(st.integers(-5, 20).map(float), min_size=1, max_size=40), percent=st.integers(50, 99))
 def test_the_rank_is_that_of_the_definition(scores: list[float], percent: int) -> None:
     rank = conformal_rank(len(scores), percent / 100)
     expected = reference.quantile(scores, Fraction(percent, 100))

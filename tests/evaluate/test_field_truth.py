@@ -86,10 +86,7 @@ def box_grid(error: float = 0.0, *, hard_error: float = 0.0, voxel: float = 0.02
     axis = -0.4 + voxel * np.arange(round(0.8 / voxel) + 1)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     truth = box_distance(points.reshape(-1, 3), SIZE).reshape(points.shape[:3])
-    channels = {
-        "sdf": (truth + error).astype(np.float32),
-        "bound": (truth + hard_error - 0.017).astype(np.float32),
-    }
+    channels = {"sdf": (truth + error).astype(np.float32), "bound": (truth + hard_error - 0.017).astype(np.float32)}
     return DistanceGrid(origin=np.full(3, -0.4), voxel=voxel, channels=channels, header=dict(HEADER))
 
 

@@ -109,19 +109,13 @@ def fails_as(error: BaseException) -> Callable[[Path], None]:
 def test_a_failure_leaves_nothing(
     tmp_path: Path, work: Callable[[Path], object], error: type[Exception], words: str
 ) -> None:
-    with (
-        pytest.raises(error, match=words),
-        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
-    ):
+    with pytest.raises(error, match=words), output_path(tmp_path / "out", force=False, is_folder=True) as partial:
         work(partial)
     assert not list(tmp_path.iterdir())
 
 
 def test_an_interrupted_run_leaves_only_a_partial(tmp_path: Path) -> None:
-    with (
-        pytest.raises(KeyboardInterrupt),
-        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
-    ):
+    with pytest.raises(KeyboardInterrupt), output_path(tmp_path / "out", force=False, is_folder=True) as partial:
         (partial / "a").write_text("1")
         raise KeyboardInterrupt
     assert [p.name for p in tmp_path.iterdir()] == ["out.partial"]

@@ -57,11 +57,7 @@ def near_figures(
 
 
 def blind_share(
-    arm: ArmModel,
-    q: Float64,
-    q_first: Float64,
-    margin: float,
-    last_seen: Callable[[Float64], NDArray[np.int64]],
+    arm: ArmModel, q: Float64, q_first: Float64, margin: float, last_seen: Callable[[Float64], NDArray[np.int64]]
 ) -> float:
     """Share of the moving spheres with at least five points on their shell in new space, 90 % of them never seen."""
     moving = np.flatnonzero(arm.moving_spheres).tolist()

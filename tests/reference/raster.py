@@ -19,11 +19,7 @@ def covariance_2d(camera: torch.Tensor, points_camera: torch.Tensor, radii: torc
 
 
 def render(
-    camera: torch.Tensor,
-    centers: torch.Tensor,
-    radii: torch.Tensor,
-    opacities: torch.Tensor,
-    colors: torch.Tensor,
+    camera: torch.Tensor, centers: torch.Tensor, radii: torch.Tensor, opacities: torch.Tensor, colors: torch.Tensor
 ) -> torch.Tensor:
     """Planes (5, H, W): sum_i (c_i, d_i, 1) alpha_i G_i prod_{j<i} (1 - alpha_j G_j), front to back."""
     width, height = int(camera[4]), int(camera[5])

@@ -58,9 +58,7 @@ def test_a_carried_box_that_pixels_need_is_used_and_one_in_the_air_is_not() -> N
     view = frame(block=VISITOR)
     held = Box(lower=np.array([-0.1, -0.1, -0.3]), upper=np.array([0.1, 0.1, VISITOR - 0.3]))  # in the ball's frame
     aside = Box(lower=np.array([0.2, 0.2, 0.0]), upper=np.array([0.3, 0.3, 0.1]))
-    declared = Declarations(
-        carried=tuple(Carried(link="arm", box=box, start=0.0, end=1.0) for box in (held, aside)),
-    )
+    declared = Declarations(carried=tuple(Carried(link="arm", box=box, start=0.0, end=1.0) for box in (held, aside)))
     at_frame = {0: np.repeat(robot.T_world_surface[0], 3, axis=0)}  # the link's pose, and that of each box
     holding = replace(robot, surface=robot.surface.with_boxes(declared.carried_at(0.5)), T_world_surface=at_frame)
     mask = self_mask(view, holding, OccupancyConfig())

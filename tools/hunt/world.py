@@ -201,9 +201,7 @@ def moving(solid: Primitive, seconds: Sequence[float], offsets: Float64) -> Prim
 def during(solid: Primitive, from_s: float | None, to_s: float | None) -> Primitive:
     """The solid, there only from a time to another [s]."""
     return replace(
-        solid,
-        from_ns=ALWAYS[0] if from_s is None else at_s(from_s),
-        to_ns=ALWAYS[1] if to_s is None else at_s(to_s),
+        solid, from_ns=ALWAYS[0] if from_s is None else at_s(from_s), to_ns=ALWAYS[1] if to_s is None else at_s(to_s)
     )
 
 

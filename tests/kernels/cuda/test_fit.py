@@ -12,15 +12,7 @@ from splatctrl_cli.kernels.cuda.fit import LIST_CAPACITY, DeviceFit, bytes_neede
 from splatctrl_cli.kernels.cuda.memory import DeviceError, Memory, OutOfMemory
 from splatctrl_cli.kernels.raster import Float32, LossTerms, LossWeights, TargetView
 from tests.kernels.cuda.emulator import EmulatedDevice
-from tests.kernels.cuda.scenes import (
-    SETTINGS,
-    WEIGHTS,
-    OnProcessor,
-    camera,
-    moments,
-    parameters,
-    target,
-)
+from tests.kernels.cuda.scenes import SETTINGS, WEIGHTS, OnProcessor, camera, moments, parameters, target
 from tests.reference import loss as loss_reference
 from tests.reference import raster as raster_reference
 
