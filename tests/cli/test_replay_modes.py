@@ -2,12 +2,13 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from splatctrl_cli.jobs.replays.metrics import metric_names
-from splatctrl_cli.records import JointState, Label, SplatSet
+from splatctrl_cli.records import JointState, Label
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, scene_of, splats_of, write_scene
 
@@ -212,11 +213,12 @@ def test_waypoints_are_reached_one_after_the_other(desk: Desk, arm: RobotModel, 
         assert np.linalg.norm(rows - arm.frame_pose(posture, frame)[:3, 3], axis=1).min() <= 0.01
 
 
-def with_person(arm: RobotModel, *, is_there: bool = True) -> tuple[SplatSet, SplatSet]:
-    """Nobody, then a person 30 cm ahead of the arm at the log's end."""
-    ball = ball_ahead(arm, 0.3)
-    alone, beside = splats_of(BALL), splats_of(BALL, ball)
-    return alone, replace(beside, labels=np.array([0, Label.HUMAN if is_there else 0], np.uint8))
+def write_passing_person(desk: Desk, arm: RobotModel) -> Path:
+    """A scene of nobody, from 0.3 to 2 s a person 30 cm ahead of the arm at the log's end, and nobody again."""
+    alone, beside = splats_of(BALL), splats_of(BALL, ball_ahead(arm, 0.3))
+    beside = replace(beside, labels=np.array([0, Label.HUMAN], np.uint8))
+    maps = ((0, alone), (3 * SECOND // 10, beside), (2 * SECOND, alone), (3 * SECOND, alone))
+    return write_scene(desk.folder / "scene", *maps)
 
 
 @pytest.mark.painted
@@ -224,10 +226,7 @@ def test_the_standstill_waits_where_the_controller_goes_on(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
     moving(desk)
-    alone, beside = with_person(arm)
-    scene = write_scene(
-        desk.folder / "scene", (0, alone), (3 * SECOND // 10, beside), (2 * SECOND, alone), (3 * SECOND, alone)
-    )
+    scene = write_passing_person(desk, arm)
     drive = ("--scene", str(scene), "-q", "--mode", "closed-loop", "--baseline", "standstill", "--zone", "0.9,1.0")
     assert desk.replay(*drive, "--require", "standstill_num_stops<=1") == 0
     metrics = desk.metrics()

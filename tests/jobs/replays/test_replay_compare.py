@@ -12,7 +12,7 @@ from splatctrl_cli.jobs.replays.compare import certified_distance, figure_scales
 from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, scene_of, splats_of, write_field, write_scene
-from tests.cli.test_replay_modes import ball_ahead, moving, with_person
+from tests.cli.test_replay_modes import ball_ahead, moving, write_passing_person
 from tests.jobs.stage import MOVE
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -90,12 +90,8 @@ def test_a_goal_that_is_in_collision_leaves_a_row_without_a_motion(
 
 def test_all_baselines_stand_in_one_table(desk: Desk, arm: RobotModel) -> None:
     moving(desk)
-    alone, beside = with_person(arm)
-    scene = write_scene(
-        desk.folder / "scene", (0, alone), (3 * SECOND // 10, beside), (2 * SECOND, alone), (3 * SECOND, alone)
-    )
-    zone = ("--zone", "0.9,1.0")
-    assert desk.replay("--scene", str(scene), *CLOSED, "--baseline", "standstill,birrt", *zone) == 0
+    scene = str(write_passing_person(desk, arm))
+    assert desk.replay("--scene", scene, *CLOSED, "--baseline", "standstill,birrt", "--zone", "0.9,1.0") == 0
     metrics = desk.metrics()
     assert set(figure_scales(["standstill", "birrt"], has_truth=False)) <= set(metrics)
     assert metrics["standstill_num_interventions"] == metrics["standstill_num_stops"] == 1
