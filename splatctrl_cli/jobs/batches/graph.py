@@ -181,7 +181,8 @@ def _nodes_of(
             inherited = _joined([node.variant for node in before])
             if inherited is None:
                 continue
-            for chosen in _combinations(job.matrix):
+            for picked in itertools.product(*job.matrix.values()):
+                chosen = dict(zip(job.matrix, picked, strict=True))
                 own = {f"{job.name}.{option}": value for option, value in chosen.items()}
                 variant = {**inherited, **own}
                 node = _node(recording, job, variant, _suffix(variant, (each for each, _ in jobs)), before, out)
@@ -268,11 +269,6 @@ def _joined(variants: Sequence[Variant]) -> Variant | None:
         if any(joined.setdefault(key, value) != value for key, value in variant.items()):
             return None
     return joined
-
-
-def _combinations(matrix: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
-    for values in itertools.product(*matrix.values()):
-        yield dict(zip(matrix, values, strict=True))
 
 
 def _merged(options: Table, chosen: Variant) -> dict[str, Any]:

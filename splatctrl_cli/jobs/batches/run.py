@@ -209,7 +209,7 @@ def local_executor(workers: int) -> Iterator[Executor]:
     executor = ThreadPoolExecutor(workers, thread_name_prefix="node")
     before = None
     if threading.current_thread() is threading.main_thread():
-        before = signal.signal(signal.SIGTERM, _interrupted)
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield executor
     except BaseException:
@@ -221,10 +221,6 @@ def local_executor(workers: int) -> Iterator[Executor]:
         stop_runners()
         if before is not None:
             signal.signal(signal.SIGTERM, before)
-
-
-def _interrupted(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 class Clock:

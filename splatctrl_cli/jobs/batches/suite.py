@@ -93,7 +93,8 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
     tables = _list(path.name, document, "recordings")
     recordings = _named([one for table in tables for one in _recordings(folder, table)])
     if not jobs or not recordings:
-        raise UsageError(f"{path.name}: expected [[recordings]] and [jobs.NAME], got none of {_lacking(jobs)}")
+        lacking = "the first" if jobs else "the second"
+        raise UsageError(f"{path.name}: expected [[recordings]] and [jobs.NAME], got none of {lacking}")
     _check_recordings(recordings, [job.name for job in jobs])
     out = folder / _text(path.name, document, "out", f"{path.stem}.out")
     return Suite(name=name, folder=folder, out=out, recordings=tuple(recordings), jobs=jobs)
@@ -107,10 +108,6 @@ def jobs_for(recording: Recording, jobs: Sequence[Job], commands: Sequence[str])
 def _job_for(job: Job, recording: Recording, commands: Sequence[str]) -> Job:
     own = _job(job.name, recording.overrides.get(job.name, {}), commands, job)
     return replace(own, options={**job.options, **own.options}, matrix={**job.matrix, **own.matrix})
-
-
-def _lacking(jobs: Sequence[Job]) -> str:
-    return "the first" if jobs else "the second"
 
 
 def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = None) -> Job:

@@ -53,15 +53,6 @@ class KnownFields:
     splats_alone: DistanceFunction | None = None
 
 
-def _nothing(_: int) -> None:
-    """For a scene that is all there from the beginning."""
-
-
-def _nothing_known(_: int) -> Seen | None:
-    """For a scene without records of what was seen."""
-    return None
-
-
 @dataclass(frozen=True, kw_only=True)
 class KnownScene:
     """`at(stamp_ns)` gives the same object for the same scene as long as it is in use; nothing is known before
@@ -84,11 +75,11 @@ class KnownScene:
     digests: dict[str, str]
     stamps_ns: Sequence[int] = ()
     latency_ns: int = 0
-    advance: Callable[[int], None] = _nothing
+    advance: Callable[[int], None] = lambda stamp_ns: None
     finish: Callable[[], None] = lambda: None
     box: Box | None = None
     moment_ns: int | None = None
-    seen_at: Callable[[int], Seen | None] = _nothing_known
+    seen_at: Callable[[int], Seen | None] = lambda stamp_ns: None
     has_seen_times: bool = True
     figures: Callable[[], Mapping[str, Any]] = dict
     has_people_margin: bool = False

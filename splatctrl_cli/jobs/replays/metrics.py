@@ -254,10 +254,6 @@ def _trace(name: str, value: Callable[[ReplayTrace], float], scale: Scale = DESC
     return _single(name, of_trace, scale=scale)
 
 
-def _rotation_deg(replay: Replay) -> Float64:
-    return np.degrees(_of("divergence", "rotation")(replay))
-
-
 OF_CLOSED_LOOP: Declared = (
     _trace("goal_reached", lambda trace: int(trace.outcome is Outcome.GOAL_REACHED), FULFILLED),
     _trace("stalled", lambda trace: int(trace.outcome is Outcome.STALLED), FAULTS),
@@ -282,7 +278,7 @@ OF_CLOSED_LOOP: Declared = (
         for name, unit, column in (
             ("joints", "rad", _of("divergence", "joints")),
             ("position", "m", _of("divergence", "position")),
-            ("rotation_deg", "degrees", _rotation_deg),
+            ("rotation_deg", "degrees", lambda replay: np.degrees(_of("divergence", "rotation")(replay))),
         )
     ),
 )

@@ -190,11 +190,6 @@ def test_a_replay_finds_the_meshes_of_the_self_mask_where_its_packages_are(tmp_p
 FILES = ("steps.csv", "events.json", "summary.json", "states.json")
 
 
-def in_blocks_of(monkeypatch: pytest.MonkeyPatch, num: int) -> None:
-    for module in (files, state_pass, state_store, spilled_rows, state_columns):
-        monkeypatch.setattr(module, "BLOCK", num)
-
-
 @pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
 @pytest.mark.usefixtures("without_plots")
 def test_blocks_of_any_size_give_the_same_files(
@@ -218,7 +213,8 @@ def test_blocks_of_any_size_give_the_same_files(
     truth = ("--truth", str(desk.folder / "truth.json"))
     more = {"audit": truth, "open-loop": (), "closed-loop": ("--follow",)}[mode]
     for num in (1, 7, 10_000):
-        in_blocks_of(monkeypatch, num)
+        for module in (files, state_pass, state_store, spilled_rows, state_columns):
+            monkeypatch.setattr(module, "BLOCK", num)
         assert desk.replay("--scene", str(scene), "-q", "--mode", mode, *more, out=str(num)) == 0
     for file in FILES:
         whole = (desk.folder / "10000" / file).read_bytes()
