@@ -3,7 +3,7 @@
 Where images change from frame to frame is compared with where a moving robot of spheres would change them.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -16,7 +16,6 @@ from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, RgbdFrame, Stamps, UInt8
 
 _NEAR = 0.05  # [m] in front of the camera
-Score = Callable[[float], float]
 Index = NDArray[np.int64]
 
 

@@ -10,7 +10,6 @@ from itertools import combinations
 
 import coal
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config.fixed import (
@@ -29,7 +28,6 @@ from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import DisabledPair, fixtures, joined_links, random_postures
 
-Int64 = NDArray[np.int64]
 LinkNames = tuple[str, str]
 Depth = Callable[[Float64], Float64]
 

@@ -15,7 +15,6 @@ from splatctrl_cli.records import Float64
 
 BASE = "link0"
 HAND = "hand"
-JOINT_NAMES = tuple(f"joint{i}" for i in range(1, 8))
 
 # name, origin xyz [m], roll about x [rad], lower, upper [rad], velocity [rad/s], effort [N m]
 JOINTS = (

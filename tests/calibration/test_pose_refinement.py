@@ -132,11 +132,6 @@ def test_what_is_stored_is_where_each_view_is(views: list[RgbdFrame]) -> None:
     assert told["poses"]["held"] == []
 
 
-@pytest.fixture(scope="module")
-def lit_views(sample_data: Path) -> list[RgbdFrame]:
-    return views_of(sample_data)
-
-
 def test_gains_are_found_to_a_percent(views: list[RgbdFrame]) -> None:
     gains = gains_of(len(views))
     off = [exposed(view, 1 / gain) for view, gain in zip(views, gains, strict=True)]

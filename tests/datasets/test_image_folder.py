@@ -19,7 +19,6 @@ from tests.scene.wall import frame
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 CAMERA = "[camera]\nwidth = 8\nheight = 6\nfx = 10\nfy = 10\ncx = 4.0\ncy = 3.0\n"
 FRAMES = '[frames]\ncolor = "rgb/*.png"\ndepth = "depth/*.png"\n'
-POSES = '[poses]\nformat = "trajectory-log"\nfile = "t.log"\n'
 POSE = look_at([0.5, 0.2, 1.0], [0.0, 0.0, 0.0])
 
 

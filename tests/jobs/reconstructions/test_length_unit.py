@@ -25,7 +25,6 @@ from tests.jobs.bakes.baked import Said
 
 CONFIG = Config(scene=SceneConfig(max_splats=600, first_iterations=20, refine_iterations=20))
 DEPTH_ONLY = {"poses": 1.0, "depths": 1000.0}
-POSES_ONLY = {"poses": 1000.0, "depths": 1.0}
 
 
 @pytest.fixture(scope="module")

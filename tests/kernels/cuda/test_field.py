@@ -1,6 +1,5 @@
 """The kernels of the fields, beside those of the processor and the float64 references of the paper's equations."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +23,6 @@ from tests.reference import field as reference
 
 ALL = ("hard", "gradient", "bound", "entry", "se", "gpdf")
 KINDS = {"se": SeField, "gpdf": GpdfField}
-NewDevice = Callable[[], Memory]
 EXACT = FieldConfig(truncation=1e-9)  # nothing that counts is left out: what is left is rounding
 NUM, MEAN_RADIUS = 600, 0.007
 
