@@ -4,14 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.cloud import drawn_on
 from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.mesh_distance import TriangleMesh
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Index
 
 CANDIDATES = 24  # per square of one spacing: what is left between samples then has little room for another
 SHRINKS = 30  # of an inscribed ball; each reaches further into the corner, and a few do
@@ -48,7 +47,7 @@ def check_spacing(spacing: float) -> None:
         raise UsageError(f"spacing: expected a distance above 0 m, got {spacing}")
 
 
-def thin(points: Float64, spacing: float) -> NDArray[np.int64]:
+def thin(points: Float64, spacing: float) -> Index:
     """Indices of points (N, 3) that are pairwise at least `spacing` [m] apart; every other one is nearer to one.
 
     Points are taken in their order: random points give a Poisson-disk sample.

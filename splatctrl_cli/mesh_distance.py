@@ -6,15 +6,12 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.libraries import trimesh
-from splatctrl_cli.records import Bool, Float64
-
-Int64 = NDArray[np.int64]
+from splatctrl_cli.records import Bool, Float64, Index
 
 POINTS_PER_CHUNK = 20_000
 PAIRS_PER_CHUNK = 400_000  # of the (pairs x 3) float64 arrays
@@ -30,7 +27,7 @@ class TriangleMesh:
     """
 
     vertices: Float64
-    faces: Int64
+    faces: Index
     is_closed: bool
 
     @property
@@ -122,7 +119,7 @@ class MeshDistance:
         distance, _, is_inside = self.closest(points)
         return np.where(is_inside, -distance, distance)
 
-    def _nearest(self, points: Float64) -> tuple[Int64, Float64]:
+    def _nearest(self, points: Float64) -> tuple[Index, Float64]:
         """The nearest face (Q,) and the barycentric coordinates (Q, 3) of the nearest point on it."""
         best = np.full(len(points), np.inf)
         face = np.zeros(len(points), dtype=np.int64)
@@ -137,7 +134,7 @@ class MeshDistance:
                 self._improve(points, asking[may_be], found[may_be], best, face, shares)
         return face, shares
 
-    def _disc_distance(self, points: Float64, faces: Int64) -> Float64:
+    def _disc_distance(self, points: Float64, faces: Index) -> Float64:
         """Distance (P,) to the disc of radius R_f about c_f in the plane of a face, which holds the face."""
         away = points - self._centroids[faces]
         height = _dot(away, self._normals.of_face[faces])
@@ -145,7 +142,7 @@ class MeshDistance:
         return np.asarray(np.hypot(height, np.maximum(aside - self._reach[faces], 0.0)))
 
     def _improve(
-        self, points: Float64, asking: Int64, faces: Int64, best: Float64, face: Int64, shares: Float64
+        self, points: Float64, asking: Index, faces: Index, best: Float64, face: Index, shares: Float64
     ) -> None:
         """Take each pair (point, face) that is nearer than the best so far; of equals, the first."""
         pair_shares = barycentric_of_closest(points[asking], self.mesh.corners[faces])
@@ -159,7 +156,7 @@ class MeshDistance:
         shares[asking[taken]] = pair_shares[taken]
 
 
-def _within(tree: cKDTree, points: Float64, radius: Float64) -> Iterator[tuple[Int64, Int64]]:
+def _within(tree: cKDTree, points: Float64, radius: Float64) -> Iterator[tuple[Index, Index]]:
     """Pairs (point, entry of the tree) not further apart than the point's radius, a manageable number at a time."""
     counts = np.asarray(tree.query_ball_point(points, radius, return_length=True))
     before = np.cumsum(counts) - counts
@@ -218,7 +215,7 @@ class _Normals:
         self._of_edge = np.zeros((int(edge.max()) + 1, 3))
         np.add.at(self._of_edge, self._edge.reshape(-1), np.repeat(self.of_face, 3, axis=0))
 
-    def at(self, face: Int64, shares: Float64) -> Float64:
+    def at(self, face: Index, shares: Float64) -> Float64:
         """Outward directions (Q, 3), not normalised, where a point of a face has these barycentric coordinates."""
         normal = np.asarray(self.of_face[face])
         num_zero = np.count_nonzero(shares == 0, axis=1)

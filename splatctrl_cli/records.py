@@ -20,6 +20,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
+Index = NDArray[np.int64]
 Stamps = NDArray[np.int64]  # (T,) [ns]
 SECOND_NS = 1_000_000_000
 MILLIMETRE, MILLIMETRES = 0.001, 1000.0  # [m] of one, and how many a metre has

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.calibration.unknowns import twist_between
-from splatctrl_cli.calibration.views import Index, bend, surface_normals, tiles_of
+from splatctrl_cli.calibration.views import bend, surface_normals, tiles_of
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import back_project, invert_transform, transform_points
 from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics
+from splatctrl_cli.records import Bool, Float32, Float64, Index, Intrinsics
 from splatctrl_cli.robot.model import RobotModel
 
 REMEMBERED = 1024  # times, at which the links' poses are kept: the rounds after the clock is found ask for the same

@@ -15,10 +15,10 @@ from scipy.sparse import csr_array
 
 from splatctrl_cli.calibration.gray_views import GrayView, Rows
 from splatctrl_cli.calibration.unknowns import HELD
-from splatctrl_cli.calibration.views import Index, surface_normals
+from splatctrl_cli.calibration.views import surface_normals
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import project
-from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.records import Float64, Index, RgbdFrame
 
 
 def stretch(depth: Float64, offset: Float64) -> tuple[Float64, Float64]:

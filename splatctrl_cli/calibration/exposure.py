@@ -5,13 +5,12 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.calibration.gray_views import gray_view, on_surface, overlapping, scaled
 from splatctrl_cli.calibration.views import depth_sigma
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, project
-from splatctrl_cli.records import Bool, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float64, Index, RgbdFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,8 +23,8 @@ class BandRatios:
 
     num_images: int
     num_bands: int
-    channels: NDArray[np.int64]
-    pairs: NDArray[np.int64]
+    channels: Index
+    pairs: Index
     ratios: Float64
     weights: Float64
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from splatctrl_cli.calibration.views import DepthView, Index, by_twists, depth_sigma, landed
+from splatctrl_cli.calibration.views import DepthView, by_twists, depth_sigma, landed
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, project, strided_lens, transform_points
-from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
 
 EVERY = slice(None)
 

@@ -5,12 +5,10 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.geometry import invert_transform, pose_at
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Index
 
-Index = NDArray[np.int64]
 POSE, DEPTH = 6, 2  # unknowns of a camera: a turn and a move in its own frame, the scale and bias of its depths
 OF_CAMERA = POSE + DEPTH
 HELD = -1

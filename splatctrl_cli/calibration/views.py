@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import back_project, project, strided_lens, transform_points
-from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, Index, Intrinsics, RgbdFrame
 
-Index = NDArray[np.int64]
 SMOOTH = 0.1  # of the depth, that a pixel and its four neighbours may differ by: beyond it they are no surface
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.finding import Finding, error, note, warning
@@ -19,7 +18,7 @@ from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_messages import STATE_TYPES, JointStream
 from splatctrl_cli.logs.state_topics import joint_records
 from splatctrl_cli.logs.survey import Survey
-from splatctrl_cli.records import Float64, JointState, LossReport, spread
+from splatctrl_cli.records import Float64, Index, JointState, LossReport, spread
 from splatctrl_cli.robot.model import RobotModel
 
 TURN = 2 * np.pi
@@ -193,7 +192,7 @@ def _positions(states: Sequence[JointState]) -> Iterator[Float64]:
         yield np.array([state.position for state in states])
 
 
-def _posed(states: Sequence[JointState]) -> NDArray[np.int64]:
+def _posed(states: Sequence[JointState]) -> Index:
     """The states that have an end-effector pose."""
     if isinstance(states, StateColumns) and states.T_base_ee is None and states.T_world_ee is None:
         return np.zeros(0, dtype=np.int64)

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.check_images import thumbnail_lens
 from splatctrl_cli.geometry import invert_transform, transform_points
-from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, RgbdFrame, Stamps, UInt8
+from splatctrl_cli.records import Float32, Float64, Index, Intrinsics, JointState, RgbdFrame, Stamps, UInt8
 
 _NEAR = 0.05  # [m] in front of the camera
-Index = NDArray[np.int64]
 
 
 @dataclass(kw_only=True)

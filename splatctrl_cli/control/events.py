@@ -5,9 +5,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.records import Bool, Float64, Stamps
+from splatctrl_cli.records import Bool, Float64, Index, Stamps
 
 UNREPRESENTED = "unrepresented voxel"  # label of an obstacle that is occupied and has no splat
 MAX_NAMES = 12  # of an event; how many there are is in num_names
@@ -102,7 +101,7 @@ class OneEach:
     """One of `names` at each state, by index (T,)."""
 
     names: Sequence[str]
-    index: NDArray[np.int64]
+    index: Index
 
     def __call__(self, i: int) -> Sequence[str]:
         return [self.names[int(self.index[i])]]

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import ENCODER, MOTION_WINDOW
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Float64, Stamps
+from splatctrl_cli.records import Float64, Index, Stamps
 
 Rows = tuple[Float64, Float64]
 FR3 = "fr3"
@@ -208,9 +207,9 @@ class Strain:
     """
 
     velocity: Float64
-    velocity_joint: NDArray[np.int64]
+    velocity_joint: Index
     acceleration: Float64
-    acceleration_joint: NDArray[np.int64]
+    acceleration_joint: Index
 
 
 class MotionLimits:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.control.audit import AuditTrace
 from splatctrl_cli.control.events import EventKind, OneEach, Signal
@@ -11,7 +10,7 @@ from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.limits import Strain
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.terms import RowKind
-from splatctrl_cli.records import Bool, Float64
+from splatctrl_cli.records import Bool, Float64, Index
 
 
 def audit_signals(
@@ -48,7 +47,7 @@ def audit_signals(
 
 
 def clearance_signals(
-    source: str, distance: Float64, sphere: NDArray[np.int64], margin: float, spheres: Sequence[str]
+    source: str, distance: Float64, sphere: Index, margin: float, spheres: Sequence[str]
 ) -> list[Signal]:
     """Below the margin, and in contact, by the clearance (T,) [m] of the sphere (T,) that is nearest."""
     names = OneEach(names=spheres, index=sphere)

@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import CLEARANCE_NEAR, MAP_ALLOWANCE
 from splatctrl_cli.evaluate.views import seen_by
 from splatctrl_cli.files.spilled_rows import BLOCK
-from splatctrl_cli.records import Bool, Float64, FloatRows, RgbdFrame
+from splatctrl_cli.records import Bool, Float64, FloatRows, RgbdFrame, Stamps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +55,7 @@ def clearance_agreement(
 
 
 def mark_seen(
-    seen: Bool, points_world: FloatRows, stamp_ns: NDArray[np.int64], frame: RgbdFrame, *, has_clock: bool = True
+    seen: Bool, points_world: FloatRows, stamp_ns: Stamps, frame: RgbdFrame, *, has_clock: bool = True
 ) -> None:
     """Set `seen` (T,) where a surface point (T, 3) [m], asked for at a stamp (T,), was seen in a frame not later.
 

@@ -17,12 +17,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import FEWEST_STRETCHES
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Index
 
-Index = NDArray[np.int64]
 ROUNDING = 1e-9  # of (n + 1) * confidence, which is a whole number where it should be
 
 

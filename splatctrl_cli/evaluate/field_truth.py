@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import BANDS, PROBABILITY_NEAR
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.field_accuracy import FieldAccuracy, field_accuracy, grid_distances, median_radius
 from splatctrl_cli.evaluate.views import seen_by
 from splatctrl_cli.mesh_distance import MeshDistance, load_mesh
-from splatctrl_cli.records import Box, DistanceGrid, Float64, RgbdFrame
+from splatctrl_cli.records import Box, DistanceGrid, Float64, Index, RgbdFrame
 from splatctrl_cli.report.reliability import Reliability, reliability
 
 FIELDS = ("hard", "sdf")  # the exact distance, and what a controller uses
@@ -187,9 +186,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
     )
 
 
-def _drawn_cells(
-    grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int
-) -> tuple[NDArray[np.int64], int]:
+def _drawn_cells(grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int) -> tuple[Index, int]:
     """Some of the cells (C, 3) whose centres lie in a box, in order, and how many there are in all."""
     shape = np.array(grid.channels["sdf"].shape)
     first = np.maximum(np.ceil((lower - grid.origin) / grid.voxel).astype(np.int64), 0)

@@ -4,10 +4,9 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.records import Label, SplatSet
+from splatctrl_cli.records import Index, Label, SplatSet
 from splatctrl_cli.voxels import Balls
 
 DEFAULT_LABELS = frozenset({Label.OBJECT, Label.HUMAN})
@@ -19,7 +18,7 @@ class ObstacleSpheres:
     """The N spheres of a field, balls last, as splats; index (N,) in the scene's splats, NO_SPLAT of a ball."""
 
     splats: SplatSet
-    index: NDArray[np.int64]
+    index: Index
 
     @property
     def num_unrepresented(self) -> int:

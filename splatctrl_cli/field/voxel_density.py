@@ -9,12 +9,11 @@ from scipy.fft import irfftn, rfftn
 
 from splatctrl_cli.config.fixed import KERNEL_REACH, VOXELS_PER_LENGTH
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Index
 
 NODES = 96  # of a block along each axis: a size that transforms fast, 7 MiB
 MAX_BLOCKS = 2000
 
-Int64 = NDArray[np.int64]
 KernelValue = Callable[[Float64], Float64]
 
 
@@ -51,7 +50,7 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
     return result
 
 
-def _blocks(cells: Int64, reach: int) -> list[tuple[Int64, Int64, Int64]]:
+def _blocks(cells: Index, reach: int) -> list[tuple[Index, Index, Index]]:
     """First node (3,) of each block, the centres that can reach its inner cells, and the centres in those."""
     inner = NODES - 2 * reach - 1  # the cells whose eight nodes no mass from beyond the block reaches
     blocks, which = np.unique(cells // inner, axis=0, return_inverse=True)
@@ -104,7 +103,7 @@ def _convolved(mass: Float64, transformed: NDArray[np.complex128]) -> Float64:
     return np.asarray(irfftn(rfftn(mass) * transformed, s=mass.shape))
 
 
-def _corners(cells: Int64, share: Float64) -> list[tuple[Int64, Float64]]:
+def _corners(cells: Index, share: Float64) -> list[tuple[Index, Float64]]:
     """Of the eight nodes around each centre: the index (N, 3), and the centre's share of it (N,)."""
     return [
         (cells + np.array(step), np.asarray(np.prod(np.where(step, share, 1.0 - share), axis=1)))
@@ -112,7 +111,7 @@ def _corners(cells: Int64, share: Float64) -> list[tuple[Int64, Float64]]:
     ]
 
 
-def _spread(cells: Int64, share: Float64) -> Float64:
+def _spread(cells: Index, share: Float64) -> Float64:
     """Units spread over the nodes of a block (NODES,) * 3; what falls beyond it is left out."""
     mass = np.zeros(NODES**3)
     for node, part in _corners(cells, share):
@@ -122,6 +121,6 @@ def _spread(cells: Int64, share: Float64) -> Float64:
     return mass.reshape((NODES,) * 3)
 
 
-def _read(density: Float64, cells: Int64, share: Float64) -> Float64:
+def _read(density: Float64, cells: Index, share: Float64) -> Float64:
     """The density (N,) at the centres."""
     return np.asarray(sum(part * density[tuple(node.T)] for node, part in _corners(cells, share)))

@@ -10,13 +10,11 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Index
 
 IN_MEMORY = 2**20  # [bytes] up to which a file is memory
 BLOCK = 4096  # rows at once
 FEW = 4096  # rows that are read beside those that were asked for
-
-Index = NDArray[np.int64]
 
 
 def scratch_folder() -> Path:

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, scratch_folder
 from splatctrl_cli.logs.rig import Camera
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Index
 
-Index = NDArray[np.int64]
 NO_MASK = -1
 
 

@@ -7,11 +7,10 @@ from functools import partial
 from typing import Any, Self, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, of_columns, ranges, selected
-from splatctrl_cli.records import Float64, JointState, Stamps
+from splatctrl_cli.records import Float64, Index, JointState, Stamps
 
 OF_JOINTS = ("position", "velocity", "commanded_velocity")
 Posture = Callable[[int], Float64 | None]  # joint positions (J,) at a time [ns]; None where there are none
@@ -90,11 +89,11 @@ class StateColumns(Sequence[JointState]):
             for i, stamp in enumerate(self.stamp_ns[first:last].tolist())
         ]
 
-    def select(self, index: NDArray[np.int64]) -> Self:
+    def select(self, index: Index) -> Self:
         """The states of an index (K,), in its order."""
         return replace(self, stamp_ns=self.stamp_ns[index], **self._each(partial(selected, index=index), COLUMNS))
 
-    def of_joints(self, order: NDArray[np.int64]) -> Self:
+    def of_joints(self, order: Index) -> Self:
         """The joints of an order (J,)."""
         return replace(self, **self._each(partial(of_columns, order=order), OF_JOINTS))
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import (
     CLOCK_DRIFT,
@@ -25,7 +24,7 @@ from splatctrl_cli.logs.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.logs.state_messages import NAMELESS, STANDARD_TYPES, STATE_TYPES, TRAJECTORY, JointStream
 from splatctrl_cli.logs.state_track import RawTrack, cleaned
 from splatctrl_cli.logs.survey import Survey, TopicSurvey
-from splatctrl_cli.records import Bool, Float64, LossReport, Stamps
+from splatctrl_cli.records import Bool, Float64, Index, LossReport, Stamps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,7 +215,7 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     return filled.select(np.flatnonzero(keep))
 
 
-def _is_still(table: Table, before: NDArray[np.int64], after: NDArray[np.int64]) -> Bool:
+def _is_still(table: Table, before: Index, after: Index) -> Bool:
     """Pairs of states (T,) of which no joint differs."""
     is_still = np.zeros(len(before), dtype=np.bool_)
     for first, last in ranges(len(before)):

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import PlannerConfig
 from splatctrl_cli.config.fixed import SHORTCUT_WORTH
@@ -18,9 +17,7 @@ from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
-from splatctrl_cli.records import Float64
-
-Index = NDArray[np.int64]
+from splatctrl_cli.records import Float64, Index
 
 
 class PlanOutcome(StrEnum):

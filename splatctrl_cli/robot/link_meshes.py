@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
@@ -14,7 +13,7 @@ from splatctrl_cli.config.fixed import CYLINDER_SIDES, SPHERE_ROUNDS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import face_normals, transform_points
 from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, load_mesh
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Index
 from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
 
 
@@ -160,7 +159,7 @@ def _taken_apart(mesh: TriangleMesh) -> list[TriangleMesh]:
     return pieces
 
 
-def _is_closed(faces: NDArray[np.int64]) -> bool:
+def _is_closed(faces: Index) -> bool:
     """Whether every edge has one face on either side, which run through it in opposite directions."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     forth = np.unique(edges, axis=0)
@@ -182,14 +181,14 @@ def _hull(vertices: Float64) -> TriangleMesh | None:
     return TriangleMesh(vertices=vertices, faces=faces, is_closed=True)
 
 
-def _box(size: Float64) -> tuple[Float64, NDArray[np.int64]]:
+def _box(size: Float64) -> tuple[Float64, Index]:
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     faces = [face for a, b, c, d in quads for face in ([a, b, c], [a, c, d])]
     return corners, np.array(faces, dtype=np.int64)
 
 
-def _prism(radius: float, length: float) -> tuple[Float64, NDArray[np.int64]]:
+def _prism(radius: float, length: float) -> tuple[Float64, Index]:
     """A prism of CYLINDER_SIDES sides inside a cylinder along z, edges on its surface."""
     angle = 2 * np.pi * np.arange(CYLINDER_SIDES) / CYLINDER_SIDES
     ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(CYLINDER_SIDES)], axis=1)
@@ -209,7 +208,7 @@ def _prism(radius: float, length: float) -> tuple[Float64, NDArray[np.int64]]:
     return vertices, faces.astype(np.int64)
 
 
-def _ball(radius: float) -> tuple[Float64, NDArray[np.int64], float]:
+def _ball(radius: float) -> tuple[Float64, Index, float]:
     """A polyhedron with its corners on a sphere, and how far the sphere is from it at most."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]

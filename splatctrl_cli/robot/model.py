@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
-from splatctrl_cli.records import Bool, Box, Float64, SphereSet
+from splatctrl_cli.records import Bool, Box, Float64, Index, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
 from splatctrl_cli.robot.sphere_files import (
     RENAMED,
@@ -25,8 +24,6 @@ from splatctrl_cli.robot.sphere_files import (
 )
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
-
-Index = NDArray[np.int64]
 
 
 class RobotModel:

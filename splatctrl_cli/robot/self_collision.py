@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 from defusedxml import ElementTree
-from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import NEVER_MARGIN
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Index
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
 
@@ -57,7 +56,6 @@ def read_srdf(path: Path, urdf: UrdfFile) -> tuple[tuple[DisabledPair, ...], tup
     return known, tuple(pair for pair in pairs if pair not in known)
 
 
-Int64 = NDArray[np.int64]
 CHUNK = 200  # postures at a time
 
 
@@ -81,7 +79,7 @@ class LinkPair:
 class SelfCollisionPairs:
     """pairs (P, 2) of spheres to check; every pair of links with spheres, kept or not; the postures sampled."""
 
-    pairs: Int64
+    pairs: Index
     link_pairs: tuple[LinkPair, ...]
     num_postures: int
 
@@ -137,7 +135,7 @@ def self_collision_pairs(
     )
 
 
-def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Int64:
+def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Index:
     """The model's `self_pairs` (P, 2) less those of links that `disabled` (an SRDF) names."""
     off = {frozenset(pair.links) for pair in disabled}
     links, pairs = model.sphere_set.links, model.self_pairs()
@@ -189,7 +187,7 @@ def random_postures(model: RobotModel, num_postures: int, seed: int) -> Float64:
     return np.random.default_rng(seed).uniform(lower, upper, (num_postures, model.num_joints))
 
 
-def _gaps(model: RobotModel, owner: Int64, pairs: Int64, num_postures: int, seed: int) -> Float64:
+def _gaps(model: RobotModel, owner: Index, pairs: Index, num_postures: int, seed: int) -> Float64:
     """Smallest gap (T, P) between the spheres of each pair of links in each posture."""
     postures = random_postures(model, num_postures, seed)
     radii = model.sphere_set.radii

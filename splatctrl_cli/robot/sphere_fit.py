@@ -16,16 +16,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config.fixed import DEFICIT_GAP, FIT_BISECTIONS, FIT_MIN_PATCH, FIT_ROUNDS, FIT_STEPS, FIT_TIE
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.records import Bool, Float64, SphereSet
+from splatctrl_cli.records import Bool, Float64, Index, SphereSet
 from splatctrl_cli.robot.coverage import areas, largest_deficit, refined
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
-
-Int64 = NDArray[np.int64]
 
 DIGITS = 6  # of a written sphere: micrometres
 
@@ -105,9 +102,9 @@ def _shared_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Fl
     return [link.rounded(*state) for link, state in zip(links, states, strict=True)]
 
 
-def _covers(links: Sequence["_Link"], t: float, budget: int) -> list[Int64] | None:
+def _covers(links: Sequence["_Link"], t: float, budget: int) -> list[Index] | None:
     """A cover of each link at protrusion t; None as soon as all together take more than `budget` spheres."""
-    covers: list[Int64] = []
+    covers: list[Index] = []
     for index, link in enumerate(links):
         left = budget - sum(len(cover) for cover in covers) - (len(links) - index - 1)
         cover = link.cover(t, at_most=left)
@@ -143,7 +140,7 @@ class _Link:
         self.middle = int(np.argmin(alone))  # the candidate that covers the link alone at the least protrusion
         self.single = float(alone[self.middle])
 
-    def cover(self, t: float, *, at_most: int) -> Int64 | None:
+    def cover(self, t: float, *, at_most: int) -> Index | None:
         """Candidates (n,) whose balls of protrusion t hold every patch, as few as a few greedy passes find.
 
         None where these are more than `at_most`, or t is less than a single patch needs.
@@ -186,7 +183,7 @@ class _Link:
                 state = found
         return state
 
-    def improved(self, chosen: Int64) -> tuple[Float64, float]:
+    def improved(self, chosen: Index) -> tuple[Float64, float]:
         """Centres (n, 3) after alternating assignment and recentring, and their protrusion [m]."""
         centers = self._candidates[chosen]
         for _ in range(FIT_ROUNDS):
@@ -236,7 +233,7 @@ class _Link:
                 centers = moved
         return centers, self._assigned(centers)[1]
 
-    def _assigned(self, centers: Float64) -> tuple[Int64, float]:
+    def _assigned(self, centers: Float64) -> tuple[Index, float]:
         """The ball (P,) that holds each patch at the least protrusion, and the largest such protrusion."""
         cost = self._reach(centers) + self._distance(centers)[:, None]
         owner = cost.argmin(axis=0)

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import interpolate_transform, invert_transform, pose_at, transform_points, turn_about_z
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Stamps
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
 ALWAYS = (-(2**62), 2**62)  # [ns] a span of time that holds every stamp
@@ -87,7 +86,7 @@ class Track:
     Between two stamps the origin moves on a straight line and the solid turns about one axis, both evenly.
     """
 
-    stamp_ns: NDArray[np.int64]
+    stamp_ns: Stamps
     T_world_shape: Float64
 
     def __post_init__(self) -> None:

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Float64, Intrinsics
+from splatctrl_cli.records import Float64, Intrinsics, Stamps
 from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture, Track, closest_point
 from splatctrl_cli.simulate.render import Camera
 
@@ -35,7 +34,7 @@ class Truth:
     robot_urdf: Path
     robot_spheres: Path
     T_world_base: Float64
-    stamps: NDArray[np.int64]
+    stamps: Stamps
     clearance: Float64
 
     def distance(self, points_world: Float64, stamp_ns: int) -> Float64:

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import ControlConfig, load_config
 from splatctrl_cli.config.fixed import ENCODER, MOTION_WINDOW
@@ -15,7 +14,7 @@ from splatctrl_cli.control.limits import JointLimits, MotionLimits, braking_spee
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Index, Stamps
 from tests.control.fakes import PlanarArm, far_away
 from tests.reference.control import braking_room, fr3_velocity_range
 from tests.reference.intervals import velocity_shares
@@ -210,11 +209,11 @@ def test_open_loop_counts_accelerations_from_the_logged_velocity() -> None:
 LIMIT = np.array([2.0, 1.0])
 
 
-def at_rate(hz: float, seconds: float = 1.0) -> NDArray[np.int64]:
+def at_rate(hz: float, seconds: float = 1.0) -> Index:
     return np.round(np.arange(0, seconds, 1 / hz) * 1e9).astype(np.int64)
 
 
-def straight(stamps: NDArray[np.int64], speed: Float64) -> Float64:
+def straight(stamps: Stamps, speed: Float64) -> Float64:
     return np.asarray(stamps[:, None] * 1e-9 * speed)
 
 

@@ -3,10 +3,9 @@
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Stamps
 
 
 def interval_bound(first: Float64, last: Float64, motion: Float64, levers: Float64) -> float:
@@ -18,9 +17,7 @@ def interval_bound(first: Float64, last: Float64, motion: Float64, levers: Float
     return min(bounds)
 
 
-def velocity_shares(
-    stamps: NDArray[np.int64], positions: Float64, limit: Float64, window: float, off: float
-) -> Float64:
+def velocity_shares(stamps: Stamps, positions: Float64, limit: Float64, window: float, off: float) -> Float64:
     """(T,) largest over the joints of |q_i - q_k| less 2 `off`, over time and limit; k: the state before i, and the
     newest that is `window` [s] older.
     """
@@ -39,7 +36,7 @@ def near_figures(
     q: Float64,
     q_first: Float64,
     margin: float,
-    last_seen: Callable[[Float64], NDArray[np.int64]],
+    last_seen: Callable[[Float64], Stamps],
     now_ns: int,
 ) -> tuple[float, float, int]:
     """Share of the points on the shells in new space that were never seen, the age [s] within which three quarters of
@@ -57,7 +54,7 @@ def near_figures(
 
 
 def blind_share(
-    arm: ArmModel, q: Float64, q_first: Float64, margin: float, last_seen: Callable[[Float64], NDArray[np.int64]]
+    arm: ArmModel, q: Float64, q_first: Float64, margin: float, last_seen: Callable[[Float64], Stamps]
 ) -> float:
     """Share of the moving spheres with at least five points on their shell in new space, 90 % of them never seen."""
     moving = np.flatnonzero(arm.moving_spheres).tolist()
@@ -72,7 +69,7 @@ def hidden(
     arm: ArmModel,
     q: Float64,
     margin: float,
-    last_seen: Callable[[Float64], NDArray[np.int64]],
+    last_seen: Callable[[Float64], Stamps],
     distance: Callable[[Float64], Float64],
 ) -> float:
     """The least distance [m] to surfaces of the points on the shells that were never seen."""
@@ -88,7 +85,7 @@ def beyond(
     q: Float64,
     q_first: Float64,
     margin: float,
-    last_seen: Callable[[Float64], NDArray[np.int64]],
+    last_seen: Callable[[Float64], Stamps],
     distance: Callable[[Float64], Float64],
 ) -> float:
     """The least distance [m] to surfaces of the points in new space that were never seen, of shells with at least 20

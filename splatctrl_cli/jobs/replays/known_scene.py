@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import NEXT_SCENE_NS
@@ -26,11 +25,9 @@ from splatctrl_cli.field.obstacles import NO_SPLAT, ObstacleSpheres, obstacle_sp
 from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, Label, SplatSet
+from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, Index, Label, SplatSet
 from splatctrl_cli.scene_files.scene_folder import open_scene
 from splatctrl_cli.voxels import SWEPT, Balls, OccupancyGrid, SeenVoxels, VoxelState
-
-Index = NDArray[np.int64]
 
 Key = TypeVar("Key", bound=Hashable)
 BY_CAMERA = (VoxelState.FREE, VoxelState.UNCERTAIN, VoxelState.OCCUPIED)  # voxels that a camera saw

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Generic, TypeVar, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.control.audit import AuditTrace, Clearance
 from splatctrl_cli.control.fallbacks import Rung
@@ -15,7 +14,7 @@ from splatctrl_cli.control.open_loop import OpenLoopTrace, is_shaped
 from splatctrl_cli.control.step import ControlStep, VelocityMargin
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.files.spilled_rows import IN_MEMORY, RowFile, Rows, scratch_folder
-from splatctrl_cli.records import Float64, Stamps
+from splatctrl_cli.records import Float64, Index, Stamps
 
 BLOCK = 1024  # states that are replayed at once
 RUNGS = tuple(Rung)
@@ -132,7 +131,7 @@ class StoredClearance:
         return self._figures.rows(f"distance {self._name}")
 
     @property
-    def sphere(self) -> NDArray[np.int64]:
+    def sphere(self) -> Index:
         """(T,)."""
         return self._figures[f"sphere {self._name}"].astype(np.int64)
 
