@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config import fixed
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.records import Bool, Float64
+from splatctrl_cli.records import Bool, Float64, Index
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,10 +64,8 @@ class NearSpace:
         self._model = model
         self._moving = np.flatnonzero(model.moving_spheres)
         self._radii = np.asarray(model.sphere_set.radii, np.float64)
-        self._margin, self._depths = (
-            margin,
-            np.arange(margin, 0.0, -fixed.NEAR_LAYER),
-        )  # of shells, the outermost first
+        self._margin = margin
+        self._depths = np.arange(margin, 0.0, -fixed.NEAR_LAYER)  # of shells, the outermost first
         self._first: Float64 | None = None  # centres (S, 3) of the first state
         self._next_ns = -(2**63)
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres when they were last looked about
@@ -147,7 +145,7 @@ class NearSpace:
             edge_place=edge_place,
         )
 
-    def _shell(self, centers: Float64, directions: Float64, away: float) -> tuple[Float64, NDArray[np.int64]]:
+    def _shell(self, centers: Float64, directions: Float64, away: float) -> tuple[Float64, Index]:
         """Points (Q, 3), so far [m] from moving spheres and outside of all others, and their spheres (Q,)."""
         offsets = (self._radii[self._moving] + away)[:, None, None] * directions
         points = (centers[self._moving][:, None] + offsets).reshape(-1, 3)
@@ -160,7 +158,7 @@ class NearSpace:
         assert self._first is not None
         return _is_outside(points, self._first, self._radii + fixed.NEAR_NEW)
 
-    def _is_in_the_blind(self, points: Float64, owners: NDArray[np.int64], is_never: Bool) -> Bool:
+    def _is_in_the_blind(self, points: Float64, owners: Index, is_never: Bool) -> Bool:
         """Those of `FINE` points (Q, 3) about spheres (Q,) in new space that were never seen, as nearly all of the
         new space about their sphere.
         """
