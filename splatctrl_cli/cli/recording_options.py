@@ -47,7 +47,8 @@ def simulate_options(add: Options, parser: Parser) -> None:
     add("--fps HZ", "frames a second", real(0.1, 60, "Hz"), 5.0)
     add("--width PX", "image width", whole(16, 4096, "px"), 320)
     add("--height PX", "image height", whole(16, 4096, "px"), 240)
-    add("--noise", "depth noise", ("none", "realsense"), "realsense")
+    noise = "depth noise: realsense is 1.2 mm at 1 m; stereo is 3.6 mm at 640 pixels, with fattened edges and shadows"
+    add("--noise", noise, ("none", "realsense", "stereo"), "realsense")
 
 
 def ingest_options(add: Options, parser: Parser) -> None:

@@ -12,14 +12,19 @@ from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFram
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import shared_workspace, tabletop
 from splatctrl_cli.simulate.arm import Motion
+from splatctrl_cli.simulate.depth_camera import DepthNoise, StereoDepth
 from splatctrl_cli.simulate.environments import ENVIRONMENTS
 from splatctrl_cli.simulate.primitives import Primitive
-from splatctrl_cli.simulate.render import Camera, DepthNoise, Renderer
+from splatctrl_cli.simulate.render import Camera, Renderer
 from splatctrl_cli.simulate.truth import distance_to
 
 START_NS = 1_700_000_000_000_000_000
 JOINT_RATE = 50  # [Hz]
-NOISES: dict[str, DepthNoise | None] = {"none": None, "realsense": DepthNoise()}
+NOISES: dict[str, DepthNoise | StereoDepth | None] = {
+    "none": None,
+    "realsense": DepthNoise(),
+    "stereo": StereoDepth(),
+}
 OPTICAL_FROM_LINK = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 
 Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_child (4, 4)
@@ -156,7 +161,8 @@ class Recording:
             color, depth = renderer.image([*arm, *passing], meshes)
             human = _shown(depth, renderer.depth(arm, meshes)) if has_masks else None
             if noise is not None:
-                depth = noise.applied(depth, np.random.default_rng([self.options.seed, number, index]))
+                rng, focal = np.random.default_rng([self.options.seed, number, index]), renderer.camera.intrinsics.fx
+                depth = noise.applied(depth, rng, focal=focal)
             yield RgbdFrame(
                 stamp_ns=stamp_ns,
                 camera=renderer.camera.name,

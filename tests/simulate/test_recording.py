@@ -1,7 +1,6 @@
 """The recording: images that agree with the truth, noise as stated, motion within limits, truth that reads back."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.arm import Motion
 from splatctrl_cli.simulate.primitives import Primitive, Texture, luminance_std
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
-from splatctrl_cli.simulate.render import DepthNoise, Renderer
+from splatctrl_cli.simulate.render import Renderer
 from splatctrl_cli.simulate.truth import Truth, closest_of, distance_to, load_truth, truth_document
 
 SMALL = {"duration_s": 3.0, "fps": 1.0, "width": 80, "height": 60}
@@ -127,32 +126,6 @@ def test_motion_rests_at_its_waypoints() -> None:
     assert motion.at(2.0)[0][0] == pytest.approx(0.0)
 
 
-def test_noise_has_the_stated_spread_and_grows_with_depth_squared() -> None:
-    noise = DepthNoise(step=1e-5, dropout=0.0)
-    for depth in (1.0, 2.0):
-        exact_depth = np.full((240, 320), depth, np.float32)
-        noisy = noise.applied(exact_depth, np.random.default_rng(0))
-        assert np.std(noisy - depth) == pytest.approx(noise.spread * depth**2, rel=0.1)
-
-
-def test_noise_loses_edges_dropouts_and_what_is_too_far() -> None:
-    exact_depth = np.full((60, 80), 1.0, np.float32)
-    exact_depth[:, 40:] = 1.1
-    exact_depth[:20, 60:] = 3.5
-    noisy = DepthNoise(dropout=0.0).applied(exact_depth, np.random.default_rng(0))
-    assert (noisy[30:, 39:41] == 0).all()
-    assert (noisy[:20, 60:] == 0).all()
-    assert (noisy[30:, 42:] > 0).all()
-    share = (DepthNoise(dropout=0.02).applied(np.ones((240, 320), np.float32), np.random.default_rng(0)) == 0).mean()
-    assert share == pytest.approx(0.02, abs=0.002)
-
-
-def test_noise_comes_in_steps_of_disparity() -> None:
-    noisy = DepthNoise().applied(np.full((60, 80), 1.0, np.float32), np.random.default_rng(0))
-    steps = 1 / (noisy[noisy > 0].astype(np.float64) * DepthNoise().step)
-    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-3)
-
-
 def test_the_same_seed_gives_the_same_images_and_another_seed_others(robot: RobotModel) -> None:
     depth = [next(iter(Recording(RecordingOptions(seed=seed, **SMALL), robot).frames())).depth for seed in (1, 1, 2)]
     np.testing.assert_array_equal(depth[0], depth[1])
@@ -187,7 +160,7 @@ def test_textures_stay_between_their_colours_and_are_smooth(pattern: str) -> Non
         ({"fps": 0.0}, "--fps: expected up to 60"),
         ({"duration_s": float("nan")}, "--duration"),
         ({"width": 8}, "--width: expected 16 to 4096 px, got 8"),
-        ({"noise": "loud"}, "--noise: expected one of none, realsense, got loud"),
+        ({"noise": "loud"}, "--noise: expected one of none, realsense, stereo, got loud"),
         ({"seed": -1}, "--seed"),
         ({"visitor": (0.4, 0.1)}, "--visitor: expected X,Y within 5 m and RADIUS from 0.001 to 1 m, got 0.4,0.1"),
         ({"visitor": (0.4, 0.1, 0.0)}, "--visitor: expected X,Y"),
@@ -302,15 +275,3 @@ def test_fewer_rays_change_colours_alone(exact: Recording) -> None:
     np.testing.assert_array_equal(few.image(moving)[1], many.image(moving)[1])
     np.testing.assert_array_equal(few.depth(moving), many.image(moving)[1])
     assert 0 < np.abs(few.image(moving)[0].astype(float) - many.image(moving)[0]).mean() < 10
-
-
-def test_what_the_second_imager_does_not_see_has_no_depth() -> None:
-    """A plate at 1 m before a wall at 2 m hides as much of it, left of itself, as their disparities differ by."""
-    exact = np.full((20, 200), 2.0, np.float32)
-    exact[:, 100:140] = 1.0
-    plain = DepthNoise(dropout=0.0, edge=10.0, spread=0.0)
-    shadowed = replace(plain, baseline=0.05).applied(exact, np.random.default_rng(0), focal=300.0)
-    assert (plain.applied(exact, np.random.default_rng(0)) > 0).all()
-    hidden = np.flatnonzero(shadowed[10] == 0)
-    width = 300.0 * 0.05 * (1 / 1.0 - 1 / 2.0)
-    assert hidden.max() == 99 and abs(len(hidden) - width) <= 1.5

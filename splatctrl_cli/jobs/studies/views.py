@@ -10,10 +10,11 @@ from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.depth_camera import DepthNoise
 from splatctrl_cli.simulate.environments import ring_of_cameras
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.recording import START_NS
-from splatctrl_cli.simulate.render import Camera, DepthNoise, Renderer
+from splatctrl_cli.simulate.render import Camera, Renderer
 from splatctrl_cli.simulate.tabletop import arm_solids
 from splatctrl_cli.sources.calibrated import Perturbation
 

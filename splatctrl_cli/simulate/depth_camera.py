@@ -1,0 +1,141 @@
+"""What depth cameras measure, from exact depth: two models of an active-stereo camera."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, minimum_filter
+from scipy.special import ndtr
+
+from splatctrl_cli.records import Bool, Float32, Float64
+
+WIDTH, FOCAL = 640, 386.0  # [px] of the two depth imagers of a RealSense D435
+BASELINE = 0.05  # [m] between them; the second stands to the right
+STEPS = 32  # of disparity in a pixel
+EDGE = 0.5  # [px] of disparity between neighbours that are no longer one surface
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoDepth:
+    """The depth that two imagers measure, in the image of a colour camera. A depth pixel is a pixel of the imagers;
+    the image's `focal` over theirs says how wide it is in the image.
+
+    - Disparity d = f b / z errs by `spread` [px], so that depth errs by z^2 spread / (f b): 3.6 mm at 1 m and 14.5 mm
+      at 2 m with 0.07 px. Errors r depth pixels apart correlate by exp(-(r / `window`)^2). Steps are of 1/32 px.
+    - Beside an edge of 0.5 px or more, the background takes the depth of the foreground over `fattening` [px]: from
+      the first to the second number of depth pixels, evenly distributed, and alike within a window.
+    - Lost is the background that the second imager does not see: f b (1 / z_foreground - 1 / z_background) depth
+      pixels left of the foreground, less those that took its depth.
+    - Lost are a share `dropout` of all pixels, in blobs twice as wide as the window, and depths out of `least` to
+      `most` [m].
+
+    width [px]: of the depth imagers, by which their focal length scales; None: as wide as the image.
+    """
+
+    spread: float = 0.07
+    window: float = 2.5
+    fattening: tuple[float, float] = (1.0, 3.0)
+    dropout: float = 0.005
+    least: float = 0.28
+    most: float = 6.0
+    width: int | None = None
+
+    def applied(self, depth: Float32, rng: np.random.Generator, *, focal: float = 0.0) -> Float32:
+        """Measured depth (H, W) [m] of exact `depth`, 0 = none; focal [px]: of the image (0: of the imagers)."""
+        imager = FOCAL * (self.width or depth.shape[1]) / WIDTH
+        scale = focal / imager if focal > 0 else 1.0  # pixels of the image in one of the imagers
+        exact = np.where(depth > 0, imager * BASELINE / np.where(depth > 0, depth, 1.0), 0.0)
+        sigma = 0.5 * scale * self.window  # blurred noise correlates by exp(-(r / 2 sigma)^2)
+        error, wide, offset, lost = (_blurred(rng, depth.shape, sigma * blob) for blob in (1, 2, 2, 2))
+        low, high = self.fattening
+        reach = np.floor(scale * (low + (high - low) * ndtr(wide)) + ndtr(offset)).astype(np.int64)
+        seen = _fattened(exact, reach)
+        is_lost = _is_hidden(depth, scale * imager * BASELINE) & (seen == exact)
+        is_lost |= lost > np.quantile(lost, 1 - self.dropout)
+        disparity = np.rint((seen + self.spread * error) * STEPS) / STEPS
+        measured = imager * BASELINE / np.maximum(disparity, 1 / STEPS)
+        is_lost |= (seen == 0) | (measured < self.least) | (measured > self.most)
+        return np.where(is_lost, 0, measured).astype(np.float32)
+
+
+def _blurred(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Float64:
+    """Noise (H, W) of unit variance, blurred by a Gaussian of `sigma` [px]."""
+    impulse = np.zeros(min(shape))
+    impulse[0] = 1.0
+    kernel = gaussian_filter(impulse, sigma, mode="wrap")
+    return np.asarray(gaussian_filter(rng.standard_normal(shape), sigma, mode="wrap") / (kernel @ kernel))
+
+
+def _is_hidden(depth: Float32, focal_baseline: float) -> Bool:
+    """True where the second imager, to the right of the first, has something nearer before what a pixel shows: a
+    pixel right of it whose disparity shifts it there or farther to the left.
+    """
+    columns = np.arange(depth.shape[1])
+    shifted = np.where(depth > 0, columns - focal_baseline / np.where(depth > 0, depth, 1.0), np.inf)
+    least = np.minimum.accumulate(shifted[:, ::-1], axis=1)[:, ::-1]
+    return np.asarray(shifted > least + 0.5)  # [px]
+
+
+def _fattened(disparity: Float64, reach: np.ndarray) -> Float64:
+    """Disparities (H, W), each the largest within `reach` (H, W) [px] where that is beyond an edge."""
+    out = disparity
+    for radius in range(1, int(reach.max()) + 1):
+        y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+        largest = -minimum_filter(-disparity, footprint=np.hypot(x, y) <= radius + 0.5, mode="nearest")
+        out = np.where((reach >= radius) & (largest - disparity > EDGE), largest, out)
+    return out
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthNoise:
+    """A depth camera's error, in the manner of a D435 whose depth is registered to colour.
+
+    spread: standard deviation [m] at 1 m, growing with depth squared (an error in disparity); step [m]: distance
+    of neighbouring depths at 1 m, as disparity comes in fixed steps; patch [px]: size of the matching window, over
+    which errors agree; dropout: share of pixels lost at random, in blobs of a patch; edge [m]: step of depth
+    between neighbours beyond which both are lost; max_range [m]: farther is lost; baseline [m]: of the two imagers,
+    with which also what the second of them does not see is lost (0: nothing).
+    """
+
+    spread: float = 0.0012
+    step: float = 0.002
+    patch: int = 6
+    dropout: float = 0.005
+    edge: float = 0.03
+    max_range: float = 3.0
+    baseline: float = 0.0
+
+    def applied(self, depth: Float32, rng: np.random.Generator, *, focal: float = 0.0) -> Float32:
+        """Noisy depth (H, W) [m] of exact `depth`, 0 = none; focal [px]: of the camera, where there is a baseline."""
+        coarse = (depth.shape[0] // self.patch + 3, depth.shape[1] // self.patch + 3)
+        error = _enlarged(rng.standard_normal(coarse), self.patch, depth.shape)
+        lost = _enlarged(rng.standard_normal(coarse), self.patch, depth.shape)
+        exact = np.where(depth > 0, depth.astype(np.float64), 1.0)
+        noisy = 1 / (self.step * np.rint((1 / exact + self.spread * error) / self.step))
+        threshold = np.quantile(lost, 1 - self.dropout) if self.dropout > 0 else np.inf
+        is_lost = (lost > threshold) | (depth <= 0) | (noisy > self.max_range) | _is_at_edge(depth, self.edge)
+        if self.baseline > 0:
+            is_lost |= _is_hidden(depth, focal * self.baseline)
+        return np.where(is_lost, 0, noisy).astype(np.float32)
+
+
+def _enlarged(coarse: np.ndarray, factor: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Smooth unit-variance noise (H, W): coarse noise, blended bilinearly."""
+    v, u = np.arange(shape[0]) / factor, np.arange(shape[1]) / factor
+    i, j = v.astype(int), u.astype(int)
+    a, b = (v - i)[:, None], (u - j)[None]
+    weights = ((1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b)
+    corners = ((0, 0), (0, 1), (1, 0), (1, 1))
+    total = sum(w * coarse[np.ix_(i + di, j + dj)] for w, (di, dj) in zip(weights, corners, strict=True))
+    return np.asarray(total / np.sqrt(sum(w**2 for w in weights)))
+
+
+def _is_at_edge(depth: Float32, step: float) -> Bool:
+    """True at both pixels of every horizontal or vertical neighbour pair whose depths differ by more than `step`."""
+    out = np.zeros(depth.shape, dtype=bool)
+    across = np.abs(np.diff(depth, axis=1)) > step
+    down = np.abs(np.diff(depth, axis=0)) > step
+    out[:, 1:] |= across
+    out[:, :-1] |= across
+    out[1:] |= down
+    out[:-1] |= down
+    return out
