@@ -4,11 +4,12 @@ import argparse
 import contextlib
 import io
 from pathlib import Path
+from typing import Any
 
 from splatctrl_cli.cli.check import show_described
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.export import show_exported
-from splatctrl_cli.cli.options import request_of
+from splatctrl_cli.cli.options import names_of, request_of
 from splatctrl_cli.cli.reconstruct import show_reconstructed
 from splatctrl_cli.cli.recordings import show_ingested
 from splatctrl_cli.cli.replay import show_replayed
@@ -22,6 +23,7 @@ from splatctrl_cli.jobs.ingest import IngestResult
 from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult
 from splatctrl_cli.jobs.scores.score import ScoreResult
 from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
+from splatctrl_cli.simulate.arm import UNMODELLED
 from splatctrl_cli.simulate.environments import ENVIRONMENT_S
 from splatctrl_cli.simulate.recording import RecordingOptions
 from splatctrl_cli.simulate.shared_workspace import DURATION_S
@@ -74,7 +76,9 @@ def run_simulate(args: argparse.Namespace) -> int:
     if args.duration is None and (args.human_arm is not None or args.environment is not None):
         given["duration_s"] = DURATION_S if args.environment is None else ENVIRONMENT_S
     options = request_of(RecordingOptions, args, **{name: v for name, v in given.items() if v is not None})
-    request = request_of(SimulateRequest, args, out=args.out or Path("simulated"), options=options)
+    parts = () if args.unmodelled is None else names_of(args.unmodelled, tuple(UNMODELLED), "--unmodelled")
+    of_arm: dict[str, Any] = {"is_slim": args.slim, "unmodelled": parts}
+    request = request_of(SimulateRequest, args, out=args.out or Path("simulated"), options=options, **of_arm)
     result = simulate(request, console)
     return show_simulated(console, result)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from splatctrl_cli.datasets.dtu import DtuView, write_dtu
 from splatctrl_cli.datasets.idr import write_idr
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.simulated_arm import adapted_motion, copied_arm
@@ -14,7 +15,7 @@ from splatctrl_cli.jobs.simulated_task import task_of
 from splatctrl_cli.logs.mcap_writer import mcap_log
 from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
+from splatctrl_cli.simulate.arm import SHAPES, SLIM, arm_spheres_yaml, arm_urdf
 from splatctrl_cli.simulate.primitives import luminance_std
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions, Scene
 from splatctrl_cli.simulate.tabletop import object_mask, turntable_views
@@ -26,15 +27,28 @@ class SimulateRequest:
     """Write log.mcap, truth.json and the robot's files into the folder `out`; dtu: and a scan, in both layouts.
 
     urdf: of another arm than the simulated one, its base on the table at the world's origin; packages: where its
-    meshes are looked for.
+    meshes are looked for. is_slim: the arm is seen by shapes inside of its collision shapes; unmodelled: names of
+    `UNMODELLED` parts that move with it, in images and truth alone.
     """
 
     out: Path
     urdf: Path | None = None
     packages: tuple[Path, ...] = ()
     options: RecordingOptions = field(default_factory=RecordingOptions)
+    is_slim: bool = False
+    unmodelled: tuple[str, ...] = ()
     dtu: bool = False
     force: bool = False
+
+    def __post_init__(self) -> None:
+        if self.urdf is not None and (self.is_slim or self.unmodelled):
+            raise UsageError("--slim, --unmodelled: expected the simulated arm, got --urdf")
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What run.json says of it."""
+        own = {"is_slim": self.is_slim, "unmodelled": self.unmodelled}
+        return {**vars(self.options), **{name: value for name, value in own.items() if value}}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +78,7 @@ def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateR
         write_run(
             folder,
             command="simulate",
-            config=vars(request.options),
+            config=request.config,
             inputs={} if request.urdf is None else {request.urdf.name: sha256(request.urdf)},
             metrics=_metrics(truth, num_frames),
             stopwatch=stopwatch,
@@ -99,20 +113,21 @@ def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Re
     surfaces = None
     if request.urdf is None:
         urdf, spheres = folder / "robot.urdf", folder / "robot_spheres.yaml"
-        urdf.write_text(arm_urdf(), encoding="utf-8")
+        urdf.write_text(arm_urdf(SLIM if request.is_slim else SHAPES), encoding="utf-8")
         spheres.write_text(arm_spheres_yaml(), encoding="utf-8")
         robot = RobotModel.from_urdf(urdf, spheres)
     else:
         progress.log(f"simulate: fitting spheres to {request.urdf.name}")
-        robot, surfaces = copied_arm(request.urdf, request.packages, folder)
+        robot, surfaces = copied_arm(request.urdf, request.packages, folder, progress)
     if options.environment is not None:
         progress.log(f"simulate: looking for a way through the {options.environment}")
-        return Recording(options, robot, task_of(options.environment, options.seed, robot).scene(robot, options))
+        scene = task_of(options.environment, options.seed, robot).scene(robot, options)
+        return Recording(options, robot, scene, request.unmodelled)
     scene = Scene.of(options)
     if surfaces is not None:
         progress.log("simulate: looking for a way through the scene")
         scene = replace(scene, motion=adapted_motion(scene, robot, surfaces))
-    return Recording(options, robot, scene)
+    return Recording(options, robot, scene, request.unmodelled)
 
 
 def _truth(folder: Path, recording: Recording, contrast: Mapping[str, float]) -> Truth:
@@ -128,6 +143,7 @@ def _truth(folder: Path, recording: Recording, contrast: Mapping[str, float]) ->
         T_world_base=recording.robot.T_world_base,
         stamps=stamps,
         clearance=clearance,
+        unmodelled=recording.unmodelled,
     )
 
 

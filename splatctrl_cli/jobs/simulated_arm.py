@@ -1,24 +1,27 @@
 """Another arm in the simulated scene: its files, its spheres, and a motion that takes its tip where ours goes."""
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
+from defusedxml import ElementTree
 
 from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.planner.planned import goal_postures
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.coverage import coverage_of_solids
-from splatctrl_cli.robot.link_meshes import mesh_path, read_solids
+from splatctrl_cli.robot.link_meshes import load_visual, mesh_path, read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import random_postures
 from splatctrl_cli.robot.self_margins import SelfSurfaces
 from splatctrl_cli.robot.sphere_files import spheres_yaml
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
-from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
+from splatctrl_cli.robot.urdf import MeshShape, UrdfFile, read_urdf
 from splatctrl_cli.simulate.arm import Motion, hand_pose
 from splatctrl_cli.simulate.recording import START_NS, Scene
 from splatctrl_cli.simulate.truth import distance_to
@@ -26,16 +29,18 @@ from splatctrl_cli.simulate.truth import distance_to
 REMEDY = "give the URDF of an arm whose base stands on the table's top"
 
 
-def copied_arm(urdf: Path, packages: Sequence[Path], folder: Path) -> tuple[RobotModel, SelfSurfaces]:
-    """Write ``robot.urdf``, the collision meshes that it names into ``meshes/``, and ``robot_spheres.yaml`` into a
-    folder, and read them back as the robot and the surfaces of its links.
+def copied_arm(
+    urdf: Path, packages: Sequence[Path], folder: Path, progress: Progress
+) -> tuple[RobotModel, SelfSurfaces]:
+    """Write ``robot.urdf``, the meshes that it names into ``meshes/``, and ``robot_spheres.yaml`` into a folder, and
+    read them back as the robot and the surfaces of its links.
 
-    Raises InputError for a URDF without collision geometry, or whose meshes are missing.
+    Raises InputError for a URDF without collision geometry, or whose collision meshes are missing.
     """
     original = read_urdf(urdf)
     solids = read_solids(original, packages)
     copy = folder / "robot.urdf"
-    copy.write_text(_with_own_meshes(original, packages, folder), encoding="utf-8")
+    copy.write_text(_with_own_meshes(original, packages, folder, progress), encoding="utf-8")
     spheres = folder / "robot_spheres.yaml"
     fitted = fit_spheres(solids, FitOptions(max_spheres=max(fixed.DEFAULT_SPHERES, len(solids))))
     spheres.write_text(spheres_yaml(fitted, [f"Fitted to {urdf.name} by: splatctrl simulate."]), encoding="utf-8")
@@ -70,18 +75,44 @@ def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> M
     return Motion(times=times, waypoints=waypoints)
 
 
-def _with_own_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path) -> str:
-    """The URDF's text with its collision meshes copied beside it, so that the folder needs no package."""
-    text, names = urdf.text, set[str]()
-    for name in dict.fromkeys(mesh.filename for mesh in urdf.meshes):
-        source = mesh_path(urdf.path, next(mesh for mesh in urdf.meshes if mesh.filename == name), packages)
-        (folder / "meshes").mkdir(exist_ok=True)
-        copy = source.name if source.name not in names else f"{len(names)}_{source.name}"
-        names.add(copy)
-        shutil.copyfile(source, folder / "meshes" / copy)
-        for quote in ('"', "'"):
-            text = text.replace(f"{quote}{name}{quote}", f"{quote}meshes/{copy}{quote}")
-    return text
+def _with_own_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
+    """The URDF's text with its collision meshes, and as STL its visual ones, copied beside it: the folder needs no
+    package. A link whose visual mesh cannot be read is seen by its collision geometry, if it has any.
+    """
+    root, copies = ElementTree.fromstring(urdf.text), dict[tuple[str, str], str]()
+    parts = [(link, part) for link in root.iter("link") for tag in ("collision", "visual") for part in link.iter(tag)]
+    for link, part in parts:
+        mesh, is_visual = part.find("geometry/mesh"), part.tag == "visual"
+        if mesh is None:
+            continue
+        name = mesh.get("filename", "")
+        shape = MeshShape(link=str(link.get("name")), filename=name, scale=(1.0, 1.0, 1.0), T_link_mesh=np.eye(4))
+        if (part.tag, name) not in copies:
+            try:
+                copies[part.tag, name] = _copy(mesh_path(urdf.path, shape, packages), folder, copies, is_visual)
+            except InputError as error:
+                if not is_visual:
+                    raise
+                progress.log(f"simulate: {error.message}; link '{shape.link}' is seen by its collision geometry")
+                if link.find("collision") is not None:
+                    link.remove(part)
+                continue
+        mesh.set("filename", copies[part.tag, name])
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _copy(source: Path, folder: Path, copies: Mapping[tuple[str, str], str], is_visual: bool) -> str:
+    """Copy a mesh into the folder, under a name that no other copy has; that name."""
+    kind = "meshes/visual" if is_visual else "meshes"
+    stem = f"{source.stem}.stl" if is_visual else source.name
+    name = f"{kind}/{stem}" if f"{kind}/{stem}" not in copies.values() else f"{kind}/{len(copies)}_{stem}"
+    (folder / kind).mkdir(parents=True, exist_ok=True)
+    if is_visual:
+        seen = load_visual(source)
+        trimesh.Trimesh(seen.vertices, seen.faces, process=False).export(folder / name)
+    else:
+        shutil.copyfile(source, folder / name)
+    return name
 
 
 def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:

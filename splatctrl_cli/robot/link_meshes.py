@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import coal
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -96,6 +97,19 @@ def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path
         if name.startswith("package://")
         else f"expected {tried[0]}",
     )
+
+
+def load_visual(path: Path) -> TriangleMesh:
+    """A visual mesh: COLLADA by coal's reader, in metres and with z up, other formats as `load_mesh` reads them."""
+    if path.suffix.lower() != ".dae":
+        return load_mesh(path)
+    try:
+        model = coal.MeshLoader(coal.NODE_TYPE.BV_OBBRSS).load(str(path), np.ones(3))
+    except Exception as error:  # coal raises whatever the reader of the format raises
+        raise InputError(f"{path}: expected a mesh, got {type(error).__name__}: {error}") from None
+    triangles = (model.tri_indices(index) for index in range(model.num_tris))
+    faces = np.array([[triangle[corner] for corner in range(3)] for triangle in triangles], dtype=np.int64)
+    return TriangleMesh(vertices=np.array(model.vertices(), dtype=np.float64), faces=faces, is_closed=False)
 
 
 class SolidDistance:

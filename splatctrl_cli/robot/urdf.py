@@ -199,6 +199,18 @@ def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
     )
 
 
+def visual_urdf(urdf: UrdfFile) -> UrdfFile:
+    """The robot as cameras see it: links with visual geometry have that for their collision geometry."""
+    root = ElementTree.fromstring(urdf.text)
+    for link in root.findall("link"):
+        seen = [visual for visual in link.findall("visual") if visual.find("geometry") is not None]
+        for collision in link.findall("collision") if seen else ():
+            link.remove(collision)
+        for visual in seen:
+            visual.tag = "collision"
+    return read_urdf(urdf.path, ElementTree.tostring(root, encoding="unicode"))
+
+
 def _read(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")

@@ -1,6 +1,6 @@
 """A simulated recording: the records of a log in time order, and what is true while it runs."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,10 +8,12 @@ import numpy as np
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, UInt8, by_stamp
+from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, SphereSet, UInt8, by_stamp
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.surface import RobotSurface
+from splatctrl_cli.robot.urdf import visual_urdf
 from splatctrl_cli.simulate import shared_workspace, tabletop
-from splatctrl_cli.simulate.arm import Motion
+from splatctrl_cli.simulate.arm import UNMODELLED, Capsule, Motion, link_shape
 from splatctrl_cli.simulate.depth_camera import DepthNoise, StereoDepth
 from splatctrl_cli.simulate.environments import ENVIRONMENTS
 from splatctrl_cli.simulate.primitives import Primitive
@@ -25,6 +27,7 @@ NOISES: dict[str, DepthNoise | StereoDepth | None] = {
     "realsense": DepthNoise(),
     "stereo": StereoDepth(),
 }
+PART_STEP = 0.002  # [m] between balls that stand for an unmodelled part
 OPTICAL_FROM_LINK = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 
 Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_child (4, 4)
@@ -123,17 +126,31 @@ class Scene:
 
 
 class Recording:
-    """A scene, recorded once; the same options and scene give the same records."""
+    """A scene, recorded once; the same options and scene give the same records. Images show the robot's visual
+    geometry, where its URDF has any.
+    """
 
-    def __init__(self, options: RecordingOptions, robot: RobotModel, scene: Scene | None = None) -> None:
-        """scene: another than that of the options, or the motion of another arm in it."""
-        self.options = options
-        self.robot = robot
+    def __init__(
+        self,
+        options: RecordingOptions,
+        robot: RobotModel,
+        scene: Scene | None = None,
+        unmodelled: tuple[str, ...] = (),
+    ) -> None:
+        """scene: another than that of the options, or the motion of another arm in it; unmodelled: names of
+        `UNMODELLED` parts that the arm has.
+        """
+        self.options, self.robot, self.unmodelled = options, robot, unmodelled
+        parts = [(UNMODELLED[name][0], capsule) for name in unmodelled for capsule in UNMODELLED[name][1]]
+        self._body = robot if not parts else _with_parts(robot, parts)
         scene = Scene.of(options) if scene is None else scene
         self.start_ns, self.end_ns = START_NS, START_NS + round(options.duration_s * 1e9)
         self.cameras = scene.cameras or tabletop.cameras(options.width, options.height)
         self.primitives, self._temporary, self._motion = scene.primitives, scene.temporary, scene.motion
-        self._meshes = tabletop.arm_meshes(robot.surface) if robot.urdf.meshes else None
+        seen = visual_urdf(robot.urdf)
+        self._shapes = (*seen.shapes, *(link_shape(link, capsule) for link, capsule in parts))
+        surface = RobotSurface.of(seen, robot.sphere_set)
+        self._meshes = tabletop.arm_meshes(surface) if len(surface.triangles) else None
 
     def joint_states(self) -> Iterator[JointState]:
         """The arm's states from start to end, 50 a second."""
@@ -151,7 +168,7 @@ class Recording:
         """The images of the cameras (None: of every one) at the time of the frame `index`, with the arm at q (J,)."""
         stamp_ns = self.start_ns + self._offset_ns(index)
         poses = self.link_poses(q)
-        arm = tabletop.arm_solids(self.robot.urdf.shapes, poses)
+        arm = tabletop.arm_solids(self._shapes, poses)
         meshes = None if self._meshes is None else self._meshes.at(poses)
         passing = [p.at(stamp_ns) for p in self._temporary if p.is_present(stamp_ns)]
         noise, has_masks = NOISES[self.options.noise], self.options.with_person or self.options.human_arm is not None
@@ -201,18 +218,15 @@ class Recording:
     def clearances(self) -> tuple[np.ndarray, Float64]:
         """Stamps (T,) int64 [ns] of the joint states and the arm's true clearance (T,) [m] at each.
 
-        The least exact distance of a moving collision sphere to what is there, less the sphere's radius.
+        The least exact distance of a moving collision sphere to what is there, less the sphere's radius; and that of
+        unmodelled parts, to a millimetre.
         """
         states = list(self.joint_states())
-        radii = self.robot.sphere_set.radii[self.robot.moving_spheres]
+        moving, spheres = self._body.moving_spheres, self._body.sphere_set
         clearance = [
             np.min(
-                distance_to(
-                    self.primitives,
-                    self.robot.sphere_centers(state.position)[self.robot.moving_spheres],
-                    state.stamp_ns,
-                )
-                - radii
+                distance_to(self.primitives, self._body.sphere_centers(state.position)[moving], state.stamp_ns)
+                - spheres.radii[moving]
             )
             for state in states
         ]
@@ -227,6 +241,17 @@ class Recording:
         """One by camera, with what is always there cast."""
         static, rays = self.primitives[: len(self.primitives) - len(self._temporary)], self.options.color_rays
         return [Renderer(camera, static, color_rays=rays) for camera in self.cameras]
+
+
+def _with_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> RobotModel:
+    """The robot with balls along the axes of capsules that move with its links."""
+    links, centers, radii = list(robot.sphere_set.links), [robot.sphere_set.centers], list(robot.sphere_set.radii)
+    for link, capsule in parts:
+        num = int(np.linalg.norm(np.subtract(capsule.end, capsule.start)) / PART_STEP) + 2
+        centers.append(np.linspace(capsule.start, capsule.end, num))
+        links, radii = links + [link] * num, radii + [capsule.radius] * num
+    spheres = SphereSet(links=tuple(links), centers=np.concatenate(centers), radii=np.array(radii))
+    return RobotModel.from_urdf(robot.urdf.path, spheres, T_world_base=robot.T_world_base)
 
 
 def _shown(depth: Float32, without: Float32) -> UInt8:

@@ -22,8 +22,9 @@ NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}
 class Truth:
     """Obstacles over time, cameras and robot of a simulated log; world frame, metres, nanoseconds.
 
-    stamps (T,) int64 [ns] of the joint states, clearance (T,) [m] of the arm's moving collision spheres at each;
-    luminance_std: the least standard deviation of luminance (0 to 1) over each camera's images.
+    stamps (T,) int64 [ns] of the joint states, clearance (T,) [m] of the arm's moving collision spheres at each, and
+    of the `unmodelled` parts that move with it; luminance_std: the least standard deviation of luminance (0 to 1)
+    over each camera's images.
     """
 
     path: Path
@@ -36,6 +37,7 @@ class Truth:
     T_world_base: Float64
     stamps: Stamps
     clearance: Float64
+    unmodelled: tuple[str, ...] = ()
 
     def distance(self, points_world: Float64, stamp_ns: int) -> Float64:
         """Signed distance (Q,) [m] of points (Q, 3) to everything there at `stamp_ns`, the robot left out."""
@@ -88,9 +90,10 @@ def truth_document(truth: Truth) -> dict[str, Any]:
             "spheres": truth.robot_spheres.name,
             "joint_names": list(truth.joint_names),
             "T_world_base": truth.T_world_base.tolist(),
+            **({"unmodelled": list(truth.unmodelled)} if truth.unmodelled else {}),
         },
         "clearance": {
-            "of": "moving collision spheres to everything present but the robot",
+            "of": f"{', '.join(('moving collision spheres', *truth.unmodelled))} to everything present but the robot",
             "min": round(float(np.min(truth.clearance)), 6),
             "stamps": truth.stamps.tolist(),
             "distance": [round(value, 6) for value in truth.clearance.tolist()],
@@ -142,6 +145,7 @@ def _parsed(path: Path, document: dict[str, Any]) -> Truth:
         T_world_base=_pose(robot["T_world_base"]),
         stamps=np.array(clearance["stamps"], dtype=np.int64),
         clearance=np.array(clearance["distance"], dtype=np.float64),
+        unmodelled=tuple(robot.get("unmodelled", ())),
     )
 
 

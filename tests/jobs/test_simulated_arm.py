@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +11,15 @@ import trimesh
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import back_project, transform_points
+from splatctrl_cli.jobs.progress import Silent
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.mesh_distance import MeshDistance, load_mesh
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.coverage import coverage_deficit
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.urdf import read_urdf
-from splatctrl_cli.simulate.recording import RecordingOptions
+from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
+from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.truth import distance_to, load_truth
 from splatctrl_cli.sources.source import open_source
 from tests.robot.shapes import written
@@ -98,3 +100,66 @@ def test_the_same_options_give_the_same_bytes(simulated: Path, arm: Path, tmp_pa
     simulate(SimulateRequest(out=tmp_path / "again", urdf=arm, options=OPTIONS))
     for name in ("log.mcap", "truth.json", "robot.urdf"):
         assert (tmp_path / "again" / name).read_bytes() == (simulated / name).read_bytes(), name
+
+
+COLLADA = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset><library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="{count}">{numbers}</float_array><technique_common>
+<accessor source="#a" count="{vertices}" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source><vertices id="v"><input semantic="POSITION"
+source="#p"/></vertices><triangles count="{faces}"><input semantic="VERTEX" source="#v" offset="0"/><p>{indices}</p>
+</triangles></mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s"><node>
+<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes><scene>
+<instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+def collada(mesh: trimesh.Trimesh) -> str:
+    numbers, indices = (" ".join(map(str, values.ravel().tolist())) for values in (mesh.vertices, mesh.faces))
+    sizes = {"count": mesh.vertices.size, "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    return COLLADA.format(numbers=numbers, indices=indices, **sizes)
+
+
+NAMES = ("visual/seen", "forearm")
+
+
+class Heard(Silent):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def log(self, line: str) -> None:
+        self.lines.append(line)
+
+
+@pytest.mark.parametrize("suffix", ["dae", "none"])
+def test_a_link_is_seen_by_its_visual_mesh_where_that_can_be_read(arm: Path, tmp_path: Path, suffix: str) -> None:
+    """The forearm's visual mesh is a rod of 3 cm inside of its collision mesh."""
+    packages = shutil.copytree(arm.parents[1], tmp_path / "packages")
+    (urdf,) = packages.rglob("my_arm.urdf")
+    rod = trimesh.creation.capsule(height=0.2, radius=0.03, count=[16, 16])
+    rod.apply_translation([0.0, 0.01, -0.22])
+    if suffix == "dae":
+        (urdf.parent / "meshes" / "seen.dae").write_text(collada(rod))
+    visual = f'<visual><geometry><mesh filename="package://my_arm/meshes/seen.{suffix}"/></geometry></visual>'
+    urdf.write_text(urdf.read_text().replace('<link name="link5">', f'<link name="link5">{visual}'))
+    heard = Heard()
+    simulate(SimulateRequest(out=tmp_path / "out", urdf=urdf, options=OPTIONS), heard)
+    copy = read_urdf(tmp_path / "out" / "robot.urdf")
+    assert {mesh.filename for mesh in copy.meshes} == {"meshes/forearm.stl"}
+    seen = visual_urdf(copy)
+    if suffix == "none":
+        assert [mesh.filename for mesh in seen.meshes] == ["meshes/forearm.stl"]
+        assert any("seen.none was not found; link 'link5' is seen by its collision" in line for line in heard.lines)
+        return
+    assert [mesh.filename for mesh in seen.meshes] == ["meshes/visual/seen.stl"]
+    model = RobotModel.from_urdf(copy.path, tmp_path / "out" / "robot_spheres.yaml")
+    model = model.moved_by([f"my_joint{k}" for k in range(1, 8)])
+    seen_mesh, collides = (MeshDistance(load_mesh(copy.path.parent / f"meshes/{name}.stl")) for name in NAMES)
+    recording = Recording(replace(OPTIONS, width=160, height=120), model)
+    q, found = next(iter(recording.joint_states())).position, 0
+    for frame in recording.frames_at(0, q):
+        points = transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth))[frame.depth > 0]
+        points = transform_points(np.linalg.inv(model.frame_pose(q, "link5")), points)
+        is_inside = collides.signed(points) < -0.01
+        assert np.median(np.abs(seen_mesh.signed(points[is_inside]))) < 1e-3
+        found += int(is_inside.sum())
+    assert found > 30

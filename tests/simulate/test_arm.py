@@ -1,4 +1,4 @@
-"""The simulated arm: its spheres cover its shapes, tightly."""
+"""The simulated arm: its spheres cover its shapes, tightly; what is seen of it lies inside of them, if asked for."""
 
 from pathlib import Path
 
@@ -7,8 +7,16 @@ import pytest
 
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.urdf import Shape
-from splatctrl_cli.simulate.arm import JOINTS, arm_spheres_yaml, arm_urdf
+from splatctrl_cli.robot.urdf import Shape, read_urdf, visual_urdf
+from splatctrl_cli.simulate.arm import (
+    JOINTS,
+    SHAPES,
+    SLIM,
+    UNMODELLED,
+    Capsule,
+    arm_spheres_yaml,
+    arm_urdf,
+)
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.truth import distance_to
 
@@ -49,6 +57,14 @@ def test_spheres_cover_every_shape_to_a_millimetre(arm: RobotModel) -> None:
         assert gap.min(axis=1).max() < 1e-3, shape
 
 
+def solid(shape: Shape) -> Primitive:
+    """In the frame of its link."""
+    texture = Texture(pattern="noise", feature=1.0, dark=(0, 0, 0), bright=(1, 1, 1))
+    return Primitive(
+        name=shape.link, kind=shape.kind, size=shape.size, T_world_shape=shape.T_link_shape, texture=texture
+    )
+
+
 def protrusion(arm: RobotModel, link: str) -> float:
     """How far [m] the link's spheres stand out of its shapes."""
     rng = np.random.default_rng(1)
@@ -56,12 +72,7 @@ def protrusion(arm: RobotModel, link: str) -> float:
     direction = rng.standard_normal((400, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     points = (arm.sphere_set.centers[own, None] + arm.sphere_set.radii[own, None, None] * direction).reshape(-1, 3)
-    texture = Texture(pattern="noise", feature=1.0, dark=(0, 0, 0), bright=(1, 1, 1))
-    solids = [
-        Primitive(name=link, kind=shape.kind, size=shape.size, T_world_shape=shape.T_link_shape, texture=texture)
-        for shape in arm.urdf.shapes
-        if shape.link == link
-    ]
+    solids = [solid(shape) for shape in arm.urdf.shapes if shape.link == link]
     return float(distance_to(solids, points, 0).max())
 
 
@@ -84,3 +95,54 @@ def test_limits_are_those_that_the_maker_publishes(arm: RobotModel) -> None:
 def test_the_committed_robot_files_are_what_the_code_writes(sample_data: Path) -> None:
     assert (sample_data / "tabletop/robot.urdf").read_text() == arm_urdf()
     assert (sample_data / "tabletop/robot_spheres.yaml").read_text() == arm_spheres_yaml()
+
+
+def test_visual_shapes_lie_inside_of_collision_shapes_by_3_mm_and_over_a_twentieth_by_27_to_30(tmp_path: Path) -> None:
+    (tmp_path / "robot.urdf").write_text(arm_urdf(SLIM))
+    urdf = read_urdf(tmp_path / "robot.urdf")
+    seen, gaps, areas = visual_urdf(urdf), [], []
+    for link in SHAPES:
+        outer, inner = ([shape for shape in of.shapes if shape.link == link] for of in (urdf, seen))
+        points = np.concatenate([samples(shape) for shape in inner])
+        assert distance_to([solid(shape) for shape in outer], points, 0).max() < -2.8e-3
+        for shape in outer:
+            points = samples(shape)
+            area = np.full(len(points), area_of(shape) / len(points))
+            if shape.kind == "cylinder":
+                area[len(points) // 2 :] = 0.0  # its ends are inside of balls
+            is_outside = distance_to([solid(other) for other in outer], points, 0) > -1e-6
+            gaps.append(distance_to([solid(part) for part in inner], points[is_outside], 0))
+            areas.append(area[is_outside])
+    gap, area = np.concatenate(gaps), np.concatenate(areas)
+    order = np.argsort(gap)
+    share = np.cumsum(area[order]) / area.sum()
+    median, most = (gap[order][np.searchsorted(share, level)] for level in (0.5, 0.95))
+    assert median == pytest.approx(0.003, abs=1e-4)
+    assert most == pytest.approx(0.027, abs=1e-3)
+    assert gap.max() < 0.030 + 1e-6
+
+
+def area_of(shape: Shape) -> float:
+    """Of the surface [m^2] on which `samples` are, twice that of a cylinder's side."""
+    if shape.kind == "box":
+        x, y, z = shape.size
+        return 2 * (x * y + y * z + z * x)
+    return 4 * np.pi * shape.size[0] * (shape.size[1] if shape.kind == "cylinder" else shape.size[0])
+
+
+def test_the_slim_arm_collides_as_the_other_does(arm: RobotModel, tmp_path: Path) -> None:
+    (tmp_path / "robot.urdf").write_text(arm_urdf(SLIM))
+    urdf = read_urdf(tmp_path / "robot.urdf")
+    assert [(s.link, s.kind, s.size) for s in urdf.shapes] == [(s.link, s.kind, s.size) for s in arm.urdf.shapes]
+    same = visual_urdf(arm.urdf)
+    assert [(s.link, s.kind, s.size) for s in same.shapes] == [(s.link, s.kind, s.size) for s in arm.urdf.shapes]
+
+
+@pytest.mark.parametrize("name", UNMODELLED)
+def test_an_unmodelled_part_stands_out_of_the_link_that_carries_it(arm: RobotModel, name: str) -> None:
+    link, capsules = UNMODELLED[name]
+    assert all(isinstance(capsule, Capsule) for capsule in capsules)
+    own = [solid(shape) for shape in arm.urdf.shapes if shape.link == link]
+    points = np.concatenate([np.linspace(c.start, c.end, 20) for c in capsules])
+    distance = distance_to(own, points, 0)
+    assert distance.max() > 0.015 and distance.min() < 0.02

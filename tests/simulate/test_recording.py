@@ -9,10 +9,10 @@ import pytest
 
 from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
 from splatctrl_cli.geometry import back_project, transform_points
-from splatctrl_cli.records import JointState, RgbdFrame
+from splatctrl_cli.records import Float64, JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import tabletop
-from splatctrl_cli.simulate.arm import Motion
+from splatctrl_cli.simulate.arm import UNMODELLED, Motion, link_shape
 from splatctrl_cli.simulate.primitives import Primitive, Texture, luminance_std
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.render import Renderer
@@ -275,3 +275,39 @@ def test_fewer_rays_change_colours_alone(exact: Recording) -> None:
     np.testing.assert_array_equal(few.image(moving)[1], many.image(moving)[1])
     np.testing.assert_array_equal(few.depth(moving), many.image(moving)[1])
     assert 0 < np.abs(few.image(moving)[0].astype(float) - many.image(moving)[0]).mean() < 10
+
+
+@pytest.mark.parametrize("name", UNMODELLED)
+def test_an_unmodelled_part_is_in_the_images_and_the_truth_and_not_in_the_robot(
+    robot: RobotModel, exact: Recording, name: str
+) -> None:
+    options = RecordingOptions(noise="none", **SMALL | {"width": 160, "height": 120})
+    plain, more = Recording(options, robot), Recording(options, robot, unmodelled=(name,))
+    q = np.array([0.8, -0.3, 0.0, -2.4, 0.0, 2.0, 0.8])
+    differs = 0
+    link, capsules = UNMODELLED[name]
+    part = tabletop.arm_solids([link_shape(link, capsule) for capsule in capsules], more.link_poses(q))
+    for before, after in zip(plain.frames_at(0, q), more.frames_at(0, q), strict=True):
+        is_part = before.depth != after.depth
+        points = transform_points(after.T_world_camera, back_project(after.intrinsics, after.depth))[is_part]
+        assert len(points) == 0 or np.abs(distance_to(part, points, 0)).max() < 1e-5
+        differs += int(is_part.sum())
+    assert differs > 30
+    assert more.robot is robot
+    assert np.all(more.clearances()[1] <= plain.clearances()[1])
+
+
+def test_the_true_clearance_of_a_part_is_its_own_to_a_millimetre(robot: RobotModel) -> None:
+    recording = Recording(RecordingOptions(**SMALL), robot, unmodelled=("tool",))
+    stamps, clearance = recording.clearances()
+    index = int(np.argmin(clearance))
+    q = list(recording.joint_states())[index].position
+    (tool,) = UNMODELLED["tool"][1]
+    axis = transform_points(robot.frame_pose(q, "hand"), np.linspace(tool.start, tool.end, 1000))
+    expected = distance_to(recording.primitives, axis, int(stamps[index])).min() - tool.radius
+    assert expected <= clearance[index] < expected + 1e-3
+    assert clearance[index] < exact_clearance(robot).min() - 0.01
+
+
+def exact_clearance(robot: RobotModel) -> Float64:
+    return Recording(RecordingOptions(**SMALL), robot).clearances()[1]
