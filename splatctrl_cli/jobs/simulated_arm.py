@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 
@@ -23,9 +24,11 @@ from splatctrl_cli.robot.sphere_files import spheres_yaml
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.urdf import MeshShape, UrdfFile, read_urdf
 from splatctrl_cli.simulate.arm import Motion, hand_pose
+from splatctrl_cli.simulate.primitives import ALWAYS, Primitive
 from splatctrl_cli.simulate.recording import START_NS, Scene
 from splatctrl_cli.simulate.truth import distance_to
 
+LATE = 1e3  # [rad/s] a second longer than its time costs as much: every way in time is better
 REMEDY = "give the URDF of an arm whose base stands on the table's top"
 
 
@@ -55,8 +58,9 @@ def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> M
     """The scene's motion for another arm: at each waypoint its tip (the last link of its URDF, z pointing away from
     the arm) is where the hand of the simulated arm is, as far as it reaches, and any way round.
 
-    Among the postures found, those of the shortest way that keeps clear of everything there and of the arm
-    itself. Raises InputError where none leads to a waypoint, or every way runs into something.
+    Among the postures found, those of the shortest way that keeps clear of everything there and of the arm itself;
+    where none is within its velocity limits, the way that has to be slowed down least. Raises InputError where none
+    leads to a waypoint, or every way runs into something.
     """
     times = scene.motion.times
     reached = [_postures(model, hand_pose(q), q) for q in scene.motion.waypoints]
@@ -153,21 +157,30 @@ def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
 
 
 def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
-    """What a leg between two postures costs: its length [rad], and more where it comes near anything; infinite where
-    it runs into something or itself, or is too fast.
+    """The cost of a leg between two postures: its length [rad], and more where it comes near anything, most where it
+    has to be slowed down; infinite where it runs into something or itself.
+
+    A leg that is slowed down is elsewhere when things come and leave: it keeps clear of all of them, and is refused
+    where something moves.
     """
-    seconds = np.linspace(leg.times[0], leg.times[-1], fixed.SIMULATED_SAMPLES)
-    states = [leg.at(second) for second in seconds]
-    if np.any(np.abs([velocity for _, velocity in states]) > model.velocity_limit):
+    slowed = leg.within(model.velocity_limit)
+    is_late = slowed.times[-1] > leg.times[-1]
+    if is_late and any(primitive.track is not None for primitive in scene.primitives):
         return np.inf
-    positions = np.array([position for position, _ in states])
+    solids: Sequence[Primitive] = scene.primitives
+    if is_late:
+        solids = [replace(primitive, from_ns=ALWAYS[0], to_ns=ALWAYS[1]) for primitive in solids]
+    seconds = np.linspace(leg.times[0], leg.times[-1], fixed.SIMULATED_SAMPLES)
+    positions = np.array([leg.at(second)[0] for second in seconds])
     centers = model.sphere_centers_batch(positions)
     moving = model.moving_spheres
     radii, least = model.sphere_set.radii[moving], np.inf
     for second, points in zip(seconds, centers[:, moving], strict=True):
-        gap = distance_to(scene.primitives, points, START_NS + round(second * 1e9)) - radii
+        gap = distance_to(solids, points, START_NS + round(second * 1e9)) - radii
         least = min(least, float(gap.min()))
     if least <= 0 or np.any(surfaces.gaps(positions, centers, 0.0) < 0):
         return np.inf
     shortfall = max(0.0, fixed.SIMULATED_CLEARANCE - least) / fixed.SIMULATED_CLEARANCE
-    return float(np.linalg.norm(leg.waypoints[1] - leg.waypoints[0])) + fixed.SIMULATED_SHORTFALL * shortfall
+    longer = float(np.ptp(slowed.times) - np.ptp(leg.times))
+    length = float(np.linalg.norm(leg.waypoints[1] - leg.waypoints[0]))
+    return length + fixed.SIMULATED_SHORTFALL * shortfall + LATE * longer

@@ -7,7 +7,7 @@ ours: capsules (a cylinder and a sphere at either end) and boxes that roughly fo
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 
 import numpy as np
@@ -36,6 +36,7 @@ HAND_YAW = -np.pi / 4  # the hand is mounted turned by 45 degrees
 GAP = 0.003  # [m] between a collision shape and the visual shape inside of it
 WAIST = 0.030  # [m] at the waist of a capsule whose axis is longer than `LONG`, between ends of a share `BULGE` of it
 LONG, BULGE = 0.10, 0.05
+PEAK = 1.875  # a minimum-jerk segment's top speed by its mean
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,6 +291,12 @@ class Motion:
 
     times: Float64
     waypoints: Float64
+
+    def within(self, velocity_limit: Float64) -> "Motion":
+        """The same way, slowed down as a whole where a joint would be faster than its limit (J,) [rad/s]."""
+        speeds = PEAK * np.abs(np.diff(self.waypoints, axis=0)) / np.diff(self.times)[:, None]
+        slower = max(1.0, float(np.max(speeds / velocity_limit)))
+        return replace(self, times=self.times + (slower - 1.0) * (self.times - self.times[0]))
 
     def at(self, time: float) -> tuple[Float64, Float64]:
         """Positions (J,) [rad] and velocities (J,) [rad/s]; at rest before the first and after the last waypoint."""

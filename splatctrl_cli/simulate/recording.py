@@ -127,7 +127,8 @@ class Scene:
 
 class Recording:
     """A scene, recorded once; the same options and scene give the same records. Images show the robot's visual
-    geometry, where its URDF has any.
+    geometry, where its URDF has any. It keeps its velocity limits: where the time is too short for its way, the
+    recording ends on the way.
     """
 
     def __init__(
@@ -146,7 +147,8 @@ class Recording:
         scene = Scene.of(options) if scene is None else scene
         self.start_ns, self.end_ns = START_NS, START_NS + round(options.duration_s * 1e9)
         self.cameras = scene.cameras or tabletop.cameras(options.width, options.height)
-        self.primitives, self._temporary, self._motion = scene.primitives, scene.temporary, scene.motion
+        self.primitives, self._temporary = scene.primitives, scene.temporary
+        self._motion = scene.motion.within(robot.velocity_limit)
         seen = visual_urdf(robot.urdf)
         self._shapes = (*seen.shapes, *(link_shape(link, capsule) for link, capsule in parts))
         surface = RobotSurface.of(seen, robot.sphere_set)

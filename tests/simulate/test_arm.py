@@ -97,7 +97,9 @@ def test_the_committed_robot_files_are_what_the_code_writes(sample_data: Path) -
     assert (sample_data / "tabletop/robot_spheres.yaml").read_text() == arm_spheres_yaml()
 
 
-def test_visual_shapes_lie_inside_of_collision_shapes_by_3_mm_and_over_a_twentieth_by_27_to_30(tmp_path: Path) -> None:
+def test_visual_shapes_lie_3_mm_inside_of_collision_shapes_and_a_twentieth_27_to_30_mm(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "robot.urdf").write_text(arm_urdf(SLIM))
     urdf = read_urdf(tmp_path / "robot.urdf")
     seen, gaps, areas = visual_urdf(urdf), [], []

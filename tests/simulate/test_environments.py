@@ -15,8 +15,9 @@ from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.environments import ENVIRONMENTS, Environment, drawn, ring_of_cameras
 from splatctrl_cli.simulate.primitives import signed_distance
-from splatctrl_cli.simulate.recording import RecordingOptions
+from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from tests.robot.shapes import covering_spheres, folding_arm
+from tests.simulate.limits import DURATIONS, assert_keeps_limits
 
 
 @pytest.fixture(scope="module")
@@ -98,10 +99,10 @@ def test_an_arm_that_reaches_no_opening_is_refused(monkeypatch: pytest.MonkeyPat
         task_of("cubby", 0, folding_arm(tmp_path, covering_spheres())[0])
 
 
-def test_a_motion_that_would_be_too_fast_is_refused(robot: RobotModel) -> None:
-    task = task_of("cubby", 1, robot)
-    with pytest.raises(InputError, match=r"the way takes \d+\.\d s within the joints' velocity limits"):
-        task.scene(robot, RecordingOptions(duration_s=1.0, fps=3.0))
+@pytest.mark.parametrize("duration", DURATIONS)
+def test_the_way_through_it_keeps_the_velocity_limits_in_any_time(robot: RobotModel, duration: float) -> None:
+    options = RecordingOptions(duration_s=duration, fps=10.0, environment="cubby")
+    assert_keeps_limits(Recording(options, robot, task_of("cubby", 1, robot).scene(robot, options)))
 
 
 def test_a_log_is_written_of_it_with_its_truth(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """Another arm in the scene: its meshes as cameras see them, and its tip where the simulated arm's hand goes."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +19,10 @@ from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.arm import hand_pose
 from splatctrl_cli.simulate.primitives import Primitive, Texture
-from splatctrl_cli.simulate.recording import RecordingOptions, Scene
+from splatctrl_cli.simulate.recording import Recording, RecordingOptions, Scene
 from splatctrl_cli.simulate.render import Meshes, Renderer
 from tests.robot.shapes import JOINTS, arm_of, ur10e_urdf, written
+from tests.simulate.limits import DURATIONS, assert_keeps_limits
 
 TEXTURE = Texture(pattern="noise", feature=0.05, dark=(0.1, 0.2, 0.3), bright=(0.9, 0.8, 0.7), seed=3)
 
@@ -142,6 +145,26 @@ def test_an_arm_goes_no_way_on_which_it_meets_itself(tmp_path: Path, monkeypatch
     Meeting.radius = 100.0
     with pytest.raises(InputError, match="expected a way between the waypoints, got none"):
         adapted_motion(scene, model, meeting)
+
+
+@pytest.mark.parametrize("duration", DURATIONS)
+def test_another_arm_keeps_its_velocity_limits_in_any_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, duration: float
+) -> None:
+    monkeypatch.setattr(fixed, "SIMULATED_TURNS", 2)
+    model, options = ur10e(tmp_path), RecordingOptions(duration_s=duration, fps=10.0)
+    scene = Scene.of(options)
+    motion = adapted_motion(scene, model, SelfSurfaces(model, {}))
+    recording = Recording(options, model, replace(scene, motion=motion))
+    assert_keeps_limits(recording)
+    assert recording.clearances()[1].min() > 0
+
+
+def test_an_arm_that_is_too_slow_for_its_task_beside_a_person_is_refused(tmp_path: Path) -> None:
+    slow = ur10e(tmp_path, re.sub(r'velocity="[^"]+"', 'velocity="0.2"', ur10e_urdf()))
+    scene = Scene.of(RecordingOptions(human_arm="near-goal", duration_s=24.0))
+    with pytest.raises(InputError, match="expected a way between the waypoints, got none"):
+        adapted_motion(scene, slow, SelfSurfaces(slow, {}))
 
 
 def test_free_space_has_floor_and_walls_alone() -> None:

@@ -17,6 +17,7 @@ from splatctrl_cli.simulate.primitives import Primitive, Texture, luminance_std
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.render import Renderer
 from splatctrl_cli.simulate.truth import Truth, closest_of, distance_to, load_truth, truth_document
+from tests.simulate.limits import DURATIONS, assert_keeps_limits
 
 SMALL = {"duration_s": 3.0, "fps": 1.0, "width": 80, "height": 60}
 
@@ -116,6 +117,21 @@ def test_the_arm_moves_within_its_limits_and_its_velocity_is_the_slope(robot: Ro
         assert np.all(np.abs(velocity) < robot.velocity_limit)
     start, end = (robot.frame_pose(motion.at(t)[0], "hand")[:3, 3] for t in (0.0, 7.0))
     assert np.linalg.norm(end - start) > 0.5
+
+
+@pytest.mark.parametrize("duration", DURATIONS)
+def test_a_log_keeps_the_velocity_limits_in_any_time(robot: RobotModel, duration: float) -> None:
+    assert_keeps_limits(Recording(RecordingOptions(duration_s=duration, fps=10.0), robot))
+
+
+def test_a_motion_with_time_enough_stays_as_it_is_and_one_without_goes_the_same_way(robot: RobotModel) -> None:
+    whole, short = tabletop.arm_motion(7.0), tabletop.arm_motion(0.5)
+    assert whole.within(robot.velocity_limit).times.tobytes() == whole.times.tobytes()
+    slowed = short.within(robot.velocity_limit)
+    assert slowed.waypoints is short.waypoints and slowed.times[0] == short.times[0]
+    seconds = np.linspace(slowed.times[0], slowed.times[-1], 2001)
+    shares = np.abs([slowed.at(second)[1] for second in seconds]) / robot.velocity_limit
+    assert shares.max() == pytest.approx(1.0, abs=1e-4)
 
 
 def test_motion_rests_at_its_waypoints() -> None:
