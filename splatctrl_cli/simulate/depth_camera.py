@@ -131,11 +131,7 @@ def _enlarged(coarse: np.ndarray, factor: int, shape: tuple[int, ...]) -> np.nda
 
 def _is_at_edge(depth: Float32, step: float) -> Bool:
     """True at both pixels of every horizontal or vertical neighbour pair whose depths differ by more than `step`."""
-    out = np.zeros(depth.shape, dtype=bool)
-    across = np.abs(np.diff(depth, axis=1)) > step
-    down = np.abs(np.diff(depth, axis=0)) > step
-    out[:, 1:] |= across
-    out[:, :-1] |= across
-    out[1:] |= down
-    out[:-1] |= down
-    return out
+    across, down = (np.abs(np.diff(depth, axis=axis)) > step for axis in (1, 0))
+    sides = [np.pad(across, ((0, 0), pad)) for pad in ((1, 0), (0, 1))]
+    sides += [np.pad(down, (pad, (0, 0))) for pad in ((1, 0), (0, 1))]
+    return np.asarray(np.any(sides, axis=0))

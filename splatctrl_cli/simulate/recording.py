@@ -27,7 +27,7 @@ NOISES: dict[str, DepthNoise | StereoDepth | None] = {
     "realsense": DepthNoise(),
     "stereo": StereoDepth(),
 }
-PART_STEP = 0.002  # [m] between balls that stand for an unmodelled part
+NUM_BALLS = 100  # that stand for a capsule of an unmodelled part: a millimetre apart
 OPTICAL_FROM_LINK = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 
 Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_child (4, 4)
@@ -247,12 +247,14 @@ class Recording:
 
 def _with_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> RobotModel:
     """The robot with balls along the axes of capsules that move with its links."""
-    links, centers, radii = list(robot.sphere_set.links), [robot.sphere_set.centers], list(robot.sphere_set.radii)
-    for link, capsule in parts:
-        num = int(np.linalg.norm(np.subtract(capsule.end, capsule.start)) / PART_STEP) + 2
-        centers.append(np.linspace(capsule.start, capsule.end, num))
-        links, radii = links + [link] * num, radii + [capsule.radius] * num
-    spheres = SphereSet(links=tuple(links), centers=np.concatenate(centers), radii=np.array(radii))
+    balls = [(link, c.radius, x) for link, c in parts for x in np.linspace(c.start, c.end, NUM_BALLS)]
+    links, radii, centers = zip(*balls, strict=True)
+    own = robot.sphere_set
+    spheres = SphereSet(
+        links=own.links + links,
+        centers=np.concatenate([own.centers, centers]),
+        radii=np.append(own.radii, radii),
+    )
     return RobotModel.from_urdf(robot.urdf.path, spheres, T_world_base=robot.T_world_base)
 
 

@@ -71,7 +71,7 @@ def truth_document(truth: Truth) -> dict[str, Any]:
     """The truth as plain JSON values; `load_truth` reads them back unchanged."""
     return {
         "format": FORMAT,
-        "version": VERSIONS[_is_new(truth.primitives)],
+        "version": VERSIONS[any(p.kind == "capsule" or p.track is not None for p in truth.primitives)],
         "frame": "world",
         "units": {"length": "m", "time": "ns", "angle": "rad"},
         "primitives": [_primitive_document(primitive) for primitive in truth.primitives],
@@ -150,6 +150,7 @@ def _parsed(path: Path, document: dict[str, Any]) -> Truth:
 
 
 def _primitive_document(primitive: Primitive) -> dict[str, Any]:
+    track = primitive.track
     return {
         "name": primitive.name,
         "kind": primitive.kind,
@@ -158,16 +159,8 @@ def _primitive_document(primitive: Primitive) -> dict[str, Any]:
         "from_ns": None if primitive.from_ns == ALWAYS[0] else primitive.from_ns,
         "to_ns": None if primitive.to_ns == ALWAYS[1] else primitive.to_ns,
         "texture": asdict(primitive.texture),
-        **({} if primitive.track is None else {"track": _track_document(primitive.track)}),
+        **({} if track is None else {"track": {name: value.tolist() for name, value in vars(track).items()}}),
     }
-
-
-def _is_new(primitives: Sequence[Primitive]) -> bool:
-    return any(primitive.kind == "capsule" or primitive.track is not None for primitive in primitives)
-
-
-def _track_document(track: Track) -> dict[str, Any]:
-    return {"stamp_ns": track.stamp_ns.tolist(), "T_world_shape": track.T_world_shape.tolist()}
 
 
 def _track(entry: dict[str, Any] | None) -> Track | None:
