@@ -4,9 +4,13 @@ from pathlib import Path
 
 import pytest
 
+from tools.hunt.body import Body, draw_body
+from tools.hunt.clearance import TOLERANCE, TrueArm, least_clearance
 from tools.hunt.table import Row, border_of, merge_rows, read_rows, report, upper_limit
-from tools.hunt.trial import run
+from tools.hunt.trial import draw, family_of, run, true_robot
+from tools.hunt.world import DURATION_S, at_s
 
+STEREO_SEED = 211
 BORDER = Path(__file__).with_name("border.txt")
 
 
@@ -32,6 +36,16 @@ def test_rows_come_back_from_the_table_as_they_were(tmp_path: Path) -> None:
     merge_rows(tmp_path / "t.csv", rows[1:])
     merge_rows(tmp_path / "t.csv", rows)
     assert read_rows(tmp_path / "t.csv") == rows
+
+
+def test_rows_of_a_table_from_before_stereo_depth_still_load(tmp_path: Path) -> None:
+    head = "seed,index,family,kind,strength,mode,outcome,clearance,observable,rule,reason"
+    (tmp_path / "t.csv").write_text(f"{head}\n0,1,benign,none,0.5,audit,safe,0.1,True,seen before,\n")
+    assert read_rows(tmp_path / "t.csv") == [row()]
+    slim = row(index=2, robot="slim cable", spread=0.05, fattening=2.5)
+    merge_rows(tmp_path / "t.csv", [slim])
+    assert read_rows(tmp_path / "t.csv") == [row(), slim]
+    assert "slim cable" in "\n".join(report([row(), slim]))
 
 
 def test_the_upper_limit_of_no_failure_in_two_thousand_is_fifteen_in_ten_thousand() -> None:
@@ -96,3 +110,18 @@ def test_no_run_near_the_border_is_a_false_green(seed: int, index: int) -> None:
 def test_a_run_is_the_same_twice() -> None:
     seed, index = border()[0]
     assert run(seed, index) == run(seed, index)
+
+
+def test_a_run_with_stereo_depth_is_the_same_twice_and_its_truth_is_that_of_what_is_seen(tmp_path: Path) -> None:
+    model = true_robot(tmp_path)
+    chosen = (index for index in range(60) if draw_body(STEREO_SEED, index, family_of(STEREO_SEED, index)).parts)
+    trial = next(t for t in (draw(STEREO_SEED, index, model) for index in chosen) if t.mode == "audit")
+    found = run(STEREO_SEED, trial.index)
+    assert found == run(STEREO_SEED, trial.index)
+    world = trial.world
+    assert found.robot == f"slim {world.body.parts[0]}" and found.spread > 0
+    arms = (TrueArm(model, world.tool, body) for body in (world.body, Body()))
+    seen, collides = (
+        least_clearance(arm, world.primitives, world.positions, at_s(0), at_s(DURATION_S))[0] for arm in arms
+    )
+    assert found.clearance == pytest.approx(seen, abs=TOLERANCE) and seen != pytest.approx(collides, abs=1e-3)

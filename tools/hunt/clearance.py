@@ -1,6 +1,6 @@
 """The exact clearance of the arm's true surface, between the samples of a motion too.
 
-The arm is its capsules and blocks (`simulate.arm.SHAPES`), the scene is primitives; all are convex, so that the
+The arm is the capsules and blocks of its body, the scene is primitives; all are convex, so that the
 signed distance to a primitive is a convex function along a capsule's axis and over a block.
 """
 
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.simulate.arm import BASE, SHAPES, Block, Capsule
+from splatctrl_cli.simulate.arm import BASE, Block, Capsule
 from splatctrl_cli.simulate.primitives import Primitive, closest_point, signed_distance
+from tools.hunt.body import Body
 
 GOLDEN = (np.sqrt(5) - 1) / 2
 NUM_GOLDEN = 22  # steps: 3e-5 of a capsule's length
@@ -29,11 +30,11 @@ Positions = Callable[[Stamps], Float64]
 class TrueArm:
     """The surfaces of the moving links of the arm whose kinematics `urdf` has.
 
-    tool: a further capsule on the hand, which no model knows of.
+    tool: a further capsule on the hand, which no model knows of. body: how it looks, by default as it collides.
     """
 
-    def __init__(self, model: RobotModel, tool: Capsule | None = None) -> None:
-        shapes = [(link, shape) for link in SHAPES if link != BASE for shape in SHAPES[link]]
+    def __init__(self, model: RobotModel, tool: Capsule | None = None, body: Body | None = None) -> None:
+        shapes = [(link, shape) for link, shape in (body or Body()).solids if link != BASE]
         if tool is not None:
             shapes.append(("hand", tool))
         capsules = [(link, shape) for link, shape in shapes if isinstance(shape, Capsule)]

@@ -7,7 +7,7 @@ import numpy as np
 
 from splatctrl_cli.geometry import rotation_from_quat
 from splatctrl_cli.records import Float64, SphereSet
-from splatctrl_cli.simulate.arm import JOINTS, SHAPES, arm_urdf, covering_spheres
+from splatctrl_cli.simulate.arm import JOINTS, SHAPES, Block, Capsule, arm_urdf, covering_spheres
 
 NUM_JOINTS = len(JOINTS)
 
@@ -82,9 +82,9 @@ class Fault:
             or self.spheres_shrunk > 0
         )
 
-    def urdf(self) -> str:
-        """The URDF that the tool is given."""
-        text = arm_urdf()
+    def urdf(self, visual: Mapping[str, tuple[Capsule | Block, ...]] = SHAPES) -> str:
+        """The URDF that the tool is given, of an arm that is seen by `visual` shapes."""
+        text = arm_urdf(visual)
         if self.longer is None:
             return text
         joint, by = self.longer

@@ -4,7 +4,7 @@
    same surface.
 2. Clocks: an image of a wrong camera shows the arm while it moves.
 3. The robot's model: too few or too small spheres always (the URDF has the surface); what else is wrong with the
-   model or the joints only where images show the arm.
+   model or the joints, and a part that it has not, only where images show the arm.
 4. The target: what stands there from the beginning has returned depth in two frame sets (or the only one) before
    the arm came nearest; or it is wide (4 cm), returns none, and is a hole in two frame sets, with depth of other
    things all around it; or no image shows it, and it is so wide that it stands in unknown space. Disclaimed is what
@@ -67,7 +67,7 @@ def _of_fault(draft: Draft, world: World, shown: Shown) -> Observable:
     if late and not _sees_arm(shown, rows, moves):
         return Observable(holds=False, rule="no image of the arm while it moves")
     is_of_spheres = fault.spheres_kept < 1 or fault.spheres_shrunk > 0
-    is_of_model = (fault.is_of_model and not is_of_spheres) or world.tool is not None
+    is_of_model = (fault.is_of_model and not is_of_spheres) or world.tool is not None or bool(world.body.parts)
     if is_of_model and not _sees_arm(shown, list(range(len(shown.cameras))), moves):
         return Observable(holds=False, rule="no image of the arm")
     return Observable(holds=True, rule="")

@@ -7,18 +7,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatctrl_cli.geometry import back_project, frame_along, invert_transform, pose_at, project, transform_points
+from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
 from splatctrl_cli.logs.mcap_writer import mcap_log
 from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.simulate.arm import SHAPES, Block, Capsule
+from splatctrl_cli.simulate.arm import Block, Capsule, link_shape
 from splatctrl_cli.simulate.depth_camera import DepthNoise
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.recording import JOINT_RATE, OPTICAL_FROM_LINK, START_NS
 from splatctrl_cli.simulate.render import Camera, Renderer
 from splatctrl_cli.simulate.tabletop import PALETTE
 from tools.hunt.faults import Fault
-from tools.hunt.world import DURATION_S, FPS, HEIGHT, NS, NUM_FRAMES, WIDTH, World, at_s
+from tools.hunt.world import DURATION_S, FPS, NS, NUM_FRAMES, World, at_s
 
 PATCH = 3  # [px] over which the noise of depth agrees
 RING = 3  # [px]
@@ -58,7 +58,7 @@ class Recorder:
         self._arm, self._target, self._outline, self._hole, self._depth = (
             np.zeros(shape, dtype=np.int64) for _ in range(5)
         )
-        self._first: list[Float32] = [np.zeros((HEIGHT, WIDTH), np.float32)] * len(self._names)
+        self._first: list[Float32] = [np.zeros((0, 0), np.float32)] * len(self._names)
 
     def write(self, path: Path) -> Shown:
         """Write the log, and say what it shows."""
@@ -125,12 +125,7 @@ class Recorder:
         color, exact = renderer.image([*arm, *targets])
         without_target, without_arm = renderer.depth(arm), renderer.depth(targets)
         is_target, is_arm = _nearer(exact, without_target), _nearer(exact, without_arm)
-        noise = DepthNoise(patch=PATCH, edge=np.inf, max_range=fault.max_range)
-        measured = noise.applied(exact, np.random.default_rng([*self._seed, number, index]))
-        with_edges = replace(noise, edge=fault.edge).applied(
-            exact, np.random.default_rng([*self._seed, number, index])
-        )
-        measured = np.where(rng.random(exact.shape) < fault.edge_share, with_edges, measured)
+        measured = self._measured(exact, camera, (*self._seed, number, index), rng)
         measured = np.where(is_target & _lost(fault, exact.shape, rng), 0, measured)
         if camera.name == WRIST:
             measured = np.where(measured < NEAREST, 0, measured)
@@ -161,13 +156,24 @@ class Recorder:
             human=human,
         )
 
+    def _measured(self, exact: Float32, camera: Camera, seed: tuple[int, ...], rng: np.random.Generator) -> Float32:
+        """Depth (H, W) [m] as the camera measures it, holes and edges of the fault included."""
+        fault, stereo = self._fault, self._world.body.depth
+        noise = DepthNoise(patch=PATCH, edge=np.inf, max_range=fault.max_range)
+        nearly = noise.applied(exact, np.random.default_rng(seed))
+        with_edges = replace(noise, edge=fault.edge).applied(exact, np.random.default_rng(seed))
+        nearly = np.where(rng.random(exact.shape) < fault.edge_share, with_edges, nearly)
+        if stereo is None:
+            return nearly
+        measured = stereo.applied(exact, np.random.default_rng(seed), focal=camera.intrinsics.fx)
+        is_lost = (measured > fault.max_range) | ((nearly == 0) & (fault.edge_share == 1.0))
+        return np.where(is_lost, 0, measured).astype(np.float32)
+
     def _arm_solids(self, q: Float64) -> list[Primitive]:
-        solids = []
-        for link, shapes in SHAPES.items():
-            T_world_link = self._model.frame_pose(q, link)
-            tools = [self._world.tool] if link == "hand" and self._world.tool is not None else []
-            solids += [_solid(link, shape, T_world_link) for shape in (*shapes, *tools)]
-        return solids
+        tools = [] if self._world.tool is None else [("hand", self._world.tool)]
+        solids = [*self._world.body.solids, *tools]
+        poses = {link: self._model.frame_pose(q, link) for link in dict.fromkeys(link for link, _ in solids)}
+        return [_solid(link, shape, poses[link]) for link, shape in solids]
 
     def _camera_transforms(self) -> list[tuple[str, str, Float64]]:
         transforms: list[tuple[str, str, Float64]] = [("world", "link0", np.eye(4))]
@@ -199,7 +205,7 @@ def _num_seen(camera: Camera, depth: Float32, points_world: Float64) -> int:
     points = transform_points(invert_transform(camera.T_world_camera), points_world)
     points = points[points[:, 2] > 0.05]
     pixels = np.rint(project(camera.intrinsics, points)).astype(np.int64)
-    inside = np.all((pixels >= 0) & (pixels < [WIDTH, HEIGHT]), axis=1)
+    inside = np.all((pixels >= 0) & (pixels < depth.shape[::-1]), axis=1)
     measured = depth[pixels[inside, 1], pixels[inside, 0]]
     return int(np.count_nonzero(np.abs(measured - points[inside, 2]) < SAME_SURFACE))
 
@@ -227,13 +233,9 @@ def _lost(fault: Fault, shape: tuple[int, ...], rng: np.random.Generator) -> np.
 
 
 def _solid(link: str, shape: Capsule | Block, T_world_link: Float64) -> Primitive:
-    if isinstance(shape, Block):
-        T = T_world_link @ pose_at(shape.middle)
-        return Primitive(name=link, kind="box", size=shape.size, T_world_shape=T, texture=ARM_TEXTURE)
-    start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
-    T = T_world_link @ pose_at((start + end) / 2, frame_along(end - start))
-    size = (shape.radius, float(np.linalg.norm(end - start)))
-    return Primitive(name=link, kind="capsule", size=size, T_world_shape=T, texture=ARM_TEXTURE)
+    solid = link_shape(link, shape)
+    T = T_world_link @ solid.T_link_shape
+    return Primitive(name=link, kind=solid.kind, size=solid.size, T_world_shape=T, texture=ARM_TEXTURE)
 
 
 def _order(record: Record) -> tuple[int, int, str]:

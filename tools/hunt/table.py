@@ -62,7 +62,7 @@ def report(rows: Sequence[Row]) -> list[str]:
             there = Counter(row.outcome for row in mine if truth_of(row) == truth)
             head = f"{family:10s} {len(mine):5d}" if truth == TRUTHS[0] else " " * 16
             lines.append(f"{head} {truth:>8s} " + " ".join(f"{there[word]:13d}" for word in OUTCOMES))
-    return [*lines, "", *_greens(rows), "", *_nearest(rows), "", *_benign(rows), "", *_why(rows)]
+    return [*lines, "", *_greens(rows), "", *_nearest(rows), "", *_benign(rows), "", *_why(rows), "", *_bodies(rows)]
 
 
 def border_of(rows: Sequence[Row]) -> list[Row]:
@@ -115,6 +115,18 @@ def _why(rows: Sequence[Row]) -> list[str]:
     ]
 
 
+def _bodies(rows: Sequence[Row]) -> list[str]:
+    """By how the arm looks: what became of runs that are truly clear, and of the others."""
+    lines = [f"{'robot':16s} {'truth':>8s} {'runs':>5s} " + " ".join(f"{word:>13s}" for word in OUTCOMES)]
+    for robot in sorted({row.robot for row in rows}):
+        for truth in TRUTHS:
+            mine = [row for row in rows if row.robot == robot and truth_of(row) == truth]
+            there = Counter(row.outcome for row in mine)
+            counts = " ".join(f"{there[word]:13d}" for word in OUTCOMES)
+            lines.append(f"{robot or 'plain':16s} {truth:>8s} {len(mine):5d} {counts}")
+    return lines
+
+
 def _criterion(row: Row) -> str:
     """What stands before the reason's colon."""
     return row.reason.partition(":")[0] or "none"
@@ -149,4 +161,7 @@ def _row(entry: dict[str, str]) -> Row:
         observable=entry["observable"] == "True",
         rule=entry["rule"],
         reason=entry["reason"],
+        robot=entry.get("robot") or "",  # not in tables of before
+        spread=float(entry.get("spread") or 0.0),
+        fattening=float(entry.get("fattening") or 0.0),
     )

@@ -1,5 +1,6 @@
 """One run: drawn from its seed, recorded, reconstructed, replayed, and its verdict put beside the truth."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -27,6 +28,7 @@ from splatctrl_cli.simulate.arm import Motion, arm_spheres_yaml, arm_urdf
 from splatctrl_cli.simulate.primitives import Primitive, Track
 from splatctrl_cli.simulate.render import Camera
 from splatctrl_cli.sources.source import open_source
+from tools.hunt.body import draw_body
 from tools.hunt.clearance import TOLERANCE, Positions, TrueArm, interpolated, least_clearance
 from tools.hunt.families import FAMILIES, LATER, ORDER, Draft
 from tools.hunt.faults import spheres_yaml
@@ -70,7 +72,10 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What came of one run: the verdict, its first reason, and the truth [m]."""
+    """What came of one run: the verdict, its first reason, and the truth [m].
+
+    robot: the words of its body; spread, fattening [px]: of its stereo depth, 0 where depth is nearly exact.
+    """
 
     seed: int
     index: int
@@ -83,6 +88,9 @@ class Row:
     observable: bool
     rule: str
     reason: str
+    robot: str = ""
+    spread: float = 0.0
+    fattening: float = 0.0
 
     @property
     def name(self) -> str:
@@ -105,11 +113,11 @@ def draw(seed: int, index: int, model: RobotModel) -> Trial:
     """The run of a seed and an index; the same for the same two."""
     rng, family = np.random.default_rng([seed, index]), family_of(seed, index)
     contact, margin = SHARES.get(family, OTHER_SHARES)
-    wish = rng.random()
+    wish, body = rng.random(), draw_body(seed, index, family)
     for _ in range(60):
         draft = FAMILIES[family](rng)
-        arm = TrueArm(model, draft.tool)
-        everywhere = draw_cameras(rng)
+        arm = TrueArm(model, draft.tool, body)
+        everywhere = draw_cameras(rng, body.width)
         motion = draw_motion(rng, model, arm, everywhere)
         cameras = tuple(_seen_from(camera, draft) for camera in everywhere if camera.name in draft.cameras)
         if wish < contact:
@@ -118,7 +126,7 @@ def draw(seed: int, index: int, model: RobotModel) -> Trial:
             clearance = float(rng.uniform(0.0, 0.02) if wish < contact + margin else rng.uniform(0.045, 0.15))
         second = draft.second if draft.second is not None else float(rng.uniform(1.2, 2.7))
         if draft.carried is not None:
-            targets: Made = (_carried(draft, motion, model),)
+            targets: Made = (_carried(draft, motion, model, body.palm),)
         else:
             found = placed(rng, draft.make, motion, arm, cameras, clearance=clearance, second=second)
             start = motion.at(0.0)[0][None]
@@ -132,8 +140,9 @@ def draw(seed: int, index: int, model: RobotModel) -> Trial:
             things=draw_things(rng, motion, arm),
             targets=targets,
             cameras=cameras,
-            wrist=wrist_camera() if draft.has_wrist else None,
+            wrist=wrist_camera(body.width) if draft.has_wrist else None,
             tool=draft.tool,
+            body=body,
             people=draft.people,
         )
         is_driven = (rng.random() < CLOSED_SHARE or draft.only_closed) and not draft.only_audit
@@ -148,7 +157,8 @@ def run(seed: int, index: int, device: str = "cpu") -> Row:
         folder = Path(name)
         model = true_robot(folder)
         trial = draw(seed, index, model)
-        arm = TrueArm(model, trial.world.tool)
+        body = trial.world.body
+        arm = TrueArm(model, trial.world.tool, body)
         shown = record(trial, model, folder)
         evidence = _evidence(trial, arm, shown)
         outcome, result = _judged(trial, folder, device)
@@ -165,6 +175,9 @@ def run(seed: int, index: int, device: str = "cpu") -> Row:
         observable=evidence.holds,
         rule=evidence.rule,
         reason=outcome.reason,
+        robot=body.words,
+        spread=0.0 if body.depth is None else body.depth.spread,
+        fattening=0.0 if body.depth is None else body.depth.fattening[1],
     )
 
 
@@ -179,7 +192,7 @@ def true_robot(folder: Path) -> RobotModel:
 def record(trial: Trial, model: RobotModel, folder: Path) -> Shown:
     """Write what the tool is given: log.mcap, robot.urdf, robot.yaml."""
     fault, rng = trial.draft.fault, np.random.default_rng([trial.seed, trial.index, 1])
-    (folder / "robot.urdf").write_text(fault.urdf(), encoding="utf-8")
+    (folder / "robot.urdf").write_text(fault.urdf(trial.world.body.shapes), encoding="utf-8")
     (folder / "robot.yaml").write_text(spheres_yaml(fault.spheres(rng)), encoding="utf-8")
     recorder = Recorder(trial.world, fault, model, (trial.seed, trial.index, 2))
     return recorder.write(folder / "log.mcap")
@@ -272,13 +285,13 @@ def _evidence(trial: Trial, arm: TrueArm, shown: Shown) -> Observable:
     )
 
 
-def _carried(draft: Draft, motion: Motion, model: RobotModel) -> Primitive:
+def _carried(draft: Draft, motion: Motion, model: RobotModel, palm: float) -> Primitive:
     """The target in the hand, 3 mm into the palm, along the hand's z axis."""
     assert draft.carried is not None
     radius, length = draft.carried
     (solid,) = draft.make(np.zeros(3))
     seconds = np.arange(0.0, DURATION_S + 0.02, 0.02)
-    T_hand_target = pose_at([0.0, 0.0, 0.066 + radius + length / 2 - 0.003])
+    T_hand_target = pose_at([0.0, 0.0, palm + radius + length / 2 - 0.003])
     poses = np.array([model.frame_pose(motion.at(float(s))[0], "hand") @ T_hand_target for s in seconds])
     track = Track(stamp_ns=np.array([at_s(float(s)) for s in seconds]), T_world_shape=poses)
     return replace(solid, T_world_shape=poses[0], track=track)
@@ -306,7 +319,8 @@ def _quick() -> Iterator[None]:
 def _coverage(
     urdf: UrdfFile, solids: Mapping[str, Sequence[Solid]], spheres: SphereSet, **options: float
 ) -> CoverageReport:
-    key = (urdf.text, spheres.links, spheres.centers.tobytes(), spheres.radii.tobytes())
+    collides = re.sub("<visual>.*?</visual>", "", urdf.text, flags=re.DOTALL)
+    key = (collides, spheres.links, spheres.centers.tobytes(), spheres.radii.tobytes())
     if key not in _COVERAGES:
         _COVERAGES.clear()
         _COVERAGES[key] = coverage_of_solids(urdf, solids, spheres, **options)

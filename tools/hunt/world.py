@@ -1,7 +1,7 @@
 """What is truly there: a table with things on it, the arm's motion, and one target placed at a chosen clearance."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,13 +21,13 @@ from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture, Track
 from splatctrl_cli.simulate.recording import START_NS
 from splatctrl_cli.simulate.render import Camera
 from splatctrl_cli.simulate.tabletop import PALETTE
+from tools.hunt.body import WIDTH, Body
 from tools.hunt.clearance import Stamps, TrueArm
 
 BOX = Box(lower=np.array([-0.30, -0.70, -0.06]), upper=np.array([0.95, 0.70, 1.00]))
 DURATION_S = 3.2
 FPS = 5.0
 NUM_FRAMES = round(DURATION_S * FPS)
-WIDTH, HEIGHT = 96, 72
 CENTRE = np.array([-0.1, 0.1, 0.0, -1.9, 0.0, 2.1, 0.4])  # [rad] about which starts are drawn
 SPREAD = np.array([0.9, 0.35, 0.4, 0.4, 0.5, 0.4, 0.8])
 TURN = np.array([0.8, 0.35, 0.3, 0.35, 0.4, 0.4, 0.6])  # [rad] from start to end at most
@@ -43,7 +43,7 @@ class World:
     """The truth of one run: `things` stand from beginning to end, `targets` are what the family is about.
 
     wrist: a camera on the hand, its pose that in the hand's frame. tool: a capsule on the true arm's hand that no
-    model has. people: names of the targets that masks show.
+    model has. body: how the arm looks and is measured. people: names of the targets that masks show.
     """
 
     motion: Motion
@@ -52,6 +52,7 @@ class World:
     cameras: tuple[Camera, ...]
     wrist: Camera | None = None
     tool: Capsule | None = None
+    body: Body = field(default_factory=Body)
     people: frozenset[str] = frozenset()
 
     @property
@@ -109,11 +110,11 @@ def draw_motion(rng: np.random.Generator, model: RobotModel, arm: TrueArm, camer
     raise RuntimeError("no motion found")
 
 
-def draw_cameras(rng: np.random.Generator) -> tuple[Camera, ...]:
-    """Three cameras about the table, none where another draw has it."""
-    focal = 1.0 * WIDTH
+def draw_cameras(rng: np.random.Generator, width: int = WIDTH) -> tuple[Camera, ...]:
+    """Three cameras about the table, none where another draw has it; width [px] of their images."""
+    focal, height = 1.0 * width, 3 * width // 4
     k = Intrinsics(
-        fx=focal, fy=focal, cx=(WIDTH - 1) / 2 + 0.7, cy=(HEIGHT - 1) / 2 - 0.6, width=WIDTH, height=HEIGHT
+        fx=focal, fy=focal, cx=(width - 1) / 2 + 0.7, cy=(height - 1) / 2 - 0.6, width=width, height=height
     )
     places = (((1.15, -0.15, 0.95), 0.12), ((0.15, -0.90, 0.85), 0.12), ((0.20, 0.95, 0.90), 0.12))
     return tuple(
@@ -130,10 +131,11 @@ def draw_cameras(rng: np.random.Generator) -> tuple[Camera, ...]:
     )
 
 
-def wrist_camera() -> Camera:
+def wrist_camera(width: int = WIDTH) -> Camera:
     """Beside the hand, looking past the fingers; T_world_camera is T_hand_camera."""
+    height = 3 * width // 4
     k = Intrinsics(
-        fx=0.8 * WIDTH, fy=0.8 * WIDTH, cx=(WIDTH - 1) / 2, cy=(HEIGHT - 1) / 2, width=WIDTH, height=HEIGHT
+        fx=0.8 * width, fy=0.8 * width, cx=(width - 1) / 2, cy=(height - 1) / 2, width=width, height=height
     )
     T_hand_camera = look_at(np.array([0.09, 0.0, -0.02]), np.array([0.02, 0.0, 0.35]))
     return Camera(name="wrist", intrinsics=k, T_world_camera=T_hand_camera, is_training=True)
