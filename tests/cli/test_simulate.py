@@ -10,6 +10,7 @@ from rosbags.highlevel import AnyReader
 
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.arm import SLIM, arm_urdf
 from splatctrl_cli.simulate.truth import load_truth
 from tests.cli import here
 from tests.cli.test_command_line import splatctrl
@@ -109,6 +110,37 @@ def test_depth_is_in_millimetres_and_camera_info_is_that_of_the_truth(recorded: 
     assert 600 < np.median(millimetres[millimetres > 0]) < 2000
     assert depth.header.frame_id == "cam1_optical_frame"
     np.testing.assert_array_equal(messages["/cam1/color/camera_info"].k, [k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1])
+
+
+def test_a_slim_arm_with_a_tool_has_its_collision_shapes_in_the_urdf_and_the_tool_in_the_truth_alone(
+    recorded: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "slim"
+    parts = ("--slim", "--unmodelled", "tool,cable", "--noise", "stereo")
+    result = here.splatctrl("simulate", "-o", out, *TINY, *parts, "-q")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert (out / "robot.urdf").read_text() == arm_urdf(SLIM)
+    assert (out / "robot_spheres.yaml").read_bytes() == (recorded / "robot_spheres.yaml").read_bytes()
+    document = json.loads((out / "truth.json").read_text())
+    assert document["clearance"]["of"] == "moving collision spheres, tool, cable to everything present but the robot"
+    assert load_truth(out / "truth.json").unmodelled == ("tool", "cable")
+    assert load_truth(recorded / "truth.json").unmodelled == ()
+    config = json.loads((out / "run.json").read_text())["config"]
+    assert (config["is_slim"], config["unmodelled"], config["noise"]) == (True, ["tool", "cable"], "stereo")
+    assert "is_slim" not in json.loads((recorded / "run.json").read_text())["config"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--unmodelled", "arm"), "--unmodelled arm: expected some of: tool, cable, bracket"),
+        (("--slim", "--urdf", "robot.urdf"), "--slim, --unmodelled: expected the simulated arm, got --urdf"),
+    ],
+)
+def test_parts_of_another_arm_are_refused(tmp_path: Path, options: tuple[str, ...], message: str) -> None:
+    result = here.splatctrl("simulate", "-o", tmp_path / "out", *TINY, *options)
+    assert result.returncode == 2 and message in result.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_persons_arm_is_in_the_log_and_moves_in_the_truth(tmp_path: Path) -> None:
