@@ -49,5 +49,5 @@ $(RUNS): pyproject.toml constraints.txt CMakeLists.txt $(wildcard splatctrl_cli/
 
 $(STAMP): $(RUNS)
 	$(PIP) install -q -c constraints.txt torch==2.13.0
-	$(PIP) install -q --no-build-isolation -c constraints.txt -e '.[dev]'
+	$(PIP) install -q --no-build-isolation -c constraints.txt -e '.[dev,sim]'
 	touch $(STAMP)

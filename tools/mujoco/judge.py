@@ -28,6 +28,7 @@ Clearances = Callable[[Path, Floats, Floats], tuple[Floats, Floats]]
 
 EPOCH_NS = 1_760_000_000 * 10**9  # stamp of the truth's time 0
 OVER_MM, NEAR_MM = 8.0, 100.0
+REACH_MM = 300.0  # up to which the truth is measured
 NUM_CHARACTERS = 120  # of a reason
 SCENE = "scene"
 OUTCOME_OF = {"passed": SAFE, "failed": FAILED, "not evaluable": NOT_EVALUABLE}
@@ -188,10 +189,11 @@ def compare(row: Row, motion: Motion, truth: Truth) -> Row:
         num_states=len(motion.t),
         num_true_below=int((truth.visual < MARGIN_MM).sum()),
     )
-    known = np.isfinite(motion.said)
+    said = np.minimum(motion.said, REACH_MM)
+    known = np.isfinite(said)
     if not known.any():
         return row
-    errors = (motion.said - truth.visual)[known]
+    errors = (said - truth.visual)[known]
     overs = errors[truth.visual[known] < NEAR_MM]
     worst = int(np.nanargmin(motion.said))
     return replace(
