@@ -22,7 +22,7 @@ from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.truth import distance_to, load_truth
 from splatctrl_cli.sources.source import open_source
-from tests.robot.shapes import written
+from tests.robot.shapes import collada, written
 
 OPTIONS = RecordingOptions(duration_s=3.0, fps=1.0, width=64, height=48, noise="none", color_rays=0)
 FINGERS = "".join(
@@ -100,23 +100,6 @@ def test_the_same_options_give_the_same_bytes(simulated: Path, arm: Path, tmp_pa
     simulate(SimulateRequest(out=tmp_path / "again", urdf=arm, options=OPTIONS))
     for name in ("log.mcap", "truth.json", "robot.urdf"):
         assert (tmp_path / "again" / name).read_bytes() == (simulated / name).read_bytes(), name
-
-
-COLLADA = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset><library_geometries><geometry id="g"><mesh>
-<source id="p"><float_array id="a" count="{count}">{numbers}</float_array><technique_common>
-<accessor source="#a" count="{vertices}" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
-<param name="Z" type="float"/></accessor></technique_common></source><vertices id="v"><input semantic="POSITION"
-source="#p"/></vertices><triangles count="{faces}"><input semantic="VERTEX" source="#v" offset="0"/><p>{indices}</p>
-</triangles></mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s"><node>
-<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes><scene>
-<instance_visual_scene url="#s"/></scene></COLLADA>"""
-
-
-def collada(mesh: trimesh.Trimesh) -> str:
-    numbers, indices = (" ".join(map(str, values.ravel().tolist())) for values in (mesh.vertices, mesh.faces))
-    sizes = {"count": mesh.vertices.size, "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-    return COLLADA.format(numbers=numbers, indices=indices, **sizes)
 
 
 NAMES = ("visual/seen", "forearm")

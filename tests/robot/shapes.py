@@ -122,3 +122,21 @@ def flange(q: Float64) -> Float64:
         c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
         T = T @ np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]])
     return T
+
+
+COLLADA = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset><library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="{count}">{numbers}</float_array><technique_common>
+<accessor source="#a" count="{vertices}" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source><vertices id="v"><input semantic="POSITION"
+source="#p"/></vertices><triangles count="{faces}"><input semantic="VERTEX" source="#v" offset="0"/><p>{indices}</p>
+</triangles></mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s"><node>
+<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes><scene>
+<instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+def collada(mesh: trimesh.Trimesh) -> str:
+    """The mesh as COLLADA text, in metres."""
+    numbers, indices = (" ".join(map(str, values.ravel().tolist())) for values in (mesh.vertices, mesh.faces))
+    sizes = {"count": mesh.vertices.size, "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    return COLLADA.format(numbers=numbers, indices=indices, **sizes)

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.robot.link_meshes import SolidDistance, read_solids
+from splatctrl_cli.robot.link_meshes import SolidDistance, load_visual, read_solids
 from splatctrl_cli.robot.urdf import read_urdf
-from tests.robot.shapes import BALL, BOX, ROD, arm_of, l_shape, written
+from tests.robot.shapes import BALL, BOX, ROD, arm_of, collada, l_shape, written
 
 
 def box_distance(p: np.ndarray) -> np.ndarray:
@@ -127,3 +127,15 @@ def test_a_flat_open_mesh_has_no_inside(tmp_path: Path) -> None:
     (solid,) = read_solids(read_urdf(written(tmp_path, arm_of('<mesh filename="sheet.stl"/>', BALL))))["base"]
     assert solid.body is None
     np.testing.assert_allclose(SolidDistance([solid])(np.array([[0.2, 0.2, 0.3]])), [0.3])
+
+
+def test_a_visual_mesh_is_read_from_collada_in_its_unit(tmp_path: Path) -> None:
+    text = collada(trimesh.creation.box((1, 2, 3)))
+    for unit in ("1", "0.001"):
+        (tmp_path / "box.dae").write_text(text.replace('meter="1"', f'meter="{unit}"'))
+        mesh = load_visual(tmp_path / "box.dae")
+        np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), float(unit) * np.array([1, 2, 3]), rtol=1e-6)
+        assert len(mesh.faces) == 12
+    (tmp_path / "box.dae").write_text(text[:300])
+    with pytest.raises(InputError, match=r"box\.dae: expected a COLLADA mesh, got ParseError"):
+        load_visual(tmp_path / "box.dae")

@@ -8,8 +8,8 @@ import pytest
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.urdf import read_urdf
-from tests.robot.shapes import BALL, BOX, arm_of, written
+from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
+from tests.robot.shapes import BALL, BOX, ROD, arm_of, written
 
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
 NO_SPHERES = SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
@@ -91,3 +91,11 @@ def test_the_hand_of_a_real_arm_moves_with_its_last_link(real_data: Path) -> Non
     np.testing.assert_allclose(T[:3, 3], [0, 0, 0.107], atol=1e-12)
     assert T[0, 0] == pytest.approx(np.cos(np.pi / 4))
     assert bodies["fr3_leftfinger"][0] == "fr3_leftfinger"
+
+
+def test_a_robot_is_seen_by_its_visual_geometry_and_where_it_has_none_by_what_collides(tmp_path: Path) -> None:
+    visual = f'<link name="base"><visual><geometry>{ROD}</geometry></visual>'
+    text = arm_of(BOX, BALL).replace('<link name="base">', visual)
+    urdf = read_urdf(written(tmp_path, text))
+    assert [(s.link, s.kind) for s in urdf.shapes] == [("base", "box"), ("tip", "sphere")]
+    assert [(s.link, s.kind) for s in visual_urdf(urdf).shapes] == [("base", "cylinder"), ("tip", "sphere")]
