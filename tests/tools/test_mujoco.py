@@ -1,0 +1,277 @@
+"""Recordings made by MuJoCo: their truth, their images, what their sensors measure, and the logs that they write."""
+
+import ast
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+os.environ.setdefault("MUJOCO_GL", "egl")
+mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install -e '.[sim]'")
+
+from scipy.spatial.transform import Rotation  # noqa: E402
+
+from splatctrl_cli.cli.main import main  # noqa: E402
+from tools.mujoco import recording  # noqa: E402
+from tools.mujoco.cell import Cell, Lens, as_piece  # noqa: E402
+from tools.mujoco.depth import COUNT, DEPTH_LENS, Laser, Stereo, aligned  # noqa: E402
+from tools.mujoco.images import Camera, Studio, views_of  # noqa: E402
+from tools.mujoco.poses import Float64, inverse, look_at, moved, pose, turn_rpy  # noqa: E402
+from tools.mujoco.robots import ROBOTS, load_robot  # noqa: E402
+from tools.mujoco.solids import Solid, Track, fixed, frusta, signed_distance  # noqa: E402
+from tools.mujoco.stage import bottle, room  # noqa: E402
+from tools.mujoco.topics import FORMATS, log_name, opened_log  # noqa: E402
+from tools.mujoco.truth import Body, World, clearance_of, load_world, mujoco_difference  # noqa: E402
+
+PACKAGE = Path(recording.__file__).parent
+LENS = Lens(fx=610.0, fy=612.0, cx=322.5, cy=236.0)
+SOLIDS = (
+    Solid(name="box", kind="box", size=(0.1, 0.05, 0.2), track=fixed(np.eye(4))),
+    Solid(name="cylinder", kind="cylinder", size=(0.08, 0.2), track=fixed(np.eye(4))),
+    Solid(name="ball", kind="ball", size=(0.12,), track=fixed(np.eye(4))),
+    Solid(name="capsule", kind="capsule", size=(0.06, 0.15), track=fixed(np.eye(4))),
+    Solid(name="bottle", kind="lathe", profile=bottle(0.06, 0.25), track=fixed(np.eye(4))),
+)
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Iterator[None]:
+    """A renderer, or a skip that says so."""
+    try:
+        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception as error:
+        pytest.skip(f"no renderer: MUJOCO_GL={os.environ['MUJOCO_GL']}: {type(error).__name__}: {error}")
+    yield
+
+
+def test_nothing_of_the_judge_imports_the_tool() -> None:
+    for path in PACKAGE.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not [name for name in names if name.split(".")[0] == "splatctrl_cli"], path
+
+
+@pytest.mark.parametrize("solid", SOLIDS, ids=lambda solid: solid.name)
+def test_a_distance_is_that_of_the_nearest_of_many_surface_points(solid: Solid) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.35, 0.35, (25, 3))
+    triangles = as_piece(solid).triangles
+    area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+    chosen = rng.choice(len(triangles), 200_000, p=area / area.sum())
+    weights = rng.dirichlet(np.ones(3), len(chosen))
+    surface = np.einsum("nk,nki->ni", weights, triangles[chosen])
+    nearest = np.array([np.linalg.norm(surface - point, axis=1).min() for point in points])
+    distance, slope = signed_distance(solid, points)
+    np.testing.assert_allclose(np.abs(distance), nearest, atol=2e-3)
+    step = 1e-6
+    for axis in range(3):
+        shift = step * np.eye(3)[axis]
+        change = (signed_distance(solid, points + shift)[0] - signed_distance(solid, points - shift)[0]) / (2 * step)
+        assert np.median(np.abs(change - slope[:, axis])) < 1e-6
+
+
+def test_outside_of_a_bottle_its_distance_is_the_least_of_its_frusta() -> None:
+    points = np.random.default_rng(1).uniform(-0.3, 0.3, (5000, 3))
+    distance = signed_distance(SOLIDS[-1], points)[0]
+    parts = np.min([signed_distance(part, points)[0] for part in frusta(SOLIDS[-1])], axis=0)
+    np.testing.assert_allclose(parts[distance > 0], distance[distance > 0], atol=1e-12)
+    assert (parts[distance < 0] < 0).all()
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_clearance_agrees_with_a_dense_sample_and_with_mujoco(name: str) -> None:
+    robot = load_robot(name)
+    rng = np.random.default_rng(len(name))
+    q = np.array([rng.uniform(robot.description.low, robot.description.high)])
+    places = [pose((0.45, 0.2 * k - 0.3, 0.45), turn_rpy(rng.uniform(-1, 1, 3))) for k in range(len(SOLIDS))]
+    solids = tuple(replace(s, track=fixed(T)) for s, T in zip(SOLIDS, places, strict=True))
+    world = World(robot=robot, solids=solids)
+    seen, _ = world.clearances(np.zeros(1), q)
+    poses = Cell(robot, (), ()).link_poses(q)
+    for column, solid in enumerate(solids):
+        points = np.concatenate([moved(poses[link][0], _sampled(body, rng)) for link, body in world.seen().items()])
+        near = signed_distance(solid, moved(inverse(solid.track.poses[0]), points))[0].min()
+        assert -1e-4 <= min(near, 0.3) - seen.per[0, column] < 2.5e-3, (solid.name, near, seen.per[0, column])
+    assert mujoco_difference(world, 0.0, q[0]) < 2e-4
+
+
+def test_what_moves_with_the_robot_is_robot_and_not_an_obstacle() -> None:
+    robot = load_robot("panda")
+    q = np.array([(np.array(robot.description.low) + robot.description.high) / 2])
+    tip = Cell(robot, (), ()).link_poses(q)["panda_hand"][0]
+    post = Solid(name="post", kind="ball", size=(0.05,), track=fixed(tip @ pose((0.0, 0.0, 0.40))))
+    bare = World(robot=robot, solids=(post,)).clearances(np.zeros(1), q)[0]
+    stick = Solid(name="stick", kind="capsule", size=(0.01, 0.08), track=fixed(pose((0, 0, 0.2))), link="panda_hand")
+    held = replace(stick, link=None, track=fixed(tip @ pose((0, 0, 0.2))), held=(0.5, 1.0))
+    assert World(robot=robot, solids=(post, stick)).clearances(np.zeros(1), q)[0].least[0] == pytest.approx(
+        0.06, abs=1e-3
+    )
+    before, during = (
+        World(robot=robot, solids=(post, held)).clearances(np.array([0.0, 0.7]), np.repeat(q, 2, 0))[0].least
+    )
+    assert before == bare.least[0] > 0.15
+    assert during == pytest.approx(0.06, abs=1e-3)
+
+
+def test_the_truth_is_that_of_the_recordings_that_others_made(real_data: Path) -> None:
+    for name, model in (
+        ("panda_shelf_real", "panda"),
+        ("ur5_near60_ideal", "ur5"),
+        ("panda_near60_ideal", "panda_tight"),
+    ):
+        folder = real_data / "mujoco" / name
+        with np.load(folder / "truth.npz") as known:
+            solids = [
+                _theirs(entry, known["t_pose"], known[f"pose_{entry['name']}"])
+                for entry in json.loads((folder / "truth.json").read_text(encoding="utf-8"))["objects"]
+                if entry["kind"] != "mesh"
+            ]
+            rows = slice(0, None, 20)
+            world = World(robot=load_robot(model), solids=tuple(solids))
+            ours = world.clearances(known["t"][rows], known["q"][rows])[0].least
+            assert np.abs(ours - np.minimum(known["visual"][rows], 0.3)).max() < 5e-4
+
+
+def test_exact_depth_lies_on_the_true_surfaces(renderer: None) -> None:
+    robot = load_robot("panda")
+    solids = [*room(), *(replace(s, track=fixed(pose((0.5, 0.25 * k - 0.5, 0.3)))) for k, s in enumerate(SOLIDS))]
+    camera = Camera(name="camera", lens=LENS, T_parent_camera=look_at((1.2, 0.9, 0.9), (0.4, 0.0, 0.3)))
+    cell = Cell(robot, solids, views_of([camera]))
+    q = (np.array(robot.description.low) + robot.description.high) / 2
+    cell.place(q, 0.0)
+    studio = Studio(cell, [camera], None)
+    image = studio.image(camera, [0])
+    is_robot = studio.is_robot(camera)
+    studio.close()
+    v, u = np.nonzero((image.depth > 0) & ~is_robot)
+    z = image.depth[v, u] * COUNT
+    points = moved(
+        camera.T_parent_camera, np.stack([(u - LENS.cx) / LENS.fx * z, (v - LENS.cy) / LENS.fy * z, z], axis=1)
+    )
+    away = np.min([np.abs(signed_distance(s, moved(inverse(s.track.poses[0]), points))[0]) for s in solids], axis=0)
+    assert len(points) > 200_000
+    assert np.quantile(away, 0.95) < 5e-4
+    v, u = np.nonzero((image.depth > 0) & is_robot)
+    z = image.depth[v, u] * COUNT
+    points = moved(
+        camera.T_parent_camera, np.stack([(u - LENS.cx) / LENS.fx * z, (v - LENS.cy) / LENS.fy * z, z], axis=1)
+    )
+    pieces = {link: Body.of(found) for link, found in robot.visual.items() if found}
+    poses = cell.link_poses(q[None])
+    chosen = points[:: len(points) // 60]
+    for point in chosen:
+        ball = Solid(name="point", kind="ball", size=(0.0,), track=fixed(pose(point)))
+        assert clearance_of(pieces, poses, [ball], np.zeros(1)).least[0] < 6e-4
+
+
+def test_stereo_errs_as_its_figures_say() -> None:
+    sensor, rng = Stereo(spread=0.07, fattening=2, dropouts=0.0), np.random.default_rng(0)
+    none = np.zeros((480, 640), dtype=bool)
+    for distance, expected in ((0.5, 0.9e-3), (1.0, 3.63e-3), (2.0, 14.5e-3)):
+        z = sensor.measured(np.full((480, 640), distance), none, rng)
+        assert np.std(z) == pytest.approx(expected, rel=0.12)  # z^2 spread / (f b)
+        disparity = DEPTH_LENS.fx * sensor.baseline / z
+        np.testing.assert_allclose(disparity * 32, np.rint(disparity * 32), atol=1e-6)
+    error = z - z.mean()
+    assert np.mean(error[:, 1:] * error[:, :-1]) / np.var(error) == pytest.approx(np.exp(-1 / 16), abs=0.03)
+    assert abs(np.mean(error[:, 16:] * error[:, :-16]) / np.var(error)) < 0.05
+
+
+def test_stereo_fattens_a_foreground_and_loses_what_the_right_imager_does_not_see() -> None:
+    exact = np.full((480, 640), 2.0)
+    exact[160:320, 200:400] = 1.0
+    z = Stereo(spread=0.0, fattening=3, dropouts=0.0).measured(
+        exact, np.zeros(exact.shape, bool), np.random.default_rng(0)
+    )
+    is_near = np.abs(z - 1.0) < 0.03
+    widths = is_near[200:280].sum(axis=1)
+    assert widths.min() >= 202 and widths.max() <= 206 and len(set(widths)) > 1
+    left, right = z[240, 180:197], z[240, 404:420]
+    shadow = DEPTH_LENS.fx * 0.05 * (1 / 1.0 - 1 / 2.0)  # 9.7 px
+    assert np.count_nonzero(z[240, 180:200] == 0) == pytest.approx(shadow - 2, abs=2)
+    assert (right > 1.9).all() and (left == 0).any()
+
+
+def test_a_laser_mixes_depths_at_an_edge() -> None:
+    exact = np.full((480, 640), 2.0)
+    exact[:, 320:] = 1.0
+    z = Laser(dropouts=0.0).measured(exact, np.zeros(exact.shape, bool), np.random.default_rng(0))
+    assert np.std(z[:, 400:]) == pytest.approx(2.5e-3, rel=0.03)
+    between = (z > 1.05) & (z < 1.95)
+    assert not between[:, :318].any() and not between[:, 322:].any()
+    assert 0.3 < between[:, 319:321].mean() < 0.6
+
+
+def test_aligned_depth_of_a_plane_is_the_plane() -> None:
+    depth = np.full((480, 640), 1.2)
+    image = aligned(depth, LENS)
+    assert set(np.unique(image)) == {1200}
+    square = np.zeros((480, 640))
+    square[230:250, 310:330] = 1.0
+    v, u = np.nonzero(aligned(square, LENS))
+    middle = (np.array([319.5, 239.5]) - [DEPTH_LENS.cx, DEPTH_LENS.cy]) / DEPTH_LENS.fx + [0.015, 0.0]
+    assert u.mean() == pytest.approx(middle[0] * LENS.fx + LENS.cx, abs=0.6)
+    assert v.mean() == pytest.approx(middle[1] * LENS.fy + LENS.cy, abs=0.6)
+    assert len(u) == pytest.approx(400 * (611 / 386) ** 2, rel=0.1)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_log_of_each_format_is_read_by_the_tool(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = Camera(name="camera_left", lens=LENS, T_parent_camera=np.eye(4))
+    with opened_log(tmp_path, kind) as log:
+        log.add_transforms(0.0, [("world", "camera_left_link", np.eye(4))], is_static=True)
+        for k in range(3):
+            log.add_joints(k / 10, ["a", "b"], np.array([0.1, 0.2]), np.zeros(2))
+            color = np.full((480, 640, 3), 90, np.uint8)
+            log.add_image(k / 10, camera, color, np.full((480, 640), 1234, np.uint16))
+    assert main(["info", str(tmp_path / log_name(kind)), "--json"]) == 0
+    said = capsys.readouterr().out
+    assert "camera_left" in said and "joint_states" in said
+
+
+def test_a_recording_is_whole_and_the_same_twice(
+    renderer: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(recording, "RATE", 1.0)
+    monkeypatch.setattr(recording, "JOINT_RATE", 20.0)
+    monkeypatch.setattr(recording, "TF_RATE", 10.0)
+    digests = []
+    for name in ("one", "other"):
+        recording.record(3, 5, tmp_path / name)  # a shelf
+        digests.append([hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted((tmp_path / name).rglob("*.*"))])
+    assert digests[0] == digests[1]
+    folder = tmp_path / "one"
+    said = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    with np.load(folder / "truth.npz") as truth:
+        assert len(truth["t"]) == 81 and truth["visual"].min() == said["min_visual"]
+        again = load_world(folder).clearances(truth["t"], truth["q"])[0].least
+        np.testing.assert_allclose(again, truth["visual"], atol=1e-12)
+    assert said["mujoco_difference"] < 2e-4
+    assert main(["info", str(folder / said["log"]), "--json"]) == 0
+    shown = capsys.readouterr().out
+    assert all(camera in shown for camera in said["cams"])
+
+
+def _sampled(body: Body, rng: np.random.Generator) -> Float64:
+    """Points on triangles, by area."""
+    a, b, c = np.moveaxis(body.triangles, 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    chosen = rng.choice(len(a), 12_000, p=area / area.sum())
+    return np.asarray(np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), len(chosen)), body.triangles[chosen]))
+
+
+def _theirs(entry: dict[str, object], times: Float64, rows: Float64) -> Solid:
+    """A solid of the recordings that others made."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, 3], poses[:, :3, :3] = rows[:, :3], Rotation.from_quat(rows[:, 3:]).as_matrix()
+    kind = str(entry["kind"]).replace("sphere", "ball")
+    size = tuple(float(value) for value in np.asarray(entry["size"]))
+    return Solid(name=str(entry["name"]), kind=kind, size=size, track=Track(times=times, poses=poses))
