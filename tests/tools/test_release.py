@@ -12,6 +12,7 @@ from tools import release
 def test_every_file_states_this_version() -> None:
     stated = release.versions()
     assert set(stated) == set(release.STATED)
+    assert stated.pop("CHANGELOG.md") in (splatctrl_cli.__version__, "Unreleased")
     assert set(stated.values()) == {splatctrl_cli.__version__}
 
 

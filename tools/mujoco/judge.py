@@ -163,7 +163,7 @@ def read_motion(steps: Path, joints: tuple[str, ...]) -> Motion:
         said=np.array([1e3 * float(line["clearance_exact"] or nan) for line in lines]),
         q=np.array([[float(line[f"q_{joint}"]) for joint in joints] for line in lines]),
         links=[line["nearest_exact"].partition("[")[0] for line in lines],
-        splats=[re.split(r" ?[\d(]", line["obstacle"], maxsplit=1)[0] for line in lines],
+        splats=[re.split(r"(?: at)? ?[\d(]", line["obstacle"], maxsplit=1)[0] for line in lines],
     )
 
 

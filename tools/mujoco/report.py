@@ -116,7 +116,7 @@ def _name_red(row: Row) -> str:
     if row.criterion != "clearance":
         return row.criterion
     place = f"more than {ELSEWHERE_MM:.0f} mm from" if _measure_red(row) > ELSEWHERE_MM else "perhaps at"
-    return f"clearance: {row.worst_splat} near {row.worst_link}, {place} a true surface"
+    return f"clearance: {row.worst_splat}, {place} a true surface"
 
 
 def _count_outcomes(title: str, rows: Sequence[Row], key: Callable[[Row], str]) -> Table:
@@ -138,6 +138,7 @@ def _count_errors(rows: Sequence[Row]) -> Table:
     near = [row for row in rows if 0 <= row.true_mm < GREEN_MM]
     clear = [row for row in rows if row.true_mm > RED_MM]
     red = [row for row in rows if row.is_red and row.true_mm < MARGIN_MM]
+    apart = [row for row in rows if row.true_mm >= GREEN_MM]
     seen = [row for row in rows if row.true_mm >= CAUTION_MM and row.num_cams >= 3]
     driven = [row for row in rows if row.mode == DRIVEN]
     safe = [row for row in driven if row.outcome == SAFE]
@@ -145,6 +146,7 @@ def _count_errors(rows: Sequence[Row]) -> Table:
         ("false green in contact (true < 0 mm)", touching, sum(row.is_false_green for row in touching)),
         (f"false green in the margin (true < {GREEN_MM:.0f} mm)", near, sum(row.is_false_green for row in near)),
         (f"false red (true > {RED_MM:.0f} mm)", clear, sum(row.is_false_red for row in clear)),
+        (f"contact although {GREEN_MM:.0f} mm clear", apart, sum(row.outcome == CONTACT for row in apart)),
         (f"red for a false reason (true there > {RED_MM:.0f} mm)", red, sum(r.worst_true_mm > RED_MM for r in red)),
         (f"useless caution (true >= {CAUTION_MM:.0f} mm)", seen, sum(row.is_useless_caution for row in seen)),
         ("closed loop that refuses to start", driven, sum(map(_is_refused_start, driven))),
