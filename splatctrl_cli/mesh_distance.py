@@ -6,6 +6,7 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from defusedxml import ElementTree
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import InputError
@@ -43,19 +44,21 @@ class TriangleMesh:
 
 
 def load_mesh(path: Path) -> TriangleMesh:
-    """The mesh in a file that trimesh reads (OBJ, STL, PLY, OFF, GLB), as it stands there, all parts as one.
+    """The mesh in a file that trimesh reads (OBJ, STL, PLY, OFF, GLB, COLLADA), all its parts as one.
 
     Vertices at the same place become one, whatever their texture and normal: a seam of a texture is not a hole.
+    COLLADA is scaled by the file's unit; its up axis is ignored, as RViz does.
     Raises InputError where the file cannot be read, or holds no triangle or a coordinate that is not finite.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected a mesh, got no such file")
     try:
         loaded = trimesh.load(path, force="mesh", process=False)
+        scale = _collada_unit(path) if path.suffix.lower() == ".dae" else 1.0
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         raise InputError(
             f"{path}: expected a mesh, got {type(error).__name__}: {error}",
-            remedy="give an OBJ, STL, PLY or GLB file",
+            remedy="give an OBJ, STL, PLY, GLB or COLLADA file",
         ) from None
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
         raise InputError(f"{path}: expected a mesh, got no triangle", remedy="give a mesh with faces, not a cloud")
@@ -64,10 +67,16 @@ def load_mesh(path: Path) -> TriangleMesh:
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
     loaded.update_faces(loaded.nondegenerate_faces())
     return TriangleMesh(
-        vertices=np.array(loaded.vertices, dtype=np.float64),
+        vertices=scale * np.array(loaded.vertices, dtype=np.float64),
         faces=np.array(loaded.faces, dtype=np.int64),
         is_closed=bool(loaded.is_watertight and loaded.is_winding_consistent),
     )
+
+
+def _collada_unit(path: Path) -> float:
+    """Metres in a unit of a COLLADA file."""
+    unit = ElementTree.parse(path).find("{*}asset/{*}unit")
+    return 1.0 if unit is None else float(unit.get("meter", "1"))
 
 
 class MeshDistance:

@@ -13,10 +13,11 @@ from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.libraries import trimesh
+from splatctrl_cli.mesh_distance import load_mesh
 from splatctrl_cli.planner.planned import goal_postures
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.coverage import coverage_of_solids
-from splatctrl_cli.robot.link_meshes import load_visual, mesh_path, read_solids
+from splatctrl_cli.robot.link_meshes import mesh_path, read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import random_postures
 from splatctrl_cli.robot.self_margins import SelfSurfaces
@@ -112,7 +113,7 @@ def _copy(source: Path, folder: Path, copies: Mapping[tuple[str, str], str], is_
     name = f"{kind}/{stem}" if f"{kind}/{stem}" not in copies.values() else f"{kind}/{len(copies)}_{stem}"
     (folder / kind).mkdir(parents=True, exist_ok=True)
     if is_visual:
-        seen = load_visual(source)
+        seen = load_mesh(source)
         trimesh.Trimesh(seen.vertices, seen.faces, process=False).export(folder / name)
     else:
         shutil.copyfile(source, folder / name)

@@ -4,9 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import coal
 import numpy as np
-from defusedxml import ElementTree
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
@@ -98,24 +96,6 @@ def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path
         if name.startswith("package://")
         else f"expected {tried[0]}",
     )
-
-
-def load_visual(path: Path) -> TriangleMesh:
-    """A visual mesh: COLLADA by coal's reader, in the file's unit and as its axes stand, others as `load_mesh` does.
-
-    Raises InputError where the file cannot be read.
-    """
-    if path.suffix.lower() != ".dae":
-        return load_mesh(path)
-    try:
-        unit = ElementTree.parse(path).find("{*}asset/{*}unit")
-        scale = 1.0 if unit is None else float(unit.get("meter", "1"))
-        model = coal.MeshLoader(coal.NODE_TYPE.BV_OBBRSS).load(str(path), np.full(3, scale))
-    except Exception as error:  # the readers raise whatever they meet
-        raise InputError(f"{path}: expected a COLLADA mesh, got {type(error).__name__}") from None
-    triangles = (model.tri_indices(index) for index in range(model.num_tris))
-    faces = np.array([[triangle[corner] for corner in range(3)] for triangle in triangles], dtype=np.int64)
-    return TriangleMesh(vertices=np.array(model.vertices(), dtype=np.float64), faces=faces, is_closed=False)
 
 
 class SolidDistance:

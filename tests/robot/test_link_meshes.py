@@ -7,7 +7,8 @@ import pytest
 import trimesh
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.robot.link_meshes import SolidDistance, load_visual, read_solids
+from splatctrl_cli.mesh_distance import load_mesh
+from splatctrl_cli.robot.link_meshes import SolidDistance, read_solids
 from splatctrl_cli.robot.urdf import read_urdf
 from tests.robot.shapes import BALL, BOX, ROD, arm_of, collada, l_shape, written
 
@@ -133,9 +134,21 @@ def test_a_visual_mesh_is_read_from_collada_in_its_unit(tmp_path: Path) -> None:
     text = collada(trimesh.creation.box((1, 2, 3)))
     for unit in ("1", "0.001"):
         (tmp_path / "box.dae").write_text(text.replace('meter="1"', f'meter="{unit}"'))
-        mesh = load_visual(tmp_path / "box.dae")
+        mesh = load_mesh(tmp_path / "box.dae")
         np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), float(unit) * np.array([1, 2, 3]), rtol=1e-6)
         assert len(mesh.faces) == 12
     (tmp_path / "box.dae").write_text(text[:300])
-    with pytest.raises(InputError, match=r"box\.dae: expected a COLLADA mesh, got ParseError"):
-        load_visual(tmp_path / "box.dae")
+    with pytest.raises(InputError, match=r"box\.dae: expected a mesh, got "):
+        load_mesh(tmp_path / "box.dae")
+
+
+def test_a_collada_mesh_of_several_parts_is_whole() -> None:
+    """Each part has faces that count its own vertices, from 0; they are not those of the parts before it."""
+    loading = pytest.importorskip(
+        "tools.mujoco.robots", reason="the robots are not installed: pip install -e '.[sim]'"
+    )
+    path = loading.robots_folder() / "ur_description/meshes/ur5/visual/wrist1.dae"
+    mesh = load_mesh(path)
+    area = 0.5 * np.linalg.norm(np.cross(*np.diff(mesh.corners, axis=1).swapaxes(0, 1)), axis=1).sum()
+    assert area == pytest.approx(0.0461, rel=0.01)
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [0.077, 0.085, 0.105], atol=1e-3)
