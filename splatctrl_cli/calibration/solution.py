@@ -199,7 +199,7 @@ def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
                 free.append(int(at))
                 usual.append(sigma)
     gain = np.linalg.solve(covariance[np.ix_(free, free)] + np.diag(np.square(usual)), covariance[free]).T
-    off, covariance = off - gain @ off[free], covariance - gain @ covariance[free]
+    off, covariance = off - gain @ off[free], _positive(covariance - gain @ covariance[free])
     while free:
         ratios = [abs(off[at]) / np.sqrt(covariance[at, at]) for at in free]
         least = int(np.argmin(ratios))
@@ -212,7 +212,13 @@ def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
 def _with_held(off: Float64, covariance: Float64, at: int) -> tuple[Float64, Float64]:
     """What becomes of estimates (P,) and their covariance (P, P) when one of them is held at 0."""
     gain = covariance[:, at] / max(covariance[at, at], np.finfo(float).tiny)
-    return off - gain * off[at], covariance - np.outer(gain, covariance[at])
+    return off - gain * off[at], _positive(covariance - np.outer(gain, covariance[at]))
+
+
+def _positive(covariance: Float64) -> Float64:
+    """A covariance (P, P) without variances that rounding has left at zero or below."""
+    np.fill_diagonal(covariance, np.maximum(np.diag(covariance), np.finfo(float).tiny))
+    return covariance
 
 
 def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:

@@ -24,10 +24,6 @@ def simulate_options(add: Options, parser: Parser) -> None:
     add_output(add, files, default="simulated")
     add("--urdf FILE", "another arm with collision geometry, its base on the table; spheres are fitted to it", Path)
     add_packages(add)
-    inside = "draw the arm by visual shapes that lie 3 mm (median) to 27 mm (95 %) inside of its collision shapes"
-    add("--slim", inside)
-    parts = "parts of the arm that images and truth.json have and robot.urdf has not: tool,cable,bracket, or some"
-    add("--unmodelled PARTS", parts)
     add_seed(add, "the noise, of --environment and of --human-arm")
     add(
         "--duration S",
@@ -42,17 +38,21 @@ def simulate_options(add: Options, parser: Parser) -> None:
     add("--human-arm", shared, ("near-pickup", "near-goal"))
     drawn = "things on tables, or a shelf, drawn by the seed, and a way through"
     add("--environment", drawn, ("tabletop", "cubby", "merged-cubby"))
-    add("--num-cameras N", "with --environment: 2 to 6 about the arm", whole(2, 6), 4)
     add(
         "--dtu",
         "write PATH/dtu and PATH/idr too: a DTU scan of a static scene, in MVSNet's layout and in IDR's, with masks"
         " of its things",
     )
-    add("--fps HZ", "frames a second", real(0.1, 60, "Hz"), 5.0)
     add("--width PX", "image width", whole(16, 4096, "px"), 320)
     add("--height PX", "image height", whole(16, 4096, "px"), 240)
-    noise = "depth noise: realsense is 1.2 mm at 1 m; stereo is 3.6 mm at 640 pixels, with fattened edges and shadows"
-    add("--noise", noise, ("none", "realsense", "stereo"), "realsense")
+    add("--noise", "depth noise; stereo fattens edges", ("none", "realsense", "stereo"), "realsense")
+    more = add.group("arm and cameras")
+    inside = "draw the arm by visual shapes that lie 3 mm (median) to 27 mm (95 %) inside of its collision shapes"
+    more("--slim", inside)
+    parts = "parts of the arm that images and truth.json have and robot.urdf has not: tool,cable,bracket, or some"
+    more("--unmodelled PARTS", parts)
+    more("--num-cameras N", "with --environment: 2 to 6 about the arm", whole(2, 6), 4)
+    more("--fps HZ", "frames a second", real(0.1, 60, "Hz"), 5.0)
 
 
 def ingest_options(add: Options, parser: Parser) -> None:

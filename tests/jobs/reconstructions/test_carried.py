@@ -20,7 +20,8 @@ from tests.jobs.bakes.baked import Said
 from tests.jobs.stage import MOVE, Stage, states_on
 
 pytestmark = pytest.mark.usefixtures("without_plots")
-HELD = '<collision><origin xyz="0 0 0.15"/><geometry><box size="0.07 0.07 0.07"/></geometry></collision>'
+CUBE = '<origin xyz="0 0 0.15"/><geometry><box size="0.07 0.07 0.07"/></geometry>'
+HELD = f"<visual>{CUBE}</visual><collision>{CUBE}</collision>"
 BOX = "[-0.045, -0.045, 0.105, 0.045, 0.045, 0.195]"
 FRAMES = 6
 RAISED = START + np.array([0.0, -0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
