@@ -46,7 +46,7 @@ class SimulateRequest:
 
     @property
     def config(self) -> dict[str, Any]:
-        """What run.json says of it."""
+        """Metrics for run.json."""
         own = {"is_slim": self.is_slim, "unmodelled": self.unmodelled}
         return {**vars(self.options), **{name: value for name, value in own.items() if value}}
 

@@ -1,4 +1,4 @@
-"""What depth cameras measure, from exact depth: two models of an active-stereo camera."""
+"""Two models of an active-stereo camera: measured depth from exact depth."""
 
 from dataclasses import dataclass
 

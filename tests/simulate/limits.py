@@ -1,4 +1,4 @@
-"""What every recorded motion is held to, whatever its time."""
+"""Velocity limits of recorded motions, at any duration."""
 
 import numpy as np
 

@@ -99,6 +99,6 @@ def test_the_same_stereo_camera_has_the_same_statistics_in_both() -> None:
 
 
 def _both(exact: Float64, ours: StereoDepth, theirs: Stereo) -> tuple[Float64, Float64]:
-    """What both cameras measure of exact depth [m]."""
+    """Depth [m] that both stereo models measure, from exact depth [m]."""
     first = ours.applied(exact.astype(np.float32), np.random.default_rng(0), focal=DEPTH_LENS.fx)
     return first.astype(np.float64), theirs.measured(exact, NONE, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""How the arm of a run looks, and how its cameras measure depth: in seeds from 200 on not as the model has it."""
+"""The visible arm and the depth model of a run; from seed 200 on they differ from the robot's model."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -39,14 +39,14 @@ class Body:
 
     @property
     def palm(self) -> float:
-        """Where the hand's palm is along its z axis [m]."""
+        """Position [m] of the palm along the hand's z axis."""
         block = self.shapes["hand"][0]
         assert isinstance(block, Block)
         return block.middle[2] + block.size[2] / 2
 
     @property
     def width(self) -> int:
-        """Of the images [px]."""
+        """Width of the images [px]."""
         return WIDTH if self.depth is None else STEREO_WIDTH
 
     @property

@@ -116,7 +116,7 @@ def _why(rows: Sequence[Row]) -> list[str]:
 
 
 def _bodies(rows: Sequence[Row]) -> list[str]:
-    """By how the arm looks: what became of runs that are truly clear, and of the others."""
+    """Outcomes of clear runs and of the others, by the visible arm."""
     lines = [f"{'robot':16s} {'truth':>8s} {'runs':>5s} " + " ".join(f"{word:>13s}" for word in OUTCOMES)]
     for robot in sorted({row.robot for row in rows}):
         for truth in TRUTHS:

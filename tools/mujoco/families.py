@@ -36,7 +36,7 @@ def wanted(rng: np.random.Generator, contact: float = 0.2, margin: float = 0.1) 
 
 
 def clear(stage: Stage) -> None:
-    """Nothing near."""
+    """Leave the space about the robot empty."""
 
 
 def near(stage: Stage) -> None:

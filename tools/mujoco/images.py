@@ -67,7 +67,7 @@ class Studio:
         self._renderer.close()
 
     def image(self, camera: Camera, seed: Sequence[int]) -> Image:
-        """What a camera records of the cell as it stands."""
+        """Render the image that a camera records of the present state."""
         rng = np.random.default_rng(seed)
         color = self._rendered(camera.name, "color").astype(np.float32)
         color += COLOR_NOISE * rng.standard_normal(color.shape, dtype=np.float32)
@@ -87,7 +87,7 @@ class Studio:
         )
 
     def is_robot(self, camera: Camera) -> NDArray[np.bool_]:
-        """Where the colour camera (H, W) sees the robot and what is fixed to it."""
+        """Pixels (H, W) of the colour camera that show the robot, or a solid fixed to it."""
         return np.isin(self._rendered(camera.name, "segments"), self._robot)
 
     def exact_depth(self, name: str) -> Float64:

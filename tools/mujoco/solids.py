@@ -52,7 +52,7 @@ class Solid:
 
     @property
     def radius(self) -> float:
-        """Of the ball about its origin that holds it [m]."""
+        """Radius [m] of a ball about its origin that holds it."""
         if self.kind == "box":
             return float(np.linalg.norm(self.size))
         if self.kind == "lathe":
@@ -89,7 +89,7 @@ def signed_distance(solid: Solid, points: Float64) -> tuple[Float64, Float64]:
 
 
 def _of_box(points: Float64, half: Float64) -> tuple[Float64, Float64]:
-    """Of an axis-aligned box in two or three dimensions."""
+    """Signed distance and gradient of an axis-aligned box in two or three dimensions."""
     past = np.abs(points) - half
     outside = np.maximum(past, 0)
     length = np.linalg.norm(outside, axis=1)
@@ -108,7 +108,7 @@ def frusta(solid: Solid) -> tuple[Solid, ...]:
 
 
 def _of_profile(points: Float64, profile: Float64) -> tuple[Float64, Float64]:
-    """Of the solid that a profile (P, 2) turned about z encloses; of a frustum the gradient is exact, too."""
+    """Signed distance and gradient of a profile (P, 2) turned about z; a frustum's gradient is exact."""
     rho, z = np.hypot(points[:, 0], points[:, 1]), points[:, 2]
     best = np.full(len(points), np.inf)
     toward = np.zeros((len(points), 2))

@@ -99,7 +99,7 @@ class Stage:
         return float(clearance_of(seen, poses, solids, times).least.min())
 
     def _surfaces(self, times: Float64) -> tuple[dict[str, Body], dict[str, Float64]]:
-        """What is seen of the moving links, and poses (T, 4, 4) of all at times (T,) [s]."""
+        """Visible bodies of the moving links, and poses (T, 4, 4) of all links at times (T,) [s]."""
         fixed_here = sum(solid.link is not None for solid in self.solids)
         if self._seen is None or self._seen[0] != fixed_here:
             self._seen = (fixed_here, World(robot=self.robot, solids=tuple(self.solids)).seen())
@@ -166,7 +166,7 @@ class Stage:
 
 
 class NoPlaceError(Exception):
-    """Nothing fits where it was asked for; the recording is drawn anew."""
+    """No place was found for a solid; the recording is drawn anew."""
 
 
 def room() -> list[Solid]:
@@ -188,7 +188,7 @@ def draw_camera(rng: np.random.Generator, name: str, phase: float = 0.0) -> Came
 
 
 def draw_lens(rng: np.random.Generator) -> Lens:
-    """Of a D435's colour imager at 640x480, as units differ."""
+    """Draw the lens of a D435's colour imager at 640x480."""
     f = float(rng.uniform(600, 616))
     return Lens(
         fx=f,

@@ -51,7 +51,7 @@ class Row:
 
     @property
     def name(self) -> str:
-        """Of the recording, as its folder is called."""
+        """Name of the recording's folder."""
         return f"{self.seed}-{self.index}"
 
     @property

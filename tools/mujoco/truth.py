@@ -74,7 +74,7 @@ class Clearance:
 def clearance_of(
     bodies: Mapping[str, Body], poses: Mapping[str, Float64], solids: Sequence[Solid], times: Float64
 ) -> Clearance:
-    """Of bodies by link, each at poses (T, 4, 4), from solids at times (T,) [s]."""
+    """Clearance of bodies by link, at poses (T, 4, 4), from solids at times (T,) [s]."""
     names = list(bodies)
     per = np.full((len(times), len(solids)), REACH)
     who = np.full((len(times), len(solids)), -1)
@@ -148,7 +148,7 @@ class World:
 
     @property
     def obstacles(self) -> tuple[Solid, ...]:
-        """What does not move with the robot at any time."""
+        """Solids that never move with the robot."""
         return tuple(solid for solid in self.solids if solid.link is None and solid.held is None)
 
     def seen(self) -> dict[str, Body]:
@@ -166,7 +166,7 @@ class World:
         return self._moving(self.robot.collision)
 
     def clearances(self, times: Float64, q: Float64) -> tuple[Clearance, Clearance]:
-        """Of what is seen, and of the collision geometry, at times (T,) [s] and joint positions (T, J)."""
+        """Clearance of the visible and of the collision surface, at times (T,) [s] and joint positions (T, J)."""
         poses = Cell(self.robot, (), ()).link_poses(q)
         seen = clearance_of(self.seen(), poses, self.obstacles, times)
         for solid in self.solids:
