@@ -1,22 +1,17 @@
 """The exact distance to a triangle mesh, in float64."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from defusedxml import ElementTree
-from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import face_normals
+from splatctrl_cli.kernels.triangles import TriangleTree
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Bool, Float64, Index
 
-POINTS_PER_CHUNK = 20_000
-PAIRS_PER_CHUNK = 400_000  # of the (pairs x 3) float64 arrays
-ROUNDING = 1e-9  # [m] of the distance to a disc, generously: only what is certainly farther is left out
 NEXT, OPPOSITE = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
@@ -80,21 +75,11 @@ def _collada_unit(path: Path) -> float:
 
 
 class MeshDistance:
-    """Exact distance from points to a mesh: every face that may be the nearest is tried.
-
-    Faces go into a k-d tree by their centroids c_f, one tree per octave of size R_f (the largest distance of a corner
-    from the centroid), because a face lies within R_f of c_f: where a face is known at distance u, only faces with
-    ``|x - c_f| <= u + R_f`` can be nearer, and of those only the ones whose disc about c_f reaches as near as u.
-    """
+    """Exact distance from points to a mesh."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
         self.mesh = mesh
-        corners = mesh.corners
-        self._centroids = corners.mean(axis=1)
-        self._reach = np.linalg.norm(corners - self._centroids[:, None], axis=2).max(axis=1)
-        octave = np.floor(np.log2(np.maximum(self._reach, 1e-12))).astype(np.int64)
-        self._groups = [np.flatnonzero(octave == value) for value in np.unique(octave)]
-        self._trees = [cKDTree(self._centroids[group]) for group in self._groups]
+        self._tree = TriangleTree(mesh.corners)
         self._normals = _Normals(mesh)
 
     def closest(self, points: Float64) -> tuple[Float64, Float64, Bool]:
@@ -103,106 +88,21 @@ class MeshDistance:
         Inside by the angle-weighted normal of the nearest face, edge or vertex (Baerentzen, Aanaes, Signed distance
         computation using the angle weighted pseudonormal, 2005), exact for a closed mesh; all False for an open one.
         """
-        distance = np.empty(len(points))
-        surface = np.empty((len(points), 3))
+        distance, face, shares = self._tree.closest(points)
+        surface = np.einsum("qk,qka->qa", shares, self.mesh.corners[face])
         is_inside = np.zeros(len(points), dtype=np.bool_)
-        for start in range(0, len(points), POINTS_PER_CHUNK):
-            part = slice(start, start + POINTS_PER_CHUNK)
-            face, shares = self._nearest(points[part])
-            surface[part] = np.einsum("qk,qka->qa", shares, self.mesh.corners[face])
-            away = points[part] - surface[part]
-            distance[part] = np.linalg.norm(away, axis=1)
-            if self.mesh.is_closed:
-                is_inside[part] = np.einsum("qa,qa->q", away, self._normals.at(face, shares)) < 0
+        if self.mesh.is_closed:
+            is_inside = np.einsum("qa,qa->q", points - surface, self._normals.at(face, shares)) < 0
         return distance, surface, is_inside
 
-    def lower_bound(self, points: Float64) -> Float64:
-        """points (Q, 3) [m] -> a length (Q,) [m] that the distance is not below; much faster than the distance."""
-        bound = np.full(len(points), np.inf)
-        for group, tree in zip(self._groups, self._trees, strict=True):
-            bound = np.minimum(bound, tree.query(points)[0] - self._reach[group].max())
-        return bound
+    def distance(self, points: Float64, within: float = np.inf) -> Float64:
+        """points (Q, 3) [m] -> distance (Q,) [m], infinite where it is more than `within` [m]."""
+        return self._tree.closest(points, within)[0]
 
     def signed(self, points: Float64) -> Float64:
         """points (Q, 3) [m] -> distance (Q,) [m], negative inside a closed mesh."""
         distance, _, is_inside = self.closest(points)
         return np.where(is_inside, -distance, distance)
-
-    def _nearest(self, points: Float64) -> tuple[Index, Float64]:
-        """The nearest face (Q,) and the barycentric coordinates (Q, 3) of the nearest point on it."""
-        best = np.full(len(points), np.inf)
-        face = np.zeros(len(points), dtype=np.int64)
-        shares = np.zeros((len(points), 3))
-        everyone = np.arange(len(points))
-        for group, tree in zip(self._groups, self._trees, strict=True):
-            self._improve(points, everyone, group[tree.query(points)[1]], best, face, shares)
-        for group, tree in zip(self._groups, self._trees, strict=True):
-            for asking, asked in _within(tree, points, best + self._reach[group].max()):
-                found = group[asked]
-                may_be = self._disc_distance(points[asking], found) <= best[asking] + ROUNDING
-                self._improve(points, asking[may_be], found[may_be], best, face, shares)
-        return face, shares
-
-    def _disc_distance(self, points: Float64, faces: Index) -> Float64:
-        """Distance (P,) to the disc of radius R_f about c_f in the plane of a face, which holds the face."""
-        away = points - self._centroids[faces]
-        height = _dot(away, self._normals.of_face[faces])
-        aside = np.sqrt(np.maximum(_dot(away, away) - height**2, 0.0))
-        return np.asarray(np.hypot(height, np.maximum(aside - self._reach[faces], 0.0)))
-
-    def _improve(
-        self, points: Float64, asking: Index, faces: Index, best: Float64, face: Index, shares: Float64
-    ) -> None:
-        """Take each pair (point, face) that is nearer than the best so far; of equals, the first."""
-        pair_shares = barycentric_of_closest(points[asking], self.mesh.corners[faces])
-        at = np.einsum("pk,pka->pa", pair_shares, self.mesh.corners[faces])
-        distance = np.linalg.norm(points[asking] - at, axis=1)
-        order = np.lexsort((distance, asking))
-        first = order[np.r_[True, np.diff(asking[order]) > 0]] if len(order) else order
-        taken = first[distance[first] < best[asking[first]]]
-        best[asking[taken]] = distance[taken]
-        face[asking[taken]] = faces[taken]
-        shares[asking[taken]] = pair_shares[taken]
-
-
-def _within(tree: cKDTree, points: Float64, radius: Float64) -> Iterator[tuple[Index, Index]]:
-    """Pairs (point, entry of the tree) not further apart than the point's radius, a manageable number at a time."""
-    counts = np.asarray(tree.query_ball_point(points, radius, return_length=True))
-    before = np.cumsum(counts) - counts
-    for part in np.split(np.arange(len(points)), np.flatnonzero(np.diff(before // PAIRS_PER_CHUNK)) + 1):
-        lists = tree.query_ball_point(points[part], radius[part])
-        asked = np.fromiter(chain.from_iterable(lists), dtype=np.int64, count=int(counts[part].sum()))
-        yield np.repeat(part, counts[part]), asked
-
-
-def barycentric_of_closest(points: Float64, corners: Float64) -> Float64:
-    """Barycentric coordinates (P, 3) of the point of a triangle (P, 3, 3) nearest to a point (P, 3).
-
-    The cases of Ericson, Real-Time Collision Detection (2005), 5.1.5; a coordinate is exactly zero off a corner or
-    an edge.
-    """
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    ab, ac = b - a, c - a
-    d1, d2 = _dot(ab, points - a), _dot(ac, points - a)
-    d3, d4 = _dot(ab, points - b), _dot(ac, points - b)
-    d5, d6 = _dot(ab, points - c), _dot(ac, points - c)
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    zero, one = np.zeros(len(points)), np.ones(len(points))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        on_ab, on_ac = d1 / (d1 - d3), d2 / (d2 - d6)
-        on_bc = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        total = va + vb + vc
-        cases: list[tuple[Bool, tuple[Float64, Float64, Float64]]] = [
-            ((d1 <= 0) & (d2 <= 0), (one, zero, zero)),
-            ((d3 >= 0) & (d4 <= d3), (zero, one, zero)),
-            ((d6 >= 0) & (d5 <= d6), (zero, zero, one)),
-            ((vc <= 0) & (d1 >= 0) & (d3 <= 0), (1 - on_ab, on_ab, zero)),
-            ((vb <= 0) & (d2 >= 0) & (d6 <= 0), (1 - on_ac, zero, on_ac)),
-            ((va <= 0) & (d4 >= d3) & (d5 >= d6), (zero, 1 - on_bc, on_bc)),
-        ]
-        inner = (va / total, vb / total, vc / total)
-    conditions = [condition for condition, _ in cases]
-    return np.stack([np.select(conditions, [v[k] for _, v in cases], inner[k]) for k in range(3)], axis=1)
 
 
 class _Normals:

@@ -5,8 +5,9 @@ import pytest
 import trimesh
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, barycentric_of_closest, load_mesh
+from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.records import Float64
+from tests.reference.triangles import distance_to_triangles, winding_number
 
 CLOSED = (
     "featuretype.STL",
@@ -31,27 +32,6 @@ def box_mesh(size: tuple[float, float, float], *, is_closed: bool = True) -> Tri
 def box_distance(points: Float64, size: tuple[float, float, float]) -> Float64:
     gap = np.abs(points) - np.array(size) / 2
     return np.linalg.norm(np.maximum(gap, 0), axis=1) + np.minimum(gap.max(axis=1), 0)
-
-
-def brute_force(points: Float64, mesh: TriangleMesh) -> Float64:
-    distances = []
-    for point in points:
-        at = np.broadcast_to(point, (len(mesh.faces), 3))
-        shares = barycentric_of_closest(at, mesh.corners)
-        distances.append(np.linalg.norm(np.einsum("fk,fka->fa", shares, mesh.corners) - point, axis=1).min())
-    return np.array(distances)
-
-
-def winding_number(points: Float64, mesh: TriangleMesh) -> Float64:
-    """Solid angles of all faces over 4 pi: 1 inside, 0 outside (van Oosterom and Strackee's formula)."""
-    numbers = []
-    for point in points:
-        a, b, c = (mesh.corners[:, k] - point for k in range(3))
-        la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
-        triple = np.einsum("fa,fa->f", a, np.cross(b, c))
-        rest = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
-        numbers.append(2 * np.arctan2(triple, rest).sum() / (4 * np.pi))
-    return np.array(numbers)
 
 
 def test_signed_distance_to_a_box_is_the_analytic_one() -> None:
@@ -81,8 +61,8 @@ def test_every_face_is_tried_that_may_be_the_nearest(real_data: Path, name: str)
     points = np.random.default_rng(2).uniform(-0.25, 0.25, (60, 3))
     points = np.concatenate([points, 0.5 * mesh.vertices[::200]])  # some inside
     signed = MeshDistance(mesh).signed(points)
-    np.testing.assert_allclose(np.abs(signed), brute_force(points, mesh), atol=1e-12)
-    np.testing.assert_array_equal(signed < 0, winding_number(points, mesh) > 0.5)
+    np.testing.assert_allclose(np.abs(signed), distance_to_triangles(points, mesh.corners), atol=1e-12)
+    np.testing.assert_array_equal(signed < 0, winding_number(points, mesh.corners) > 0.5)
     assert 0 < np.count_nonzero(signed < 0) < len(points)
 
 
@@ -94,9 +74,10 @@ def test_triangles_of_very_different_sizes_are_all_tried() -> None:
     mesh = TriangleMesh(vertices=corners.reshape(-1, 3), faces=np.arange(600).reshape(-1, 3), is_closed=False)
     points = rng.uniform(-0.5, 0.5, (200, 3))
     distance, _, is_inside = MeshDistance(mesh).closest(points)
-    np.testing.assert_allclose(distance, brute_force(points, mesh), atol=1e-12)
+    np.testing.assert_allclose(distance, distance_to_triangles(points, mesh.corners), atol=1e-12)
     assert not is_inside.any()
-    assert (MeshDistance(mesh).lower_bound(points) <= distance).all()
+    near = MeshDistance(mesh).distance(points, 0.1)
+    np.testing.assert_array_equal(near, np.where(distance <= 0.1, distance, np.inf))
 
 
 def test_distance_turns_with_the_mesh_and_scales_with_it() -> None:

@@ -1,6 +1,6 @@
 """What the controller asks of a robot: the one seam between control and kinematics."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -10,14 +10,24 @@ from splatctrl_cli.kernels.chain import Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
 
 
+class Balls(Protocol):
+    """centers (N, 3) and radii (N,) [m]."""
+
+    @property
+    def centers(self) -> NDArray[np.floating]: ...
+
+    @property
+    def radii(self) -> NDArray[np.floating]: ...
+
+
 class ArmModel(Protocol):
     """A kinematic chain with collision spheres; `splatctrl_cli.robot.model.RobotModel` is one.
 
     J joints, S spheres; positions [m] and poses in world. sphere_deficit (S,) [m]: how far outside the spheres the
     surface of a sphere's body may be, NaN where nobody measured it. lever_arms (S, J): how far [m] a sphere goes, at
     most, per radian (or metre) of each joint. self_allowance (P,) [m]: how much less than the margin asked for each
-    of `self_pairs` keeps. chain: its bodies and spheres as the kernels walk them, None where only
-    its methods know.
+    of `self_pairs` keeps. surface_gaps: by link with triangles, its clearance (T,) [m] at postures (T, J). chain: its
+    bodies and spheres as the kernels walk them, None where only its methods know.
     """
 
     @property
@@ -66,6 +76,8 @@ class ArmModel(Protocol):
     def lever_arms(self) -> Float64: ...
 
     def self_pairs(self) -> NDArray[np.integer]: ...
+
+    def surface_gaps(self, positions: Float64, scene: Balls) -> Mapping[str, Float64]: ...
 
     def reach(self) -> float: ...
 

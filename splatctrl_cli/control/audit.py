@@ -9,12 +9,26 @@ from numpy.typing import NDArray
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import pair_gaps
-from splatctrl_cli.records import Float64, JointState, Stamps
+from splatctrl_cli.records import Bool, Float64, JointState, Stamps
 
 Channel = NDArray[np.uint8]
 
 DistanceFunction = Callable[[Float64], Float64]
 """points (Q, 3) [m], world -> distance (Q,) [m], NaN where there is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BallDistance:
+    """A `DistanceFunction` of N balls, centers (N, 3) and radii (N,) [m], which surfaces are measured to."""
+
+    of_points: DistanceFunction
+    centers: NDArray[np.floating]
+    radii: NDArray[np.floating]
+
+    def __call__(self, points: Float64) -> Float64:
+        """Of points (Q, 3) [m]."""
+        return self.of_points(points)
+
 
 DistancesAt = Callable[[int], Mapping[str, DistanceFunction]]
 """The distances known at a stamp [ns], by name; the same object for the same scene, so that states share a query."""
@@ -27,7 +41,8 @@ CHUNK = 256  # states per query
 
 @dataclass(frozen=True, kw_only=True)
 class Clearance:
-    """distance (T,) [m] of the nearest moving sphere's surface, NaN where there is none; sphere (T,) its index.
+    """distance (T,) [m] of the nearest moving part (`part_clearances`), NaN where there is none; sphere (T,): the
+    index of its sphere.
 
     For self-collision, of the nearest pair; sphere is then the pair's index, -1 without pairs.
     """
@@ -83,15 +98,43 @@ def checked_states(model: ArmModel, states: Sequence[JointState]) -> tuple[Stamp
     return stamps, positions
 
 
-def moving_clearance(model: ArmModel, centers: Float64, distance_to: DistanceFunction) -> tuple[Clearance, Float64]:
-    """The smallest sphere clearance of every state, from the centres (T, S, 3) [m] of all spheres; and that of each
-    moving sphere (T, M) [m].
+def part_clearances(
+    model: ArmModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
+) -> tuple[Float64, Bool]:
+    """Clearances (T, M) [m] at postures (T, J) of the parts that the moving spheres stand for, and which (M,) are of
+    a link's own surface: the rest are the spheres'.
+
+    Where a link has triangles and the scene is of balls, its surface decides: the nearest of its spheres has the
+    surface's clearance, and the others at least that, or their own less `sphere_deficit`. centers (T, S, 3) [m] of
+    all spheres, where they are known.
     """
     moving = np.flatnonzero(model.moving_spheres)
-    points = np.ascontiguousarray(centers[:, moving].reshape(-1, 3))
-    distance = distance_to(points).reshape(len(centers), len(moving)) - model.sphere_set.radii[moving]
+    there = model.sphere_centers_batch(positions) if centers is None else centers
+    points = np.ascontiguousarray(there[:, moving].reshape(-1, 3))
+    each = distance_to(points).reshape(len(positions), len(moving)) - model.sphere_set.radii[moving]
+    gaps = model.surface_gaps(positions, distance_to) if isinstance(distance_to, BallDistance) else {}
+    links = np.array(model.sphere_set.links)[moving]
+    for link, gap in gaps.items():
+        of_link = np.flatnonzero(links == link)
+        if not len(of_link):
+            continue
+        nearest = of_link[each[:, of_link].argmin(axis=1)]
+        deficit = np.maximum(np.nan_to_num(model.sphere_deficit[moving[of_link]]), 0.0)
+        each[:, of_link] = np.maximum(each[:, of_link] - deficit, gap[:, None])
+        each[np.arange(len(each)), nearest] = gap
+    return each, np.isin(links, list(gaps))
+
+
+def moving_clearance(
+    model: ArmModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
+) -> tuple[Clearance, Float64]:
+    """The smallest of `part_clearances` of every posture (T, J), and all of them (T, M) [m]."""
+    distance, moving = (
+        part_clearances(model, positions, distance_to, centers)[0],
+        np.flatnonzero(model.moving_spheres),
+    )
     nearest = np.argmin(distance, axis=1)
-    least = Clearance(distance=distance[np.arange(len(centers)), nearest], sphere=moving[nearest])
+    least = Clearance(distance=distance[np.arange(len(distance)), nearest], sphere=moving[nearest])
     return least, distance
 
 
@@ -121,7 +164,7 @@ def audited(
     for first, last in _runs(stamps, distances_at):
         centers = model.sphere_centers_batch(positions[first:last])
         for name, distance_to in distances_at(int(stamps[first])).items():
-            least, each = moving_clearance(model, centers, distance_to)
+            least, each = moving_clearance(model, positions[first:last], distance_to, centers)
             parts.setdefault(name, []).append(least)
             spheres.setdefault(name, []).append(each)
         self_parts.append(_self_clearance(model, centers))

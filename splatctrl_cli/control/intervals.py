@@ -11,7 +11,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import HALVED_DOWN_TO, MAX_HALVINGS
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.audit import DistanceFunction
+from splatctrl_cli.control.audit import DistanceFunction, part_clearances
 from splatctrl_cli.records import Bool, Float64
 
 
@@ -143,7 +143,6 @@ def _refined(
 
 
 def clearances(model: ArmModel, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:
-    """(T, M) [m] of every moving sphere's surface at postures (T, J)."""
-    centers = model.sphere_centers_batch(positions)[:, reach.moving]
-    distance = distance_to(np.ascontiguousarray(centers.reshape(-1, 3)))
-    return np.asarray(distance.reshape(len(positions), -1) - reach.radii)
+    """(T, M) [m] of every moving sphere's part of the body at postures (T, J), with what it leaves uncovered."""
+    each, is_surface = part_clearances(model, positions, distance_to)
+    return np.asarray(each - np.where(is_surface, 0.0, reach.radii - model.sphere_set.radii[reach.moving]))

@@ -159,7 +159,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
     is_known = np.isfinite(distances["sdf"].at(drawn))
     known, points = drawn[is_known], grid.origin + grid.voxel * cells[is_known]
     field = MeshDistance(mesh)
-    in_reach = field.lower_bound(points) < REACH
+    in_reach = field.distance(points, REACH) < REACH
     known, points = known[in_reach], points[in_reach]
     distance, _, is_inside = field.closest(points)
     is_near = ~is_inside & (distance < REACH)

@@ -11,18 +11,19 @@ BOX, CYLINDER, BALL, CAPSULE = 0.0, 1.0, 2.0, 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceScene:
-    """Solids (P) and triangles (F) in a camera's optical frame [m].
+    """Solids (P) in a camera's optical frame and triangles (F) in the frames of links (L) [m].
 
     solids (P, 16) float64: kind, the rotation (9) and shift (3) from the optical frame to the solid's own, its size:
     half edges of a box; radius, half length along z and 0 of a cylinder or a capsule; radius, 0, 0 of a ball.
-    triangles (F, 3, 3) float64: corners, counter-clockwise seen from outside. The links (P,) and (F,) are numbers
-    of at least 0.
+    triangles (F, 3, 3) float64: corners; link_poses (L, 3, 4) lead from links to the optical frame. The links (P,)
+    and (F,) are numbers of at least 0.
     """
 
     solids: Float64
     solid_links: Int16
     triangles: Float64
     triangle_links: Int16
+    link_poses: Float64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,13 +49,13 @@ def render_surface(
     """Cast a ray through every pixel's centre; intrinsics (6,): fx, fy, cx, cy, width, height.
 
     measured (H, W) float32 [m], 0 = none: a measured point is inside a solid where it lies by more than `tolerance` +
-    `quadratic` depth^2 [m] behind its front and before its back along the ray; of triangles, inside closed surfaces.
+    `quadratic` depth^2 [m] behind its front and before its back along the ray; no triangle holds a point.
     A solid that holds the camera is not seen, nor is a triangle that reaches behind the camera.
     """
     shape = (int(intrinsics[5]), int(intrinsics[4]))
     depth, link, inside = np.empty(shape, np.float32), np.empty(shape, np.int16), np.empty(shape, np.int16)
     native.render_surface(
-        intrinsics, scene.solids, scene.solid_links, scene.triangles, scene.triangle_links, measured, tolerance,
-        quadratic, depth, link, inside, num_threads,
+        intrinsics, scene.solids, scene.solid_links, scene.triangles, scene.triangle_links, scene.link_poses,
+        measured, tolerance, quadratic, depth, link, inside, num_threads,
     )  # fmt: skip
     return SurfaceImage(depth=depth, link=link, inside=inside)

@@ -130,11 +130,16 @@ def _primitive(shape: Shape) -> Solid:
     return Solid(link=shape.link, surface=mesh, slack=float(slack), body=mesh, ball=ball)
 
 
-def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
-    """The mesh in the link's frame; an open one is taken apart into the pieces that are closed and the rest."""
+def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
+    """The mesh in the link's frame."""
     vertices = transform_points(shape.T_link_mesh, mesh.vertices * np.array(shape.scale))
     faces = mesh.faces if np.prod(shape.scale) > 0 else mesh.faces[:, ::-1]
-    whole = replace(mesh, vertices=vertices, faces=np.ascontiguousarray(faces))
+    return replace(mesh, vertices=vertices, faces=np.ascontiguousarray(faces))
+
+
+def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
+    """The mesh in the link's frame; an open one is taken apart into the pieces that are closed and the rest."""
+    whole = placed(shape, mesh)
     pieces = [whole] if whole.is_closed else _taken_apart(whole)
     return [
         Solid(link=shape.link, surface=piece, slack=0.0, body=piece if piece.is_closed else _hull(piece.vertices))

@@ -1,14 +1,14 @@
-"""The robot's own surface: its collision geometry as a camera sees it, and how far points lie from it."""
+"""The robot's own surface as cameras see it, and how far points lie from it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import invert_transform, pose_at
+from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
 from splatctrl_cli.kernels.points import solid_distance
 from splatctrl_cli.kernels.surface_image import (
     BALL,
@@ -19,10 +19,11 @@ from splatctrl_cli.kernels.surface_image import (
     SurfaceScene,
     render_surface,
 )
-from splatctrl_cli.mesh_distance import TriangleMesh, load_mesh
-from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, SphereSet
-from splatctrl_cli.robot.link_meshes import mesh_path, mesh_pieces
-from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
+from splatctrl_cli.kernels.triangles import TriangleTree
+from splatctrl_cli.mesh_distance import load_mesh
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Intrinsics, SphereSet
+from splatctrl_cli.robot.link_meshes import mesh_path, placed
+from splatctrl_cli.robot.urdf import Shape, UrdfFile, visual_urdf
 
 Int16 = NDArray[np.int16]
 KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": BALL, "capsule": CAPSULE}
@@ -33,9 +34,10 @@ class RobotSurface:
     """Solids (P) and triangles (F), each fixed to one of `links` (L) [m].
 
     kinds (P,) as `kernels.surface_image` numbers them, sizes (P, 3) (half edges; radius and half length; radius),
-    T_link_solid (P, 4, 4), solid_links (P,); triangles (F, 3, 3) in the frame of triangle_links (F,).
-    by_spheres: links that collision spheres stand for, because their geometry is missing or cannot be read. fixed:
-    links that no joint moves. num_carried: the last of `links` again, one for each box around what they carry.
+    T_link_solid (P, 4, 4), solid_links (P,); triangles (F, 3, 3) in the frame of triangle_links (F,), `trees` of them
+    by their number. by_spheres: links that collision spheres stand for, because their geometry is missing or cannot
+    be read. fixed: links that no joint moves. num_carried: the last of `links` again, one for each box around what
+    they carry.
     """
 
     links: tuple[str, ...]
@@ -45,28 +47,28 @@ class RobotSurface:
     solid_links: Int16
     triangles: Float64
     triangle_links: Int16
+    trees: Mapping[int, TriangleTree] = field(default_factory=dict)
     by_spheres: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
     num_carried: int = 0
 
     @classmethod
     def of(cls, urdf: UrdfFile, spheres: SphereSet, folders: Sequence[Path] = ()) -> "RobotSurface":
-        """The collision geometry of a URDF; the spheres of links that have none that can be read.
+        """The visual geometry of a URDF; of links without, or whose cannot be read, the collision geometry; the
+        spheres of links that have neither.
 
         folders: where ``package://`` paths are looked for, before the folders above the URDF.
         """
-        unread = {link for link, _ in urdf.other_shapes}
-        pieces = []
-        for mesh in urdf.meshes:
-            try:
-                pieces.append((mesh.link, _triangles(urdf, mesh, folders)))
-            except InputError:
-                unread.add(mesh.link)
+        seen = visual_urdf(urdf)
+        pieces, unread = _read(seen, folders)
+        if unread:
+            seen = visual_urdf(urdf, without=unread)
+            pieces, unread = _read(seen, folders)
         by_spheres = tuple(
-            link for link in dict.fromkeys(spheres.links) if link in unread or link not in urdf.collision_links
+            link for link in dict.fromkeys(spheres.links) if link in unread or link not in seen.collision_links
         )
         left_out = set(by_spheres)
-        shapes = [shape for shape in urdf.shapes if shape.link not in left_out]
+        shapes = [shape for shape in seen.shapes if shape.link not in left_out]
         is_ball = [link in left_out for link in spheres.links]
         balls = [
             _ball(link, center, radius)
@@ -93,17 +95,17 @@ class RobotSurface:
         """Primitives, and triangles (F, 3, 3) in the frame of a link each."""
         links = tuple(dict.fromkeys([*(s.link for s in shapes), *(link for link, _ in triangles)]))
         number = {link: index for index, link in enumerate(links)}
-        corners = [part for _, part in triangles]
+        corners = np.concatenate([np.zeros((0, 3, 3)), *(part for _, part in triangles)])
+        owners = np.repeat([number[link] for link, _ in triangles], [len(part) for _, part in triangles])
         return cls(
             links=links,
             kinds=np.array([KINDS[s.kind] for s in shapes], np.float64),
             sizes=np.array([_sizes(s) for s in shapes], np.float64).reshape(-1, 3),
             T_link_solid=np.array([s.T_link_shape for s in shapes], np.float64).reshape(-1, 4, 4),
             solid_links=np.array([number[s.link] for s in shapes], np.int16),
-            triangles=np.concatenate([np.zeros((0, 3, 3)), *corners]),
-            triangle_links=np.repeat([number[link] for link, _ in triangles], [len(part) for part in corners]).astype(
-                np.int16
-            ),
+            triangles=corners,
+            triangle_links=owners.astype(np.int16),
+            trees={int(k): TriangleTree(corners[owners == k]) for k in np.unique(owners)},
             by_spheres=by_spheres,
             fixed=fixed,
         )
@@ -120,7 +122,8 @@ class RobotSurface:
             Shape(link=link, kind="box", size=tuple(box.upper - box.lower), T_link_shape=_shifted(box))
             for link, box in boxes
         ]
-        return RobotSurface(
+        return replace(
+            self,
             links=(*self.links, *(s.link for s in shapes)),
             kinds=np.append(self.kinds, [BOX] * len(shapes)),
             sizes=np.concatenate([self.sizes, np.array([_sizes(s) for s in shapes]).reshape(-1, 3)]),
@@ -128,10 +131,6 @@ class RobotSurface:
                 [self.T_link_solid, np.array([s.T_link_shape for s in shapes]).reshape(-1, 4, 4)]
             ),
             solid_links=np.append(self.solid_links, len(self.links) + np.arange(len(shapes))).astype(np.int16),
-            triangles=self.triangles,
-            triangle_links=self.triangle_links,
-            by_spheres=self.by_spheres,
-            fixed=self.fixed,
             num_carried=len(shapes),
         )
 
@@ -179,13 +178,12 @@ class RobotSurface:
         k = intrinsics
         T_camera_link = invert_transform(T_world_camera) @ T_world_link
         T_solid_camera = np.linalg.inv(T_camera_link[self.solid_links] @ self.T_link_solid)
-        T = T_camera_link[self.triangle_links]
-        corners = np.einsum("fij,fkj->fki", T[:, :3, :3], self.triangles) + T[:, None, :3, 3]
         scene = SurfaceScene(
             solids=self._solids(T_solid_camera),
             solid_links=self.solid_links,
-            triangles=np.ascontiguousarray(corners),
+            triangles=self.triangles,
             triangle_links=self.triangle_links,
+            link_poses=np.ascontiguousarray(T_camera_link[:, :3]),
         )
         packed = np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height], np.float64)
         depth = np.ascontiguousarray(measured, np.float32)
@@ -197,14 +195,30 @@ class RobotSurface:
         points_world: NDArray[np.floating],
         *,
         without: Sequence[str] = (),
+        within: NDArray[np.floating] | float = np.inf,
         num_threads: int = 1,
     ) -> Float64:
-        """Signed distance (Q,) [m] of points (Q, 3) to the nearest solid, negative inside; neither triangles nor the
-        links `without` count.
+        """Signed distance (Q,) [m] of points (Q, 3) to the nearest solid or triangle, negative inside; to triangles
+        infinite where it is more than `within` (Q,) [m]. The links `without` do not count.
         """
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
-        counts = np.array([link not in without for link in self.links], bool)[self.solid_links]
-        return solid_distance(points_world, self._solids(T_solid_world)[counts], num_threads)
+        counts = np.array([link not in without for link in self.links], bool)
+        least = solid_distance(points_world, self._solids(T_solid_world)[counts[self.solid_links]], num_threads)
+        for number, tree in self.trees.items():
+            if counts[number]:
+                points = transform_points(invert_transform(T_world_link[number]), points_world)
+                is_inside = self._is_inside(number, points)
+                bound = np.where(is_inside, np.inf, np.minimum(np.maximum(least, 0.0), within))
+                found = tree.closest(points, bound)[0]
+                least = np.minimum(least, np.where(is_inside, -found, found))
+        return least
+
+    def _is_inside(self, number: int, points: Float64) -> Bool:
+        """Points (Q, 3) [m], in the frame of a link with triangles, that these enclose."""
+        corners = self.triangles[self.triangle_links == number]
+        is_inside = np.all((points > corners.min(axis=(0, 1))) & (points < corners.max(axis=(0, 1))), axis=1)
+        is_inside[is_inside] = self.trees[number].holds(points[is_inside])
+        return np.asarray(is_inside)
 
     def _solids(self, T_solid: NDArray[np.floating]) -> Float64:
         """Rows (P, 16) of `SurfaceScene` for the frame from which T_solid (P, 4, 4) leads to each solid's own."""
@@ -228,14 +242,15 @@ def _areas(kinds: Float64, sizes: Float64) -> Float64:
     return np.select([kinds == kind for kind in (BOX, CYLINDER, BALL, CAPSULE)], choices)
 
 
-def _triangles(urdf: UrdfFile, mesh: MeshShape, folders: Sequence[Path]) -> Float64:
-    """(F, 3, 3) in the link's frame. An open surface comes twice, turned: it is seen, and nothing is inside it."""
-    parts = [solid.surface for solid in mesh_pieces(mesh, load_mesh(mesh_path(urdf.path, mesh, folders)))]
-    return np.concatenate([corners for part in parts for corners in _sides(part)])
-
-
-def _sides(mesh: TriangleMesh) -> list[Float64]:
-    return [mesh.corners] if mesh.is_closed else [mesh.corners, mesh.corners[:, ::-1]]
+def _read(urdf: UrdfFile, folders: Sequence[Path]) -> tuple[list[tuple[str, Float64]], set[str]]:
+    """Of each mesh its link and its triangles (F, 3, 3) in that frame; and links of which something is not read."""
+    pieces, unread = [], {link for link, _ in urdf.other_shapes}
+    for mesh in urdf.meshes:
+        try:
+            pieces.append((mesh.link, placed(mesh, load_mesh(mesh_path(urdf.path, mesh, folders))).corners))
+        except InputError:
+            unread.add(mesh.link)
+    return [(link, corners) for link, corners in pieces if link not in unread], unread
 
 
 def _sizes(shape: Shape) -> tuple[float, float, float]:

@@ -199,11 +199,14 @@ def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
     )
 
 
-def visual_urdf(urdf: UrdfFile) -> UrdfFile:
-    """The robot as cameras see it: links with visual geometry have that for their collision geometry."""
+def visual_urdf(urdf: UrdfFile, without: Collection[str] = ()) -> UrdfFile:
+    """The robot as cameras see it: visual geometry replaces the collision geometry of each link that has some, but
+    for the links `without`.
+    """
     root = ElementTree.fromstring(urdf.text)
     for link in root.findall("link"):
-        seen = [visual for visual in link.findall("visual") if visual.find("geometry") is not None]
+        is_seen = link.get("name") not in without
+        seen = [visual for visual in link.findall("visual") if is_seen and visual.find("geometry") is not None]
         for collision in link.findall("collision") if seen else ():
             link.remove(collision)
         for visual in seen:

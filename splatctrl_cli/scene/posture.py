@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import ROBOT_REACH
 from splatctrl_cli.records import Box, Float32, Float64
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.surface import RobotSurface
@@ -32,23 +33,16 @@ class RobotPosture:
             return RobotSurface.of_balls(self.centers, self.radii), np.eye(4)[None]
         return self.surface, self.T_world_surface[stamp_ns]
 
-    def distance(self, points_world: NDArray[np.floating]) -> Float64:
-        """Signed distance (N,) [m] of points (N, 3) to the robot's solids at the newest stamp, negative inside; to
-        its spheres where it has triangles, which have no distance.
+    def distance(self, points_world: NDArray[np.floating], without: Sequence[str] = ()) -> Float64:
+        """Signed distance (N,) [m] of points (N, 3) to the robot's surface at the newest stamp, negative inside; not
+        told beyond `ROBOT_REACH`. The links `without` do not count.
         """
-        surface, T = self._solids()
-        return surface.distance(T, points_world, num_threads=self.num_threads)
+        surface, T = self.seen_at(max(self.T_world_surface, default=0))
+        return surface.distance(T, points_world, without=without, within=ROBOT_REACH, num_threads=self.num_threads)
 
     def distance_to_moving(self, points_world: NDArray[np.floating]) -> Float64:
-        """The same to the solids of links that joints move."""
-        surface, T = self._solids()
-        return surface.distance(T, points_world, without=surface.fixed, num_threads=self.num_threads)
-
-    def _solids(self) -> tuple[RobotSurface, Float64]:
-        surface, T = self.seen_at(max(self.T_world_surface, default=0))
-        if not len(surface.triangles):
-            return surface, T
-        return RobotSurface.of_balls(self.centers, self.radii), np.eye(4)[None]
+        """The same to the links that joints move."""
+        return self.distance(points_world, () if self.surface is None else self.surface.fixed)
 
 
 def posture_of(
@@ -58,7 +52,7 @@ def posture_of(
 
     carried: boxes in the frames of links, which count as the robot's own surface.
     """
-    spheres, surface = robot.sphere_set, robot.surface.with_boxes(carried)
+    spheres, surface = robot.sphere_set, robot.surface.with_boxes(carried) if carried else robot.surface
     pose = {link: robot.frame_pose(q, link) for link in set(spheres.links)}
     return RobotPosture(
         centers=robot.sphere_centers(q),

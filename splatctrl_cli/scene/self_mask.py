@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import MASK_FAR_OFF, MASK_PIXELS, MASK_SIGMAS
+from splatctrl_cli.config.fixed import MASK_FAR_OFF, MASK_PIXELS, MASK_SIGMAS, MASK_SPECK
+from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.time_steps import AuditRow
@@ -46,10 +47,11 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
 
     A pixel is robot where its depth z lies within `self_mask_tolerance` + 2 `depth_error` z^2 of the depths that the
     rendered robot has within a few pixels: as many as the tolerance is wide at the robot's depth, so that a slanted
-    surface and an outline that is off by the calibration are explained too. Spheres that stand for a link enclose its
+    surface and an outline that is off by the calibration are explained too; of a robot drawn by triangles, so is a
+    point as near to any of them, or inside: it is seen through a slit. Spheres that stand for a link enclose its
     surface and are not it, as boxes do what it carries: what lies inside them is robot. At the outline, what is
-    behind the robot and before everything that is seen beside it is mixed: the pixel sees both; and so is, before the
-    robot's surface, one pixel by itself: noise, where two links meet. Everything else with a depth is an object.
+    behind the robot and before everything that is seen beside it is mixed: the pixel sees both; and so is a speck
+    before the robot's surface (`_specks`): noise, where two links meet. Everything else with a depth is an object.
     """
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     shown = surface.render(
@@ -76,10 +78,18 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     is_explained &= depth <= farthest_within(rendered, reach) + tolerance
     if surface.vague:
         is_explained |= np.isin(inside, surface.vague)
+    if surface.trees:
+        is_near = cv2.dilate(is_robot.view(np.uint8), _window(3 * reach + 3)).view(bool)
+        v, u = np.nonzero(is_near & has_depth & ~is_explained)
+        rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
+        points = transform_points(frame.T_world_camera, rays)
+        within = tolerance[v, u].astype(np.float64)
+        is_explained[v, u] = surface.distance(T_world_link, points, within=within) <= within
     kinds[is_explained] = PixelKind.ROBOT
     core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     kinds[_mixed(depth, has_depth & ~is_explained, nearest, core, tolerance, reach)] = PixelKind.MIXED
-    kinds[is_robot & _alone(kinds == PixelKind.OBJECT)] = PixelKind.MIXED
+    pixel_area = np.square(rendered / frame.intrinsics.fx)
+    kinds[_specks(kinds == PixelKind.OBJECT, is_robot, pixel_area)] = PixelKind.MIXED
     offset = depth - rendered
     is_told = core & has_depth & (np.abs(offset) <= MASK_FAR_OFF) & (link < len(surface.links) - surface.num_carried)
     is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
@@ -93,10 +103,16 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     )
 
 
-def _alone(chosen: Bool) -> Bool:
-    """Those of chosen pixels (H, W) with no other among the eight about them."""
-    around = cv2.boxFilter(chosen.view(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(chosen & (around == 1))
+def _specks(chosen: Bool, over: Bool, area: Float32) -> Bool:
+    """Chosen pixels (H, W) in a connected piece that lies all `over` the robot and is one pixel, or smaller than
+    `MASK_SPECK` by the area (H, W) [m^2] of the robot's surface in each pixel.
+    """
+    num, piece, stats, _ = cv2.connectedComponentsWithStats(chosen.view(np.uint8), connectivity=8)
+    spread = np.bincount(piece.ravel(), area.ravel(), num)
+    is_aside = np.bincount(piece.ravel(), ~over.ravel(), num) > 0
+    is_small = (spread < MASK_SPECK) | (stats[:, cv2.CC_STAT_AREA] == 1)
+    is_small[0] = False
+    return np.asarray((is_small & ~is_aside)[piece])
 
 
 def _by_link(values: NDArray[Any], links: NDArray[np.int16], names: Sequence[str]) -> dict[str, NDArray[Any]]:

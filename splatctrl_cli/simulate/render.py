@@ -118,18 +118,19 @@ class Renderer:
         if meshes is None:
             return
         k = self.camera.intrinsics
-        T_camera = (invert_transform(self.camera.T_world_camera) @ meshes.T_world_link)[meshes.owners]
-        corners = np.einsum("fij,fkj->fki", T_camera[:, :3, :3], meshes.triangles) + T_camera[:, None, :3, 3]
+        T_camera = invert_transform(self.camera.T_world_camera) @ meshes.T_world_link
         nothing = np.zeros((k.height, k.width), np.float32)
         for ray, (du, dv) in enumerate(OFFSETS[: len(depth)]):
             at_ray = np.array([k.fx, k.fy, k.cx - du, k.cy - dv, k.width, k.height], np.float64)
-            for first in range(0, len(corners), FACES_AT_ONCE):
-                part = np.ascontiguousarray(corners[first : first + FACES_AT_ONCE])
+            for first in range(0, len(meshes.owners), FACES_AT_ONCE):
+                part = slice(first, first + FACES_AT_ONCE)
+                owners = meshes.owners[part]
                 scene = SurfaceScene(
                     solids=np.zeros((0, 16)),
                     solid_links=np.zeros(0, np.int16),
-                    triangles=part,
-                    triangle_links=np.arange(len(part), dtype=np.int16),
+                    triangles=meshes.triangles[part],
+                    triangle_links=np.arange(len(owners), dtype=np.int16),
+                    link_poses=np.ascontiguousarray(T_camera[owners, :3]),
                 )
                 seen = render_surface(scene, at_ray, nothing, tolerance=0.0, quadratic=0.0)
                 mine = (seen.link >= 0) & (seen.depth < depth[ray])

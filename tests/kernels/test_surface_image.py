@@ -51,6 +51,7 @@ def scene_of(solids: list[tuple[str, tuple[float, ...], Float64]], triangles: Fl
         solid_links=np.arange(len(solids), dtype=np.int16),
         triangles=faces,
         triangle_links=np.full(len(faces), 7, np.int16),
+        link_poses=np.tile(np.eye(4)[:3], (8, 1, 1)),
     )
 
 
@@ -104,27 +105,16 @@ def test_depth_link_and_inside_are_those_of_one_ray_at_a_time(seed: int) -> None
     assert num_seen > 300 and num_inside > 20
 
 
-def test_triangles_show_what_their_solid_shows_and_hold_the_same_points() -> None:
+def test_triangles_show_what_their_solid_shows() -> None:
     center, radius = np.array([0.05, -0.02, 0.9]), 0.15
     T = pose_at(center)
-    measured = np.random.default_rng(0).uniform(0.6, 1.2, (int(K[5]), int(K[4]))).astype(np.float32)
-    ball = rendered(scene_of([("sphere", (radius,), T)]), measured)
-    faces = rendered(scene_of([], ball_faces(center, radius)), measured)
+    ball = rendered(scene_of([("sphere", (radius,), T)]))
+    faces = rendered(scene_of([], ball_faces(center, radius)))
     both = (ball.depth > 0) & (faces.depth > 0)
     assert both.sum() > 200
     assert ((ball.depth > 0) != (faces.depth > 0)).sum() < 20
     assert np.abs(ball.depth - faces.depth)[both].mean() < 1e-3
-    assert ((ball.inside >= 0) != (faces.inside >= 0)).sum() < 12
-    assert (faces.inside >= 0).sum() > 60
     assert (faces.link[faces.depth > 0] == 7).all()
-
-
-def test_nothing_is_inside_a_surface_that_is_drawn_from_both_sides() -> None:
-    faces = ball_faces(np.array([0.0, 0.0, 0.9]), 0.15)
-    measured = np.full((int(K[5]), int(K[4])), 0.9, np.float32)
-    image = rendered(scene_of([], np.ascontiguousarray(np.concatenate([faces, faces[:, ::-1]]))), measured)
-    assert (image.depth > 0).sum() > 200
-    assert (image.inside == -1).all()
 
 
 def test_a_solid_that_holds_the_camera_is_not_seen() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import NEXT_SCENE_NS
-from splatctrl_cli.control.audit import DistanceFunction, Observed, observed_lookup
+from splatctrl_cli.control.audit import BallDistance, DistanceFunction, Observed, observed_lookup
 from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.control.scene_field import SceneStep, guarded
@@ -247,7 +247,10 @@ def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: 
     exact = SphereField.over(spheres, threads=threads)
     return KnownFields(
         barrier=barrier,
-        distances={"exact": _distance(exact), "barrier": _distance(barrier)},
+        distances={
+            "exact": BallDistance(of_points=_distance(exact), centers=chosen.centers, radii=chosen.radii),
+            "barrier": _distance(barrier),
+        },
         median_radius=float(np.median(chosen.radii)),
         obstacles=lambda points: _nearest_spheres(obstacles, exact.nearest(points), points),
         human=human,
@@ -263,7 +266,8 @@ def _splats_alone(obstacles: ObstacleSpheres, threads: int) -> DistanceFunction 
     centers, radii = obstacles.splats.centers[is_splat], obstacles.splats.radii[is_splat]
     if not len(radii):
         return lambda points: np.full(len(points), np.inf)
-    return _distance(SphereField(centers, radii, threads=threads))
+    field = SphereField(centers, radii, threads=threads)
+    return BallDistance(of_points=_distance(field), centers=centers, radii=radii)
 
 
 def _nearest_spheres(obstacles: ObstacleSpheres, index: Index, points: Float64) -> tuple[Obstacle, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
 from splatctrl_cli.control.arm import sphere_names
-from splatctrl_cli.control.audit import AuditTrace, Clearance, audited, moving_clearance
+from splatctrl_cli.control.audit import AuditTrace, Clearance, audited, moving_clearance, part_clearances
 from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
 from splatctrl_cli.control.limits import MotionLimits
@@ -164,8 +164,7 @@ class ReplayRecord:
     def _clearance_in(self, scene_ns: int, stamps: Stamps, positions: Float64) -> Float64:
         """Of states (T,), (T, J) in the scene that is known at another time than theirs (T,) [m]."""
         known = self._scene.at(scene_ns)
-        centers = self._model.sphere_centers_batch(positions)
-        each = moving_clearance(self._model, centers, known.distances["exact"])[1]
+        each = moving_clearance(self._model, positions, known.distances["exact"])[1]
         return np.asarray(self._unexpected(known, stamps, positions, each).min(axis=1))
 
     def _look_at_self(self, part: AuditTrace) -> AuditTrace:
@@ -190,7 +189,9 @@ class ReplayRecord:
         """Bounds between the states of a block, and since the last state of the one before, in this block's scene."""
         known = self._scene.at(int(part.stamp_ns[0])).distances
         name = "certified" if "certified" in known else "exact"
+        is_surface = part_clearances(self._model, part.position[:1], known[name])[1]
         deficit = self._reach.radii - self._model.sphere_set.radii[self._reach.moving]
+        deficit[is_surface] = 0.0
         stamps, positions, at_states = part.stamp_ns, part.position, part.of_spheres[name] - deficit
         if self._before is not None:
             stamp, q, velocity = self._before
@@ -272,8 +273,7 @@ class ReplayRecord:
         alone, splats_alone = exact.copy(), self._scene.at(int(part.stamp_ns[0])).splats_alone
         low = np.flatnonzero(exact < self._margin - SLIGHTLY_UNDER)
         if splats_alone is not None and len(low):
-            centers = self._model.sphere_centers_batch(part.position[low])
-            alone[low] = moving_clearance(self._model, centers, splats_alone)[0].distance
+            alone[low] = moving_clearance(self._model, part.position[low], splats_alone)[0].distance
         self.between.append(represented=alone)
 
     def _nearest(self, part: AuditTrace) -> list[Obstacle | None]:

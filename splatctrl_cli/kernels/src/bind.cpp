@@ -43,4 +43,5 @@ NB_MODULE(SPLATCTRL_MODULE, m) {
   splatctrl::bind_occupancy(m);
   splatctrl::bind_surface(m);
   splatctrl::bind_points(m);
+  splatctrl::bind_triangles(m);
 }

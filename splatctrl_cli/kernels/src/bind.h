@@ -44,5 +44,6 @@ void bind_chain(nb::module_& m);
 void bind_edges(nb::module_& m);
 void bind_surface(nb::module_& m);
 void bind_points(nb::module_& m);
+void bind_triangles(nb::module_& m);
 
 }  // namespace splatctrl

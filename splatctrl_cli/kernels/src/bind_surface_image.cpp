@@ -45,9 +45,9 @@ void bind_surface(nb::module_& m) {
       "render_surface",
       [](const Array<const double>& intrinsics, const Array<const double>& solids,
          const Array<const std::int16_t>& solid_links, const Array<const double>& triangles,
-         const Array<const std::int16_t>& triangle_links, const Array<const float>& measured, float tolerance,
-         float quadratic, const Array<float>& depth, const Array<std::int16_t>& link,
-         const Array<std::int16_t>& inside, int num_threads) {
+         const Array<const std::int16_t>& triangle_links, const Array<const double>& link_poses,
+         const Array<const float>& measured, float tolerance, float quadratic, const Array<float>& depth,
+         const Array<std::int16_t>& link, const Array<std::int16_t>& inside, int num_threads) {
         expect(intrinsics.size() == 6, "intrinsics: expected 6 numbers");
         const double* k = intrinsics.data();
         const SurfaceCamera camera{k[0], k[1], k[2], k[3], static_cast<int>(k[4]), static_cast<int>(k[5])};
@@ -56,20 +56,21 @@ void bind_surface(nb::module_& m) {
                "expected images (H, W)");
         expect(triangles.size() == 9 * triangle_links.size(), "triangles: expected (F, 3, 3) and links (F,)");
         const std::vector<SurfaceSolid> shapes = solids_from(solids, solid_links);
-        std::vector<SurfaceTriangle> faces(triangle_links.size());
-        for (std::size_t i = 0; i < faces.size(); ++i) {
-          const double* p = triangles.data() + 9 * i;
-          faces[i] = {{p, p + 3, p + 6}, triangle_links.data()[i]};
+        const int num = static_cast<int>(triangle_links.size());
+        for (int i = 0; i < num; ++i) {
+          const int number = triangle_links.data()[i];
+          expect(number >= 0 && 12 * static_cast<std::size_t>(number) < link_poses.size(), "triangles: no such link");
         }
         const nb::gil_scoped_release release;
-        render_surface(camera, shapes.data(), static_cast<int>(shapes.size()), faces.data(),
-                       static_cast<int>(faces.size()), {measured.data(), tolerance, quadratic},
-                       {depth.data(), link.data(), inside.data()}, num_threads);
+        render_surface(camera, shapes.data(), static_cast<int>(shapes.size()),
+                       {triangles.data(), link_poses.data(), triangle_links.data(), num},
+                       {measured.data(), tolerance, quadratic}, {depth.data(), link.data(), inside.data()},
+                       num_threads);
       },
       nb::arg("intrinsics").noconvert(), nb::arg("solids").noconvert(), nb::arg("solid_links").noconvert(),
-      nb::arg("triangles").noconvert(), nb::arg("triangle_links").noconvert(), nb::arg("measured").noconvert(),
-      nb::arg("tolerance"), nb::arg("quadratic"), nb::arg("depth").noconvert(), nb::arg("link").noconvert(),
-      nb::arg("inside").noconvert(), nb::arg("num_threads"));
+      nb::arg("triangles").noconvert(), nb::arg("triangle_links").noconvert(), nb::arg("link_poses").noconvert(),
+      nb::arg("measured").noconvert(), nb::arg("tolerance"), nb::arg("quadratic"),
+      nb::arg("depth").noconvert(), nb::arg("link").noconvert(), nb::arg("inside").noconvert(), nb::arg("num_threads"));
 }
 
 }  // namespace splatctrl

@@ -164,11 +164,10 @@ void cast_row(const SurfaceSolid& solid, const PixelBox& box, const SurfaceCamer
   }
 }
 
-// What triangles alone show: nearest depth, its link, and how often each measured point's ray has entered their
-// surfaces before it and not left them.
+// What triangles alone show: nearest depth and its link.
 struct TriangleImage {
   std::vector<float> near;
-  std::vector<std::int16_t> link, winding;
+  std::vector<std::int16_t> link;
 };
 
 inline double cross(const double* a, const double* b, const double* p) {
@@ -178,23 +177,15 @@ inline double cross(const double* a, const double* b, const double* p) {
 // Of two triangles that share an edge through a pixel's centre exactly one has the pixel.
 inline bool owns_edge(const double* a, const double* b) { return b[1] < a[1] || (b[1] == a[1] && b[0] > a[0]); }
 
-void draw(const SurfaceTriangle& triangle, const SurfaceCamera& camera, const SurfaceMeasurement& measured,
-          TriangleImage& out) {
+// corner (3, 3): in the optical frame.
+void draw(const double* corner, std::int16_t link, const SurfaceCamera& camera, TriangleImage& out) {
   double p[3][2], inverse[3];  // pixels, 1 / depth
   for (int i = 0; i < 3; ++i) {
-    const double* c = triangle.corner[i];
+    const double* c = corner + 3 * i;
     if (c[2] < kNear) return;
     inverse[i] = 1.0 / c[2];
     p[i][0] = camera.fx * c[0] * inverse[i] + camera.cx;
     p[i][1] = camera.fy * c[1] * inverse[i] + camera.cy;
-  }
-  double area = cross(p[0], p[1], p[2]);
-  if (area == 0.0) return;
-  const bool is_front = area < 0.0;  // v points down: counter-clockwise seen from outside turns the other way
-  if (!is_front) {
-    std::swap(p[1], p[2]);
-    std::swap(inverse[1], inverse[2]);
-    area = -area;
   }
   const auto least = [&](int k) { return std::min({p[0][k], p[1][k], p[2][k]}); };
   const auto most = [&](int k) { return std::max({p[0][k], p[1][k], p[2][k]}); };
@@ -203,6 +194,14 @@ void draw(const SurfaceTriangle& triangle, const SurfaceCamera& camera, const Su
   const int right = static_cast<int>(std::floor(std::min(most(0), camera.width - 1.0)));
   const int top = static_cast<int>(std::ceil(std::max(least(1), 0.0)));
   const int bottom = static_cast<int>(std::floor(std::min(most(1), camera.height - 1.0)));
+  if (left > right || top > bottom) return;
+  double area = cross(p[0], p[1], p[2]);
+  if (area == 0.0) return;
+  if (area > 0.0) {  // v points down: seen from inside
+    std::swap(p[1], p[2]);
+    std::swap(inverse[1], inverse[2]);
+    area = -area;
+  }
   for (int v = top; v <= bottom; ++v) {
     for (int u = left; u <= right; ++u) {
       const double at[2] = {double(u), double(v)};
@@ -214,13 +213,9 @@ void draw(const SurfaceTriangle& triangle, const SurfaceCamera& camera, const Su
       if (!is_in) continue;
       const float z = static_cast<float>(area / (w[0] * inverse[0] + w[1] * inverse[1] + w[2] * inverse[2]));
       const std::size_t pixel = static_cast<std::size_t>(v) * camera.width + u;
-      if (z < out.near[pixel]) {
-        out.near[pixel] = z;
-        out.link[pixel] = triangle.link;
-      }
-      const float m = measured.depth[pixel], tolerance = measured.tolerance + measured.quadratic * m * m;
-      if (is_front && z < m - tolerance) ++out.winding[pixel];
-      if (!is_front && z < m + tolerance) --out.winding[pixel];
+      if (z >= out.near[pixel]) continue;
+      out.near[pixel] = z;
+      out.link[pixel] = link;
     }
   }
 }
@@ -228,13 +223,21 @@ void draw(const SurfaceTriangle& triangle, const SurfaceCamera& camera, const Su
 }  // namespace
 
 void render_surface(const SurfaceCamera& camera, const SurfaceSolid* solids, int num_solids,
-                    const SurfaceTriangle* triangles, int num_triangles, const SurfaceMeasurement& measured,
-                    const SurfaceImage& out, int num_threads) {
+                    const SurfaceTriangles& triangles, const SurfaceMeasurement& measured, const SurfaceImage& out,
+                    int num_threads) {
   TriangleImage drawn;
-  if (num_triangles > 0) {
+  if (triangles.num > 0) {
     const std::size_t size = static_cast<std::size_t>(camera.width) * camera.height;
-    drawn = {std::vector<float>(size, kFar), std::vector<std::int16_t>(size, -1), std::vector<std::int16_t>(size)};
-    for (int i = 0; i < num_triangles; ++i) draw(triangles[i], camera, measured, drawn);
+    drawn = {std::vector<float>(size, kFar), std::vector<std::int16_t>(size, -1)};
+    for (int i = 0; i < triangles.num; ++i) {
+      const double* pose = triangles.poses + 12 * triangles.link[i];
+      double there[9];
+      for (int k = 0; k < 9; ++k) {
+        const double *row = pose + k % 3 * 4, *c = triangles.corners + 9 * static_cast<std::size_t>(i) + k / 3 * 3;
+        there[k] = row[0] * c[0] + row[1] * c[1] + row[2] * c[2] + row[3];
+      }
+      draw(there, triangles.link[i], camera, drawn);
+    }
   }
   std::vector<PixelBox> boxes(num_solids);
   for (int i = 0; i < num_solids; ++i) boxes[i] = pixels_of(solids[i], camera);
@@ -249,10 +252,9 @@ void render_surface(const SurfaceCamera& camera, const SurfaceSolid* solids, int
         const float m = measured.depth[first + u];
         row.measured[u] = m;
         row.tolerance[u] = measured.tolerance + measured.quadratic * m * m;
-        if (num_triangles == 0) continue;
+        if (triangles.num == 0) continue;
         row.near[u] = drawn.near[first + u];
         row.link[u] = drawn.link[first + u];
-        if (m > 0.0f && drawn.winding[first + u] > 0) row.inside[u] = row.link[u];
       }
       for (int i = 0; i < num_solids; ++i) {
         if (v >= boxes[i].top && v < boxes[i].bottom) cast_row(solids[i], boxes[i], camera, v, row);

@@ -17,10 +17,11 @@ struct SurfaceSolid {
   std::int16_t link;
 };
 
-// A triangle in the optical frame, counter-clockwise seen from outside.
-struct SurfaceTriangle {
-  const double* corner[3];
-  std::int16_t link;
+// Triangles (num, 3, 3) in the frames of links; poses (L, 3, 4) lead from those to the optical frame.
+struct SurfaceTriangles {
+  const double *corners, *poses;
+  const std::int16_t* link;
+  int num;
 };
 
 struct SurfaceCamera {
@@ -30,15 +31,15 @@ struct SurfaceCamera {
 
 // measured (H, W) [m] along the optical axis, 0 = none. A measured point is inside where it lies by more than
 // `tolerance` [m], plus `quadratic` times its depth squared, behind the front and before the back of one solid on its
-// ray (for triangles: of a closed surface).
+// ray.
 struct SurfaceMeasurement {
   const float* depth;
   float tolerance, quadratic;
 };
 
 // depth (H, W) [m] of the nearest surface, 0 = none, and its link, -1 = none; inside (H, W): the link of the solid that
-// holds the measured point, -1 = none (of triangles: the link of the nearest surface). A solid that holds the camera
-// is not seen; nor is a triangle that reaches behind the camera.
+// holds the measured point, -1 = none. A solid that holds the camera is not seen; nor is a triangle that reaches behind
+// the camera.
 struct SurfaceImage {
   float* depth;
   std::int16_t* link;
@@ -46,7 +47,7 @@ struct SurfaceImage {
 };
 
 void render_surface(const SurfaceCamera& camera, const SurfaceSolid* solids, int num_solids,
-                    const SurfaceTriangle* triangles, int num_triangles, const SurfaceMeasurement& measured,
-                    const SurfaceImage& out, int num_threads);
+                    const SurfaceTriangles& triangles, const SurfaceMeasurement& measured, const SurfaceImage& out,
+                    int num_threads);
 
 }  // namespace splatctrl

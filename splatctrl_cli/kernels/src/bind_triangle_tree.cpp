@@ -1,0 +1,55 @@
+// Trees of triangles: see kernels/triangles.py for shapes.
+#include "bind.h"
+#include "triangle_tree.h"
+
+namespace splatctrl {
+
+void bind_triangles(nb::module_& m) {
+  nb::class_<TriangleTree>(m, "TriangleTree")
+      .def(
+          "__init__",
+          [](TriangleTree* self, const Array<const double>& corners) {
+            expect(corners.size() % 9 == 0, "expected corners (F, 3, 3)");
+            const nb::gil_scoped_release release;
+            new (self) TriangleTree(corners.data(), static_cast<int>(corners.size() / 9));
+          },
+          nb::arg("corners").noconvert())
+      .def(
+          "closest",
+          [](const TriangleTree& self, const Array<const double>& points, const Array<const double>& bound,
+             const Array<double>& distance, const Array<std::int64_t>& face, const Array<double>& shares,
+             int num_threads) {
+            const std::size_t n = distance.size();
+            expect(points.size() == 3 * n && bound.size() == n && face.size() == n && shares.size() == 3 * n,
+                   "expected points and shares (N, 3), bound, distance and face (N,)");
+            const nb::gil_scoped_release release;
+            self.closest(points.data(), static_cast<int>(n), bound.data(), distance.data(), face.data(),
+                         shares.data(), num_threads);
+          },
+          nb::arg("points").noconvert(), nb::arg("bound").noconvert(), nb::arg("distance").noconvert(),
+          nb::arg("face").noconvert(), nb::arg("shares").noconvert(), nb::arg("num_threads"))
+      .def(
+          "winding",
+          [](const TriangleTree& self, const Array<const double>& points, const Array<double>& number,
+             int num_threads) {
+            expect(points.size() == 3 * number.size(), "expected points (N, 3), number (N,)");
+            const nb::gil_scoped_release release;
+            self.winding(points.data(), static_cast<int>(number.size()), number.data(), num_threads);
+          },
+          nb::arg("points").noconvert(), nb::arg("number").noconvert(), nb::arg("num_threads"))
+      .def(
+          "gaps",
+          [](const TriangleTree& self, const Array<const double>& poses, const Array<const double>& centers,
+             const Array<const double>& radii, const Array<double>& gap, const Array<std::int64_t>& ball,
+             int num_threads) {
+            expect(poses.size() == 12 * gap.size() && ball.size() == gap.size() && centers.size() == 3 * radii.size(),
+                   "expected poses (T, 3, 4), gap and ball (T,), centers (N, 3), radii (N,)");
+            const nb::gil_scoped_release release;
+            self.gaps(poses.data(), static_cast<int>(gap.size()), centers.data(), radii.data(),
+                      static_cast<int>(radii.size()), gap.data(), ball.data(), num_threads);
+          },
+          nb::arg("poses").noconvert(), nb::arg("centers").noconvert(), nb::arg("radii").noconvert(),
+          nb::arg("gap").noconvert(), nb::arg("ball").noconvert(), nb::arg("num_threads"));
+}
+
+}  // namespace splatctrl

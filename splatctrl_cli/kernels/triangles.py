@@ -1,0 +1,47 @@
+"""Distances from points and balls to triangles, and what triangles enclose; compiled. The same bytes at any thread
+count.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.kernels import Bool, Float64, Int64, native
+
+INSIDE = 0.5  # of a winding number, from which a point is inside
+
+
+class TriangleTree:
+    """Triangles (F, 3, 3) [m], counter-clockwise seen from outside; they may be open and in pieces."""
+
+    def __init__(self, corners: Float64, num_threads: int = 1) -> None:
+        self._num_threads = num_threads
+        self._native: Any = native.TriangleTree(np.ascontiguousarray(corners, np.float64))
+
+    def closest(self, points: Float64, bound: Float64 | float = np.inf) -> tuple[Float64, Int64, Float64]:
+        """Of points (N, 3) [m]: distance (N,) [m] to the nearest triangle, its number (N,) and the barycentric
+        coordinates (N, 3) of the nearest point on it; infinite, -1 and 0 where it is farther than `bound` (N,) [m].
+        """
+        points = np.ascontiguousarray(points, np.float64)
+        most = np.array(np.broadcast_to(np.float64(bound), len(points)))
+        distance, face, shares = np.empty(len(points)), np.empty(len(points), np.int64), np.empty((len(points), 3))
+        self._native.closest(points, most, distance, face, shares, self._num_threads)
+        return distance, face, shares
+
+    def holds(self, points: Float64) -> Bool:
+        """Points (N, 3) [m] inside: the triangles surround them more than half (the winding number)."""
+        number = np.empty(len(points))
+        self._native.winding(np.ascontiguousarray(points, np.float64), number, self._num_threads)
+        return np.asarray(number > INSIDE)
+
+    def gaps(self, poses: Float64, centers: Float64, radii: Float64) -> tuple[Float64, Int64]:
+        """Signed gap (T,) [m] from the nearest of balls (N, 3), (N,) [m] to the triangles, negative inside, in each
+        of poses (T, 4, 4) from the balls' frame to the triangles'; and the ball's number. Infinite and -1 without
+        any.
+        """
+        gap, ball = np.empty(len(poses)), np.empty(len(poses), np.int64)
+        self._native.gaps(
+            np.ascontiguousarray(poses[:, :3], np.float64), np.ascontiguousarray(centers, np.float64),
+            np.ascontiguousarray(radii, np.float64), gap, ball, self._num_threads,
+        )  # fmt: skip
+        return gap, ball
