@@ -11,9 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import MASK_FAR_OFF, MASK_PIXELS, MASK_SIGMAS, MASK_SPECK
+from splatctrl_cli.config.fixed import (
+    CONTACT_THICKNESS,
+    MASK_FAR_OFF,
+    MASK_PIXELS,
+    MASK_SIGMAS,
+    MASK_SPECK,
+    MASK_STEP,
+    MASK_SURE,
+)
 from splatctrl_cli.geometry import back_project_pixels, transform_points
-from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
+from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.time_steps import AuditRow
 
@@ -68,7 +76,8 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     if box is None:
         return mask
     reach = pixels_of(config.self_mask_tolerance, frame, shown.depth)
-    part = _grown(box, 3 * reach + 3, frame.depth.shape)  # beyond it nothing is explained, mixed or inside
+    wide = 3 * reach + 3  # pixels, beyond which nothing is explained, mixed or inside
+    part = _grown(box, wide, frame.depth.shape)
     depth, rendered, kinds = frame.depth[part], shown.depth[part], kinds[part]
     link, inside = shown.link[part], shown.inside[part]
     has_depth, is_robot = depth > 0, rendered > 0
@@ -78,18 +87,20 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     is_explained &= depth <= farthest_within(rendered, reach) + tolerance
     if surface.vague:
         is_explained |= np.isin(inside, surface.vague)
+    before = np.isfinite(nearest_within(rendered, is_robot, wide)) & has_depth
+    before &= depth < farthest_within(rendered, wide) + CONTACT_THICKNESS
+    is_sure = np.ones_like(before)
     if surface.trees:
-        is_near = cv2.dilate(is_robot.view(np.uint8), _window(3 * reach + 3)).view(bool)
-        v, u = np.nonzero(is_near & has_depth & ~is_explained)
+        v, u = np.nonzero((is_robot | before) & has_depth & ~is_explained)
         rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
-        points = transform_points(frame.T_world_camera, rays)
-        within = tolerance[v, u].astype(np.float64)
-        is_explained[v, u] = surface.distance(T_world_link, points, within=within) <= within
+        sure = tolerance_at(depth[v, u], config, MASK_SURE)
+        gap = surface.distance(T_world_link, transform_points(frame.T_world_camera, rays), within=sure)
+        is_explained[v, u], is_sure[v, u] = gap <= tolerance[v, u], gap > sure
     kinds[is_explained] = PixelKind.ROBOT
     core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     kinds[_mixed(depth, has_depth & ~is_explained, nearest, core, tolerance, reach)] = PixelKind.MIXED
-    pixel_area = np.square(rendered / frame.intrinsics.fx)
-    kinds[_specks(kinds == PixelKind.OBJECT, is_robot, pixel_area)] = PixelKind.MIXED
+    area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0)
+    kinds[_specks(depth, kinds == PixelKind.OBJECT, before, area)] = PixelKind.MIXED
     offset = depth - rendered
     is_told = core & has_depth & (np.abs(offset) <= MASK_FAR_OFF) & (link < len(surface.links) - surface.num_carried)
     is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
@@ -103,16 +114,21 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     )
 
 
-def _specks(chosen: Bool, over: Bool, area: Float32) -> Bool:
-    """Chosen pixels (H, W) in a connected piece that lies all `over` the robot and is one pixel, or smaller than
-    `MASK_SPECK` by the area (H, W) [m^2] of the robot's surface in each pixel.
+def _specks(depth: Float32, found: Bool, before: Bool, area: Float64) -> Bool:
+    """Of found pixels (H, W) those before the robot or at its outline in a piece that is one pixel, or smaller than
+    `MASK_SPECK` by the area (H, W) [m^2] of each, and that no surface found elsewhere carries on.
     """
+    chosen, elsewhere = found & before, found & ~before
     num, piece, stats, _ = cv2.connectedComponentsWithStats(chosen.view(np.uint8), connectivity=8)
-    spread = np.bincount(piece.ravel(), area.ravel(), num)
-    is_aside = np.bincount(piece.ravel(), ~over.ravel(), num) > 0
-    is_small = (spread < MASK_SPECK) | (stats[:, cv2.CC_STAT_AREA] == 1)
-    is_small[0] = False
-    return np.asarray((is_small & ~is_aside)[piece])
+    if num == 1:
+        return chosen
+    farthest = farthest_within(np.where(elsewhere, depth, np.float32(0.0)), 1)
+    goes_on = (nearest_within(depth, elsewhere, 1) < depth + MASK_STEP) & (farthest > depth - MASK_STEP)
+    is_speck = np.bincount(piece.ravel(), area.ravel(), num) < MASK_SPECK
+    is_speck |= stats[:, cv2.CC_STAT_AREA] == 1
+    is_speck &= np.bincount(piece.ravel(), goes_on.ravel(), num) == 0
+    is_speck[0] = False
+    return np.asarray(is_speck[piece])
 
 
 def _by_link(values: NDArray[Any], links: NDArray[np.int16], names: Sequence[str]) -> dict[str, NDArray[Any]]:
@@ -166,9 +182,9 @@ def without_mixed(frame: RgbdFrame, mask: SelfMask) -> RgbdFrame:
     return replace(frame, depth=np.where(is_mixed, np.float32(0.0), frame.depth)) if is_mixed.any() else frame
 
 
-def tolerance_at(depth: Float32, config: OccupancyConfig) -> Float32:
+def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_SIGMAS) -> Float32:
     """By how much [m] a measured depth (...) [m] of the robot may differ from its rendered depth."""
-    return np.asarray(config.self_mask_tolerance + MASK_SIGMAS * config.depth_error * depth * depth, np.float32)
+    return np.asarray(config.self_mask_tolerance + sigmas * config.depth_error * depth * depth, np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
