@@ -65,7 +65,7 @@ def _add_goal(add: Options) -> None:
     add("--frame LINK", "the link to drive (default: the last of the URDF)")
     goal = add.either()
     goal(f"--goal {POSE}", "goal pose in world (default: the logged pose at the end)", pose)
-    goal("--goal-joints Q1,Q2,...", "goal configuration [rad]", numbers)
+    goal("--goal-joints Q1,Q2,...", "goal configuration [rad]; a gripper's fingers may be left out", numbers)
     goal("--waypoints FILE", "goals in order, poses or configurations (.toml or .csv)", Path)
     goal("--follow", "the logged pose of each time is the goal (the default of --mode open-loop)")
     twists = "track the twists of this topic of LOG (Twist, TwistStamped), or of a .toml's table: twists"

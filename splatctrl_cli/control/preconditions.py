@@ -48,7 +48,8 @@ def checked_posture(model: ArmModel, q: Float64, *, what: str = "joint positions
     """q as (J,) float64. Raises InputError where it has another size or is not finite."""
     posture = np.asarray(q, dtype=np.float64)
     if posture.shape != (len(model.joint_names),):
-        raise InputError(f"{what}: expected {len(model.joint_names)} joints, got shape {posture.shape}")
+        names = ", ".join(model.joint_names)
+        raise InputError(f"{what}: expected {len(model.joint_names)} joints ({names}), got shape {posture.shape}")
     if not np.all(np.isfinite(posture)):
         joint = int(np.argmin(np.isfinite(posture)))
         raise InputError(f"{what}: joint {model.joint_names[joint]} is {posture[joint]}, expected a finite angle")

@@ -69,11 +69,24 @@ def goal_waypoints(
     if request.goal is not None:
         return (Waypoint(T_world_goal=transform_from(request.goal[:3], request.goal[3:])),)
     if request.goal_joints is not None:
-        posture = checked_posture(model, np.array(request.goal_joints), what="--goal-joints")
+        posture = _posture(model, np.array(request.goal_joints), logged_end)
         return (Waypoint(T_world_goal=model.frame_pose(posture, frame), posture=posture),)
     if request.waypoints is not None:
         return read_waypoints(request.waypoints, model, frame)
     return (Waypoint(T_world_goal=model.frame_pose(logged_end, frame)),)
+
+
+def _posture(model: RobotModel, values: Float64, logged_end: Float64) -> Float64:
+    """The configuration (J,) of --goal-joints; fingers of a gripper that have no values stay as logged at the end.
+
+    Raises InputError for another number of values, naming the joints.
+    """
+    is_arm = [name not in model.urdf.grippers for name in model.joint_names]
+    if len(values) == sum(is_arm):
+        posture = logged_end.copy()
+        posture[is_arm] = values
+        values = posture
+    return checked_posture(model, values, what="--goal-joints")
 
 
 def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint, ...]:
