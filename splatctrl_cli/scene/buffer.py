@@ -73,8 +73,8 @@ class SplatBuffer:
         self.labels[slots] = Label.OBJECT
         self._reset(np.flatnonzero(slots))
 
-    def set_radius(self, slots: NDArray[np.intp], radius: float) -> None:
-        """Give the splats of slots (K,) a radius [m]."""
+    def set_radius(self, slots: NDArray[np.intp], radius: NDArray[np.floating] | float) -> None:
+        """Give the splats of slots (K,) a radius (K,) [m]."""
         self.parameters[slots, LOG_RADIUS] = np.log(radius)
 
     def fill(self, seeds: Seeds, opacity: float, keep_free: int = 0, label: Label = Label.OBJECT) -> Filled:

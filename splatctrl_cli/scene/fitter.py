@@ -9,10 +9,12 @@ import numpy as np
 
 from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel
 from splatctrl_cli.config.fixed import (
+    CONTACT_REACH,
     EVICT_EVERY,
     NEAREST_REACH,
     NOT_COVERED,
     REFINE_BLOCKS,
+    ROBOT_REACH,
     SEED_ASKED_VIEWS,
     SEED_MUCH_MORE,
 )
@@ -25,7 +27,7 @@ from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_con
 from splatctrl_cli.scene.depth_holes import lost_edges, unanswered_points
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.keyframes import View, Window, make_view, seen_through
-from splatctrl_cli.scene.labels import Seen, relabel
+from splatctrl_cli.scene.labels import Seen, relabel, room_beneath
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
 from splatctrl_cli.scene.posture import RobotPosture, carried
@@ -103,7 +105,11 @@ class SceneFitter:
         robot = robot and replace(robot, num_threads=self.num_threads)
         self._find_mounted(frames)
         config = self.occupancy.config
-        masks = list(self._each(lambda f: object_mask(f) if robot is None else self_mask(f, robot, config), frames))
+        masks = [object_mask(frame) for frame in frames]
+        if robot is not None:
+            earlier = [view.frame for view in self.window.newest]
+            asked = [[*(other for other in frames if other is not frame), *earlier] for frame in frames]
+            masks = list(self._each(lambda f, others: self_mask(f, robot, config, others), frames, asked))
         frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
         views = list(self._each(self.view, frames))
         seen = list(zip(frames, masks, strict=True))
@@ -132,6 +138,7 @@ class SceneFitter:
         self._prune(robot, views, seen, removed)
         filled += self._show_contact(robot, views, seen)
         filled += self._fill_gaps(views, masks, removed, half=self.num_steps % 2 if self.num_steps else None)
+        self._keep_to_surface(robot, seen)
         if self.shell is not None:
             self.shell.step(self.window, self.mounted, self.descent.background)
         self.num_steps += 1
@@ -355,6 +362,19 @@ class SceneFitter:
             seen, mappable, robot, splats, self.config, num_threads=self.num_threads, each=self._each
         )
         return self.buffer.fill(seeds.select(self._is_grounded(seeds.centers, views)), self.config.initial_opacity)
+
+    def _keep_to_surface(self, robot: RobotPosture | None, seen: Seen) -> None:
+        """Let no object's splat near the robot reach farther than the depth that shows its surface, or half of
+        `contact_radius`; those in contact keep all of it.
+        """
+        if robot is None:
+            return
+        slots = np.flatnonzero(self._standing_for(Label.OBJECT))
+        gap = robot.distance(self.buffer.centers[slots])
+        slots = slots[(gap > CONTACT_REACH) & (gap < ROBOT_REACH)]
+        room = room_beneath(self.buffer.centers[slots], seen, self.occupancy.config)
+        most = np.maximum(room, 0.5 * self.config.contact_radius)
+        self.buffer.set_radius(slots, np.minimum(self.buffer.radii[slots], most))
 
     def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
         """Put dead slots, beyond the reserve for gaps, to use where nothing asks for them; counts in `removed`."""

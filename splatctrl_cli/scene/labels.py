@@ -5,13 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import WELL_INSIDE
-from splatctrl_cli.geometry import invert_transform, project, transform_points
-from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
+from splatctrl_cli.config.fixed import MASK_SIGMAS, SURFACE_WITHIN, WELL_INSIDE
+from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
-from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, tolerance_at
+from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at, tolerance_at
 from splatctrl_cli.voxels import SOLID
 
 Seen = Sequence[tuple[RgbdFrame, SelfMask]]
@@ -63,14 +62,10 @@ def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
     best = np.full(len(centers), np.inf, np.float32)
     kinds = np.full(len(centers), PixelKind.NOTHING, np.uint8)
     for frame, mask in seen:
-        k = frame.intrinsics
-        points = transform_points(invert_transform(frame.T_world_camera), centers)
-        z = points[:, 2].astype(np.float32)
-        is_ahead = z > 0
-        pixels = np.floor(project(k, np.where(is_ahead[:, None], points, 1.0)) + 0.5)
-        is_inside = is_ahead & np.all((pixels >= 0) & (pixels < [k.width, k.height]), axis=1)
-        u, v = np.where(is_inside[:, None], pixels, 0).astype(np.int64).T
-        kind, measured, rendered = mask.kinds[v, u], frame.depth[v, u], mask.robot_depth[v, u]
+        pixel, z = pixels_at(frame, centers)
+        is_inside = pixel >= 0
+        kind, rendered = mask.kinds.ravel()[pixel], mask.robot_depth.ravel()[pixel]
+        measured = frame.depth.ravel()[pixel]
         gap = np.abs(z - measured)
         is_hidden = (rendered > 0) & (np.abs(z - rendered) < gap)
         is_object = (kind == PixelKind.OBJECT) & (gap <= config.see_through) & ~is_hidden
@@ -78,6 +73,21 @@ def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
         is_told = is_inside & (is_object | is_robot) & (gap < best)
         best[is_told], kinds[is_told] = gap[is_told], kind[is_told]
     return kinds
+
+
+def room_beneath(centers: Float32, seen: Seen, config: OccupancyConfig) -> Float64:
+    """How far (N,) [m] the spheres about centers (N, 3) [m] may reach, as depth shows objects: how far each centre is
+    behind the surface that it stands for, and the sensor's error; the least over the views, infinite without any.
+    """
+    room = np.full(len(centers), np.inf)
+    for frame, mask in seen:
+        pixel, z = pixels_at(frame, centers)
+        measured = np.where(pixel >= 0, frame.depth.ravel()[pixel], 0.0).astype(np.float64)
+        behind = z - measured
+        is_told = (pixel >= 0) & (mask.kinds.ravel()[pixel] == PixelKind.OBJECT) & (np.abs(behind) < SURFACE_WITHIN)
+        error = MASK_SIGMAS * config.depth_error * measured * measured
+        room[is_told] = np.minimum(room, np.maximum(behind, 0.0) + error)[is_told]
+    return room
 
 
 def human_splats(buffer: SplatBuffer, occupancy: OccupancyMap) -> Bool:

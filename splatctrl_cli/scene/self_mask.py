@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import (
     CONTACT_THICKNESS,
+    MASK_ALONE,
     MASK_FAR_OFF,
     MASK_PIXELS,
     MASK_SIGMAS,
@@ -20,8 +21,8 @@ from splatctrl_cli.config.fixed import (
     MASK_STEP,
     MASK_SURE,
 )
-from splatctrl_cli.geometry import back_project_pixels, transform_points
-from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame, UInt8
+from splatctrl_cli.geometry import back_project_pixels, invert_transform, project, transform_points
+from splatctrl_cli.records import Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.time_steps import AuditRow
 
@@ -50,8 +51,12 @@ class SelfMask:
     reach: float = 0.0
 
 
-def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
+def self_mask(
+    frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig, others: Sequence[RgbdFrame] = ()
+) -> SelfMask:
     """The pixels of a frame by what they show, with the robot as it was at the frame's stamp.
+
+    others: frames of other cameras or of just before, which may confirm what little this one shows beside the robot.
 
     A pixel is robot where its depth z lies within `self_mask_tolerance` + 2 `depth_error` z^2 of the depths that the
     rendered robot has within a few pixels: as many as the tolerance is wide at the robot's depth, so that a slanted
@@ -100,7 +105,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     kinds[_mixed(depth, has_depth & ~is_explained, nearest, core, tolerance, reach)] = PixelKind.MIXED
     area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0)
-    kinds[_specks(depth, kinds == PixelKind.OBJECT, before, area)] = PixelKind.MIXED
+    kinds[_specks(frame, part, kinds == PixelKind.OBJECT, before, area, others, config)] = PixelKind.MIXED
     offset = depth - rendered
     is_told = core & has_depth & (np.abs(offset) <= MASK_FAR_OFF) & (link < len(surface.links) - surface.num_carried)
     is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
@@ -114,21 +119,51 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     )
 
 
-def _specks(depth: Float32, found: Bool, before: Bool, area: Float64) -> Bool:
-    """Of found pixels (H, W) those before the robot or at its outline in a piece that is one pixel, or smaller than
-    `MASK_SPECK` by the area (H, W) [m^2] of each, and that no surface found elsewhere carries on.
+def _specks(
+    frame: RgbdFrame,
+    part: tuple[slice, slice],
+    found: Bool,
+    before: Bool,
+    area: Float64,
+    others: Sequence[RgbdFrame],
+    config: OccupancyConfig,
+) -> Bool:
+    """Of found pixels (H, W) of a part of a frame those before the robot or at its outline in a piece that is too
+    little to be believed, and that no surface found elsewhere carries on.
+
+    By the area (H, W) [m^2] of each pixel: less than `MASK_SPECK`, or than `MASK_ALONE` where there are other frames
+    and none measured half of its points. One pixel by itself is too little, too.
     """
-    chosen, elsewhere = found & before, found & ~before
+    depth, chosen, elsewhere = frame.depth[part], found & before, found & ~before
     num, piece, stats, _ = cv2.connectedComponentsWithStats(chosen.view(np.uint8), connectivity=8)
     if num == 1:
         return chosen
     farthest = farthest_within(np.where(elsewhere, depth, np.float32(0.0)), 1)
     goes_on = (nearest_within(depth, elsewhere, 1) < depth + MASK_STEP) & (farthest > depth - MASK_STEP)
-    is_speck = np.bincount(piece.ravel(), area.ravel(), num) < MASK_SPECK
-    is_speck |= stats[:, cv2.CC_STAT_AREA] == 1
-    is_speck &= np.bincount(piece.ravel(), goes_on.ravel(), num) == 0
-    is_speck[0] = False
-    return np.asarray(is_speck[piece])
+    spread, ends = (np.bincount(piece.ravel(), weights.ravel(), num) for weights in (area, goes_on))
+    is_speck = ((spread < MASK_SPECK) | (stats[:, cv2.CC_STAT_AREA] == 1)) & (ends == 0)
+    is_doubted = ~is_speck & (spread < MASK_ALONE) & (ends == 0) & (len(others) > 0)
+    is_speck[0] = is_doubted[0] = False
+    v, u = np.nonzero(is_doubted[piece])
+    rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
+    points, owner, size = transform_points(frame.T_world_camera, rays), piece[v, u], stats[:, cv2.CC_STAT_AREA]
+    for other in others if len(owner) else ():
+        pixel, z = pixels_at(other, points)
+        measured = np.where(pixel >= 0, other.depth.ravel()[pixel], np.float32(0.0))
+        agrees = (measured > 0) & (np.abs(z - measured) <= tolerance_at(measured, config))
+        is_doubted &= np.bincount(owner, agrees, num) < 0.5 * size
+    return np.asarray((is_speck | is_doubted)[piece])
+
+
+def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float32]:
+    """The pixel that shows each of points (N, 3) [m], world: its number (N,), -1 outside; and depths (N,) [m]."""
+    k = frame.intrinsics
+    there = transform_points(invert_transform(frame.T_world_camera), points)
+    z = there[:, 2].astype(np.float32)
+    pixels = np.floor(project(k, np.where((z > 0)[:, None], there, 1.0)) + 0.5)
+    is_inside = (z > 0) & np.all((pixels >= 0) & (pixels < [k.width, k.height]), axis=1)
+    u, v = np.where(is_inside[:, None], pixels, 0).astype(np.int64).T
+    return np.where(is_inside, v * k.width + u, -1), z
 
 
 def _by_link(values: NDArray[Any], links: NDArray[np.int16], names: Sequence[str]) -> dict[str, NDArray[Any]]:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.geometry import pose_at
@@ -109,16 +110,56 @@ def test_a_lone_depth_at_the_rim_before_nothing_is_mixed_and_a_thin_thing_there_
     assert (kinds(depth)[60 : 60 + rows, rim] == kind).all()
 
 
-@pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.OBJECT)])
-def test_one_pixel_before_the_robot_is_noise_and_two_are_a_thing(columns: int, kind: PixelKind) -> None:
+@pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.MIXED), (3, PixelKind.OBJECT)])
+def test_less_than_fifty_square_millimetres_before_the_robot_are_noise(columns: int, kind: PixelKind) -> None:
     depth = ball_depth()
-    depth[60, 79 : 79 + columns] += [0.012, -0.012][columns - 1]
+    depth[60, 79 : 79 + columns] += [0.012, -0.012, -0.012][columns - 1]
     found = kinds(depth)
     assert (found[60, 79 : 79 + columns] == kind).all()
     assert (found[SHOWN] == PixelKind.ROBOT).sum() == SHOWN.sum() - columns
     depth = np.full(SHOWN.shape, FLOOR)
     depth[20, 20] = 0.8
     assert kinds(depth)[20, 20] == PixelKind.OBJECT  # beside the robot it may be all that is seen of a thing
+
+
+@pytest.mark.parametrize(("side", "gap", "earlier", "kind"), [
+    (3, 0.03, 0.0, PixelKind.MIXED), (3, 0.03, 0.03, PixelKind.OBJECT), (5, 0.03, 0.0, PixelKind.OBJECT),
+])  # fmt: skip
+def test_a_little_before_the_robot_counts_where_another_frame_measured_it_too(
+    side: int, gap: float, earlier: float, kind: PixelKind
+) -> None:
+    now, before = ball_depth(), ball_depth()
+    now[60 : 60 + side, 79 : 79 + side] -= gap
+    before[60 : 60 + side, 79 : 79 + side] -= earlier
+    mask = self_mask(frame(now), robot(), CONFIG, [frame(before)])
+    assert (mask.kinds[60 : 60 + side, 79 : 79 + side] == kind).all()
+    alone = self_mask(frame(now), robot(), CONFIG)  # nothing that could have shown it
+    assert (alone.kinds[60 : 60 + side, 79 : 79 + side] == PixelKind.OBJECT).all()
+
+
+def drawn() -> RobotPosture:
+    """The ball as triangles."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    return replace(robot(), surface=RobotSurface.from_parts([], [("arm", ball.triangles + CENTER)]))
+
+
+@pytest.mark.parametrize("posture", [robot(), drawn()])
+def test_what_is_seen_through_a_slit_is_robot_where_triangles_are_there(posture: RobotPosture) -> None:
+    depth = ball_depth()
+    depth[50:70, 79:82] = CENTER[2] + RADIUS - 0.01  # the inner side of the back
+    found = kinds(depth, posture)[52:68, 79:82]
+    has_triangles = posture.surface is not None and bool(posture.surface.trees)
+    assert (found == (PixelKind.ROBOT if has_triangles else PixelKind.OBJECT)).all()
+
+
+@pytest.mark.parametrize(("gap", "is_object"), [(0.012, False), (0.03, True)])
+def test_before_a_mesh_what_noise_may_explain_is_evidence_of_nothing(gap: float, is_object: bool) -> None:
+    config = replace(CONFIG, depth_error=0.004)  # twice of it 5 mm, four times 10 mm
+    depth = ball_depth()
+    depth[54:66, 74:86] -= gap
+    found = self_mask(frame(depth), drawn(), config).kinds[54:66, 74:86]
+    assert ((found == PixelKind.OBJECT) == is_object).all()
+    assert (found == PixelKind.MIXED).any() != is_object
 
 
 def test_points_inside_the_robot_are_counted_by_link_and_are_no_robot() -> None:
