@@ -16,6 +16,10 @@ from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.records import Float64, Index
 from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
 
+MESH_LENGTHS = (0.001, 10.0)  # [m] of a link's mesh: beyond them its unit is another
+LINK_LENGTHS = (0.01, 3.0)  # [m] that a link has in its own unit
+UNITS = {"millimetres": 1e-3, "metres": 1.0}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Solid:
@@ -131,10 +135,26 @@ def _primitive(shape: Shape) -> Solid:
 
 
 def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
-    """The mesh in the link's frame."""
+    """The mesh in the link's frame. Raises InputError for one whose length says that it is in another unit."""
     vertices = transform_points(shape.T_link_mesh, mesh.vertices * np.array(shape.scale))
+    length = float(np.ptp(vertices, axis=0).max())
+    if not MESH_LENGTHS[0] <= length <= MESH_LENGTHS[1]:
+        raise InputError(
+            f"link '{shape.link}': mesh {shape.filename}: expected a length of 1 mm to 10 m, got {length:g} m",
+            remedy=_unit_words(shape, length),
+        )
     faces = mesh.faces if np.prod(shape.scale) > 0 else mesh.faces[:, ::-1]
     return replace(mesh, vertices=vertices, faces=np.ascontiguousarray(faces))
+
+
+def _unit_words(shape: MeshShape, length: float) -> str:
+    """The unit in which a mesh of `length` [m], as scaled, would be as long as links are; else what to correct."""
+    raw = length / float(np.abs(shape.scale).max())
+    for name, unit in UNITS.items():
+        if LINK_LENGTHS[0] <= raw * unit <= LINK_LENGTHS[1]:
+            scale = " ".join(f"{unit * sign:g}" for sign in np.sign(shape.scale))
+            return f'looks like {name}: scale="{scale}"'
+    return "correct its scale"
 
 
 def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:

@@ -1,6 +1,6 @@
 """The robot's own surface as cameras see it, and how far points lie from it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -36,8 +36,8 @@ class RobotSurface:
     kinds (P,) as `kernels.surface_image` numbers them, sizes (P, 3) (half edges; radius and half length; radius),
     T_link_solid (P, 4, 4), solid_links (P,); triangles (F, 3, 3) in the frame of triangle_links (F,), `trees` of them
     by their number. by_spheres: links that collision spheres stand for, because their geometry is missing or cannot
-    be read. fixed: links that no joint moves. num_carried: the last of `links` again, one for each box around what
-    they carry.
+    be read. notes: in words, for which links something else stands than their visual geometry, and why. fixed: links
+    that no joint moves. num_carried: the last of `links` again, one for each box around what they carry.
     """
 
     links: tuple[str, ...]
@@ -49,6 +49,7 @@ class RobotSurface:
     triangle_links: Int16
     trees: Mapping[int, TriangleTree] = field(default_factory=dict)
     by_spheres: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
     num_carried: int = 0
 
@@ -57,10 +58,12 @@ class RobotSurface:
         """The visual geometry of a URDF; of links without, or whose cannot be read, the collision geometry; the
         spheres of links that have neither.
 
-        folders: where ``package://`` paths are looked for, before the folders above the URDF.
+        folders: where ``package://`` paths are looked for, before the folders above the URDF. Raises InputError for a
+        mesh in another unit.
         """
         seen = visual_urdf(urdf)
         pieces, unread = _read(seen, folders)
+        lost = dict(unread)
         if unread:
             seen = visual_urdf(urdf, without=unread)
             pieces, unread = _read(seen, folders)
@@ -81,7 +84,8 @@ class RobotSurface:
         bodies = urdf.rigid_bodies()
         children = {child for _, child in urdf.parents}
         fixed = tuple(link for link in urdf.links if bodies[link][0] not in children)
-        return cls.from_parts([*shapes, *balls], kept, by_spheres=by_spheres, fixed=fixed)
+        surface = cls.from_parts([*shapes, *balls], kept, by_spheres=by_spheres, fixed=fixed)
+        return replace(surface, notes=_notes(by_spheres, {*seen.collision_links} - unread.keys(), lost | unread))
 
     @classmethod
     def from_parts(
@@ -242,15 +246,29 @@ def _areas(kinds: Float64, sizes: Float64) -> Float64:
     return np.select([kinds == kind for kind in (BOX, CYLINDER, BALL, CAPSULE)], choices)
 
 
-def _read(urdf: UrdfFile, folders: Sequence[Path]) -> tuple[list[tuple[str, Float64]], set[str]]:
-    """Of each mesh its link and its triangles (F, 3, 3) in that frame; and links of which something is not read."""
-    pieces, unread = [], {link for link, _ in urdf.other_shapes}
+def _read(urdf: UrdfFile, folders: Sequence[Path]) -> tuple[list[tuple[str, Float64]], dict[str, str]]:
+    """Of each mesh its link and its triangles (F, 3, 3) in that frame; and why something of a link is not read."""
+    pieces, unread = [], {link: f"{urdf.path}: <{tag}> cannot be read" for link, tag in urdf.other_shapes}
     for mesh in urdf.meshes:
         try:
-            pieces.append((mesh.link, placed(mesh, load_mesh(mesh_path(urdf.path, mesh, folders))).corners))
-        except InputError:
-            unread.add(mesh.link)
+            loaded = load_mesh(mesh_path(urdf.path, mesh, folders))
+        except InputError as error:
+            unread.setdefault(mesh.link, error.message)
+        else:
+            pieces.append((mesh.link, placed(mesh, loaded).corners))
     return [(link, corners) for link, corners in pieces if link not in unread], unread
+
+
+def _notes(by_spheres: Sequence[str], solid: Collection[str], unread: Mapping[str, str]) -> tuple[str, ...]:
+    """For which links spheres, their `solid` collision geometry or nothing stands, and why that of the first."""
+    groups: dict[tuple[str, bool], list[str]] = {}
+    for link in dict.fromkeys([*by_spheres, *unread]):
+        rest = "collision geometry stands" if link in solid else "nothing stands"
+        groups.setdefault(("spheres stand" if link in by_spheres else rest, link in unread), []).append(link)
+    return tuple(
+        f"{what} for {', '.join(links)}: {unread.get(links[0], 'no visual or collision geometry in the URDF')}"
+        for (what, _), links in groups.items()
+    )
 
 
 def _sizes(shape: Shape) -> tuple[float, float, float]:

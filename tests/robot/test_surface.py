@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from pinocchio.rpy import rpyToMatrix
 
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
@@ -64,3 +65,47 @@ def test_extents_are_those_of_the_same_shape_as_triangles(tmp_path: Path, kind: 
     np.testing.assert_allclose(found[:6], shape.apply_transform(T).bounds.ravel(), atol=2e-4)
     parts = 0.2 * np.pi * 0.3 if kind == "capsule" else 0.0  # it is a cylinder and two balls, whole
     assert found[6] == pytest.approx(shape.area + parts, rel=2e-3)
+
+
+def seen_as(text: str, mesh: str) -> str:
+    """A URDF with a mesh as the visual geometry of `base`."""
+    visual = f"<visual><geometry>{mesh}</geometry></visual>"
+    return text.replace('<link name="base">', f'<link name="base">{visual}')
+
+
+@pytest.mark.parametrize("is_visual", [True, False])
+@pytest.mark.parametrize(
+    ("factor", "scale", "line"),
+    [
+        (1e3, "1 1 1", 'got 300 m; looks like millimetres: scale="0.001 0.001 0.001"'),
+        (1e3, "1 -1 1", 'got 300 m; looks like millimetres: scale="0.001 -0.001 0.001"'),
+        (1.0, "0.001 0.001 0.001", 'got 0.0003 m; looks like metres: scale="1 1 1"'),
+        (1e-4, "1 1 1", "got 3e-05 m; correct its scale"),
+    ],
+)
+def test_a_mesh_in_another_unit_is_refused_with_the_unit_that_it_looks_like(
+    tmp_path: Path, is_visual: bool, factor: float, scale: str, line: str
+) -> None:
+    l_shape().apply_scale(factor).export(tmp_path / "ell.obj", digits=12)
+    mesh = f'<mesh filename="ell.obj" scale="{scale}"/>'
+    text = seen_as(arm_of(BALL, BALL), mesh) if is_visual else arm_of(mesh, BALL)
+    model = RobotModel.from_urdf(written(tmp_path, text), SPHERES)
+    with pytest.raises(InputError) as refused:
+        assert model.surface
+    assert str(refused.value) == f"link 'base': mesh ell.obj: expected a length of 1 mm to 10 m, {line}"
+
+
+def test_what_stands_for_a_link_without_its_visual_geometry_is_said_with_the_reason(tmp_path: Path) -> None:
+    mesh = '<mesh filename="none.stl"/>'
+    urdf = written(tmp_path, seen_as(arm_of(BALL, BALL), mesh))
+    lost = f"{urdf}: link 'base': mesh none.stl was not found"
+    assert RobotModel.from_urdf(urdf, SPHERES).surface.notes == (f"collision geometry stands for base: {lost}",)
+    urdf = written(tmp_path, arm_of(mesh, BALL))
+    assert RobotModel.from_urdf(urdf, SPHERES).surface.notes == (f"spheres stand for base: {lost}",)
+    alone = SphereSet(links=("tip",), centers=np.zeros((1, 3)), radii=np.full(1, 0.3))
+    assert RobotModel.from_urdf(urdf, alone).surface.notes == (f"nothing stands for base: {lost}",)
+    urdf = written(tmp_path, arm_of(BALL, BALL).replace("collision>", "inertial>"))
+    bare = "spheres stand for base, tip: no visual or collision geometry in the URDF"
+    assert RobotModel.from_urdf(urdf, SPHERES).surface.notes == (bare,)
+    urdf = written(tmp_path, arm_of(BALL, BALL))
+    assert RobotModel.from_urdf(urdf, SPHERES).surface.notes == ()

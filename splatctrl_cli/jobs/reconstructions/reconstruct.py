@@ -156,6 +156,7 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
         if request.urdf is None:
             _check_fits(urdf, request.source)
             progress.log(f"the robot is the log's own: {urdf.path}")
+        notes = model.surface.notes
     except InputError as error:
         if request.urdf is not None or request.spheres is not None:
             raise
@@ -163,12 +164,8 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
         return None
     for doubt in model.doubts:
         progress.log(f"warning: {doubt}")
-    if model.surface.by_spheres:
-        links = ", ".join(model.surface.by_spheres)
-        progress.log(
-            f"warning: spheres stand for {links}: their collision geometry is missing or cannot be read; correct the"
-            " paths of the URDF's meshes"
-        )
+    for note in notes:
+        progress.log(f"warning: {note}; correct the URDF")
     return model
 
 
