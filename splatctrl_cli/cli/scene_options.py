@@ -145,7 +145,8 @@ def score_options(add: Options, parser: Parser) -> None:
     scenes = "a folder that reconstruct wrote, one of such folders, named like the scans of --dtu, or a splat file"
     add("SCENE", scenes, Path, nargs="?")
     either = add.either(required=True)
-    either("--reference PATH", "a log, a capture, or an image folder's TOML", Path)
+    reference = "a log, a capture, or an image folder's TOML; logs of one session are read as one"
+    either("--reference PATH ...", reference, Path)
     either("--dtu ROOT", "a DTU data set in MVSNet's layout, or in IDR's and NeuS's", Path)
     add_output(add, "folder for scores and pictures", default="none, the scores are only printed")
     add(

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from splatctrl_cli.cli.common import Console, table
@@ -76,7 +77,8 @@ def _fit(args: argparse.Namespace) -> FitRequest:
 
 def _scoring(args: argparse.Namespace) -> dict[str, Any]:
     """What both kinds of request have in common."""
-    recording = recording_of(args, args.reference, args.masks)
+    first, *beside = args.reference or [None]
+    recording = replace(recording_of(args, first, args.masks), beside=tuple(beside))
     return {"recording": recording, "newest": args.snapshots == "newest", "cloud": _cloud(args)}
 
 

@@ -28,7 +28,8 @@ class RecordingRequest:
 
     options: how it is read; of a scan, its holdout alone. protocol: which views train and which are scored. masks,
     depths: folders with what the layout of the scan lacks. downscale: by how much its images are made smaller (None:
-    down to the size of the protocol).
+    down to the size of the protocol). beside: further logs of the same session, to score views of. Raises UsageError
+    for such beside an image folder.
     """
 
     path: Path
@@ -39,6 +40,11 @@ class RecordingRequest:
     masks: Path | None = None
     depths: Path | None = None
     downscale: int | None = None
+    beside: tuple[Path, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.beside and is_folder_of_views(self.path):
+            raise UsageError(f"--reference {self.path}: expected a log beside others, got images in a folder")
 
 
 def open_to_train(

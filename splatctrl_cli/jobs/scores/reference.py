@@ -1,7 +1,7 @@
 """What `score` compares with: the recording, which of its views are scored by which protocol, and their masks."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,10 @@ from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protoco
 from splatctrl_cli.evaluate.same_recording import changed_files, differences
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_dtu, open_held_out, refuse_scan_options
 from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Bool, RecordSource, RgbdFrame
 from splatctrl_cli.scene_files.scene_folder import SceneFolder
-from splatctrl_cli.sources.source import lacks_depth, open_source
+from splatctrl_cli.sources.source import lacks_depth, open_session, open_source
 
 Mask = Callable[[RgbdFrame], Bool | None]
 """A frame -> the pixels (H, W) that the mask rule selects."""
@@ -23,7 +24,8 @@ Mask = Callable[[RgbdFrame], Bool | None]
 class Reference:
     """source: the recording `where` with all its cameras. scan: its name in a data set of several. protocol and split
     where one was named; training_stamps_ns: of the views that it trains on. mask_rule says in words what `mask`
-    selects. Without depth, nothing says what a training camera saw. doubts: what speaks against the scores, in words.
+    selects. Without depth, nothing says what a training camera saw. stamps_ns: of each camera's frames, where several
+    logs are one session. doubts: what speaks against the scores, in words.
     """
 
     where: Path
@@ -37,6 +39,7 @@ class Reference:
     mask_rule: str = "none"
     numbered_by_stamp: bool = False
     has_depth: bool = True
+    stamps_ns: Mapping[str, Sequence[int]] = field(default_factory=dict)
     doubts: tuple[str, ...] = ()
 
     @property
@@ -51,6 +54,8 @@ def open_reference(recording: RecordingRequest, progress: Progress) -> Reference
         return _dtu_reference(recording, progress)
     refuse_scan_options(recording)
     where = recording.path
+    if recording.beside:
+        return _session_reference((where, *recording.beside), replace(recording.options, cameras=None))
     if recording.protocol is None:
         source = open_source(where, replace(recording.options, cameras=None), needs_depth=False)
         return Reference(where=where, source=source, has_depth=lacks_depth(source) is None)
@@ -65,6 +70,15 @@ def open_reference(recording: RecordingRequest, progress: Progress) -> Reference
         training_stamps_ns=frozenset(stamps[n] for n in split.training),
         has_depth=lacks_depth(source) is None,
     )
+
+
+def _session_reference(paths: Sequence[Path], options: SourceOptions) -> Reference:
+    """Several logs as one: in one tree of frames, or InputError is raised."""
+    source = open_session(paths, options)
+    stamps_ns: dict[str, list[int]] = {}
+    for stamp, camera, _ in source.poses():
+        stamps_ns.setdefault(camera, []).append(stamp)
+    return Reference(where=Path(" + ".join(map(str, paths))), source=source, stamps_ns=stamps_ns)
 
 
 def _dtu_reference(recording: RecordingRequest, progress: Progress) -> Reference:
@@ -145,6 +159,19 @@ def cameras_to_score(
     return cameras
 
 
+def check_times(reference: Reference, scoring: Sequence[str], training: Sequence[str]) -> None:
+    """Raise InputError for a camera of a session whose frames all lie before or after those of training cameras."""
+    trained = [stamp for camera in training for stamp in reference.stamps_ns.get(camera, ())]
+    for camera in scoring if trained else ():
+        stamps = reference.stamps_ns[camera]
+        if stamps[0] > max(trained) or stamps[-1] < min(trained):
+            raise InputError(
+                f"{reference.where}: camera {camera}: expected frames between those that trained, {min(trained)} to"
+                f" {max(trained)} ns, got {stamps[0]} to {stamps[-1]} ns",
+                remedy="give logs of the same time and clock, or other --cameras",
+            )
+
+
 def check_training(path: Path, scene: SceneFolder, reference: Reference) -> None:
     """Raise UsageError where the scene at `path` was not trained on the views that the protocol trains on."""
     if reference.protocol is None or reference.split is None or not scene.names_its_views:
@@ -180,6 +207,7 @@ def recording_check(
     if lines and not allow_other:
         raise InputError(
             f"{reference.where}: not the recording that {path} was made from: {'; '.join(lines)}",
-            remedy="give that recording, or --allow-other-recording to score against this one",
+            remedy="give that recording, or --allow-other-recording to score against this one; for a camera of"
+            " another log of its session give both, each as --reference",
         )
     return {"basis": basis, "differences": lines}

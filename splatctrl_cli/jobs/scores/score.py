@@ -30,6 +30,7 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.scores.reference import (
     Reference,
     cameras_to_score,
+    check_times,
     check_training,
     open_reference,
     recording_check,
@@ -156,6 +157,7 @@ def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) 
         allow_training=allow_training,
         threads=request.threads,
     )
+    check_times(reference, scorer.cameras, scene.cameras)
     check_training(request.scene, scene, reference)
     digests = reference.source.digests()
     same = recording_check(request.scene, scene, reference, digests, allow_other=request.allow_other_recording)
