@@ -69,7 +69,8 @@ class RgbdFrame:
     color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = none;
     T_world_camera (4, 4) float64 maps optical camera coordinates (z forward) to world; human (H, W) uint8, not 0
     where the pixel shows a person, None where nobody looked for one; valid (H, W), False where the pixel shows
-    nothing (the lens did not see it), None where all show something. What is not valid has no depth, and no colour.
+    nothing (the lens did not see it), None where all show something. What is not valid has no colour; a depth there,
+    of another lens, is not drawn and not scored.
     """
 
     stamp_ns: int

@@ -121,6 +121,7 @@ class _CameraInfo:
     distortion_model: str
     d: Any
     k: Any
+    r: Any
     p: Any
 
 
@@ -169,6 +170,7 @@ def _calibration(message: Any) -> Any:
         distortion_model=str(_either(message, "distortion_model") or ""),
         d=_numbers(_either(message, "D", "d"), 0),
         k=_numbers(_either(message, "K", "k"), 9),
+        r=_numbers(_either(message, "R", "r"), 9),
         p=_numbers(_either(message, "P", "p"), 12),
     )
 

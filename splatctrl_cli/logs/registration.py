@@ -60,13 +60,23 @@ class DepthToColor:
 
 
 class Undistortion:
-    """Removes a lens distortion; the result has the lens's own focal lengths and centre.
+    """Removes a lens distortion.
 
-    intrinsics: those of the result. valid: (H, W), False where the lens did not see the pixel, as in the corners of a
+    intrinsics: those of the result, which are the lens's own unless `lens` says others; R (3, 3) turns the lens's
+    axes into those of the result. valid: (H, W), False where the lens did not see the pixel, as in the corners of a
     pincushion; None where it saw all. There colour is black, and depth and labels are 0.
     """
 
-    def __init__(self, intrinsics: Intrinsics, model: str, coefficients: Float64) -> None:
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        model: str,
+        coefficients: Float64,
+        *,
+        lens: Intrinsics | None = None,
+        R: Float64 | None = None,
+    ) -> None:
+        R = np.eye(3) if R is None else R
         if len(coefficients) not in NUM_COEFFICIENTS:
             expected = ", ".join(map(str, NUM_COEFFICIENTS))
             raise InputError(
@@ -74,10 +84,10 @@ class Undistortion:
                 remedy="calibrate again, or fill up with zeros",
             )
         self.intrinsics = intrinsics
-        self._map_u, self._map_v = _maps(intrinsics, model, coefficients)
+        self._map_u, self._map_v = _maps(lens or intrinsics, model, coefficients, R, intrinsics)
         is_seen = (self._map_u >= 0) & (self._map_u <= intrinsics.width - 1)
         is_seen &= (self._map_v >= 0) & (self._map_v <= intrinsics.height - 1)
-        is_seen &= _radii(intrinsics) < _largest_radius(model, coefficients)
+        is_seen &= _radii(intrinsics, R) < _largest_radius(model, coefficients)
         if is_seen.mean() < REGISTERED_SHARE:
             raise InputError(
                 f"distortion {model} {np.round(coefficients, 6).tolist()}: the camera saw {is_seen.mean():.0%} of the"
@@ -100,21 +110,23 @@ class Undistortion:
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.float32)
 
 
-def _maps(camera: Intrinsics, model: str, coefficients: Float64) -> tuple[Float32, Float32]:
+def _maps(
+    lens: Intrinsics, model: str, coefficients: Float64, R: Float64, result: Intrinsics
+) -> tuple[Float32, Float32]:
     """Column and row in the distorted image of each pixel of the result."""
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=np.float64)
-    size = (camera.width, camera.height)
+    K, P = (np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]], dtype=np.float64) for k in (lens, result))
+    size = (result.width, result.height)
     if model == "equidistant":
-        maps = cv2.fisheye.initUndistortRectifyMap(K, coefficients[:4], np.eye(3), K, size, cv2.CV_32FC1)
+        maps = cv2.fisheye.initUndistortRectifyMap(K, coefficients[:4], R, P, size, cv2.CV_32FC1)
     else:
-        maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), K, size, cv2.CV_32FC1)
+        maps = cv2.initUndistortRectifyMap(K, coefficients, R, P, size, cv2.CV_32FC1)
     return np.asarray(maps[0]), np.asarray(maps[1])
 
 
-def _radii(camera: Intrinsics) -> Float64:
-    """Distance of each pixel (H, W) from the optical axis, at a depth of one."""
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    return np.asarray(np.hypot((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy))
+def _radii(result: Intrinsics, R: Float64) -> Float64:
+    """Distance of each pixel (H, W) of the result from the lens's axis, at a depth of one."""
+    x, y, z = np.moveaxis(back_project(result, np.ones((result.height, result.width))) @ R, 2, 0)
+    return np.asarray(np.where(z > 0, np.hypot(x, y) / np.maximum(z, 1e-9), np.inf))
 
 
 def _largest_radius(model: str, coefficients: Float64) -> float:

@@ -1,6 +1,7 @@
 """The cameras of a log made ready: intrinsics, world frame, lens and depth registration, or why they cannot be."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,13 +17,14 @@ from splatctrl_cli.logs.registration import DISTORTION_MODELS, SAME_MODELS, Dept
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.survey import Calibration, Survey
 from splatctrl_cli.logs.tf_tree import TfTree
-from splatctrl_cli.records import Float64, Intrinsics
+from splatctrl_cli.records import Bool, Float64, Intrinsics
 
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """One RGB-D camera of a log; fixed_pose is T_world_camera where a person gave it, human_topic its masks,
-    depth_scale [m per count] what a person or the log says of it.
+    """One RGB-D camera of a log; valid (H, W) is False where its lens did not see the pixel, fixed_pose is
+    T_world_camera where a person gave it, human_topic its masks, depth_scale [m per count] what a person or the log
+    says of it.
     """
 
     name: str
@@ -32,6 +34,7 @@ class Camera:
     world_frame: str
     intrinsics: Intrinsics
     undistortion: Undistortion | None = None
+    valid: Bool | None = None
     depth_to_color: DepthToColor | None = None
     fixed_pose: Float64 | None = None
     depth_scale: float | None = None
@@ -131,9 +134,21 @@ def _is_rectified(topic: str) -> bool:
 
 
 def _rectified(calibration: Calibration) -> Calibration:
-    """The camera of the rectified image: P where it is set, and no distortion."""
+    """The camera of the rectified image: P where it is set, and no distortion; valid where the lens is known."""
     K = calibration.projection if calibration.projection[0, 0] > 0 else calibration.K
-    return replace(calibration, K=K, distortion=np.zeros(0))
+    pinhole = replace(calibration, K=K, distortion=np.zeros(0))
+    model = SAME_MODELS.get(calibration.distortion_model, calibration.distortion_model)
+    if not _is_distorted(calibration) or model not in DISTORTION_MODELS:
+        return pinhole
+    lens, R = intrinsics_of(calibration), calibration.rotation if np.any(calibration.rotation) else None
+    with suppress(InputError):  # of a lens that cannot be, nothing says what it saw
+        undone = Undistortion(intrinsics_of(pinhole), model, calibration.distortion, lens=lens, R=R)
+        return replace(pinhole, valid=undone.valid)
+    return pinhole
+
+
+def _is_distorted(calibration: Calibration) -> bool:
+    return bool(np.any(np.abs(calibration.distortion) > 1e-9))
 
 
 class _Builder:
@@ -163,6 +178,7 @@ class _Builder:
             world_frame=world,
             intrinsics=intrinsics,
             undistortion=undistortion,
+            valid=calibration.valid if undistortion is None else undistortion.valid,
             depth_to_color=None if self._is_registered else self._registration(intrinsics),
             fixed_pose=None if fixed is None else transform_from(fixed[:3], fixed[3:]),
             depth_scale=self._depth_scale,
@@ -241,6 +257,7 @@ class _Builder:
             height=image.height,
             K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
             projection=np.zeros((3, 3)),
+            rotation=np.zeros((3, 3)),
             distortion_model="plumb_bob",
             distortion=np.zeros(0),
             frame_id=image.frame_id,
@@ -284,7 +301,7 @@ class _Builder:
         return f", or NAME=TOPIC[@FRAME] of a pose topic ({listed(topics)})" if topics else ""
 
     def _undistortion(self, calibration: Calibration, info: str) -> Undistortion | None:
-        if not np.any(np.abs(calibration.distortion) > 1e-9):
+        if not _is_distorted(calibration):
             return None
         model = SAME_MODELS.get(calibration.distortion_model, calibration.distortion_model)
         if model not in DISTORTION_MODELS:

@@ -221,7 +221,7 @@ def _stored_frame(
         read_color=partial(_color, camera, color),
         read_depth=partial(_depth, camera, depth),
         human=human,
-        valid=None if camera.undistortion is None else camera.undistortion.valid,
+        valid=camera.valid,
         color_file=color.compressed if keeps_color and is_kept(color.compressed) else None,
         depth_file=depth.compressed if keeps_depth and depth.is_counts and is_png(depth.compressed) else None,
         depth_unit=depth.unit(camera.depth_scale) if is_counts else None,

@@ -30,7 +30,7 @@ from splatctrl_cli.logs.realsense import OPTION, TRANSFORM, RealSense
 from splatctrl_cli.logs.state_messages import STANDARD_TYPES, STATE_TYPES, JointLog, RawJoints, read_states
 from splatctrl_cli.logs.tf_tree import TfTree
 from splatctrl_cli.logs.video import VideoLog
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Bool, Float64
 
 LARGE = 1 << 30  # bytes from which on an MCAP is described by its index
 _MOST_BYTES = 64 << 20  # of chunks that are unpacked
@@ -39,16 +39,19 @@ _MOST_BYTES = 64 << 20  # of chunks that are unpacked
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
     """What a CameraInfo says: size [px], K (3, 3) of the raw image with its distortion, projection (3, 3) of the
-    rectified image (the left part of P; zero where unset), frame.
+    rectified image (the left part of P; zero where unset), rotation (3, 3) from the raw camera's axes to those of the
+    rectified (zero where unset), frame. valid (H, W): of a rectified image, False where the lens did not see a pixel.
     """
 
     width: int
     height: int
     K: Float64
     projection: Float64
+    rotation: Float64
     distortion_model: str
     distortion: Float64
     frame_id: str
+    valid: Bool | None = None
 
 
 @dataclass(kw_only=True)
@@ -153,6 +156,7 @@ def _calibration(message: Any) -> Calibration | None:
         height=int(message.height),
         K=K,
         projection=np.asarray(fields["p"], dtype=np.float64).reshape(3, 4)[:, :3],
+        rotation=np.asarray(fields["r"], dtype=np.float64).reshape(3, 3),
         distortion_model=str(message.distortion_model),
         distortion=np.asarray(fields["d"], dtype=np.float64),
         frame_id=message.header.frame_id.strip("/"),

@@ -34,11 +34,13 @@ Masked = Sequence[tuple[View, Bool]]
 
 def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
     """Pixels (H, W) whose depth, of `min_range` [m] or more, the map leaves out: it lies outside the workspace. Those
-    that show what is `mounted` on the camera are not among them.
+    that show what is `mounted` on the camera, or that are not valid, are not among them.
     """
     depth = view.target.depth
     left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0)
-    return np.asarray(left_out if mounted is None else left_out & ~mounted)
+    for shown in (view.frame.valid, None if mounted is None else ~mounted):
+        left_out &= True if shown is None else shown
+    return np.asarray(left_out)
 
 
 class Shell:

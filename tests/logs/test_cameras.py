@@ -37,6 +37,7 @@ def log_with(*topics: Has) -> Survey:
                 height=has.size[1],
                 K=K,
                 projection=np.zeros((3, 3)),
+                rotation=np.zeros((3, 3)),
                 distortion_model="plumb_bob",
                 distortion=np.zeros(5),
                 frame_id=has.frame,

@@ -1,7 +1,10 @@
 """Depth warped into the colour camera; lens distortion removed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from pinocchio.rpy import rpyToMatrix
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
@@ -88,6 +91,20 @@ def test_a_pincushion_keeps_its_focal_length_and_marks_the_corners_that_it_did_n
     color = lens.color(np.full((48, 64, 3), 200, np.uint8))
     assert (depth[seen] == 2.0).all() and not depth[~seen].any()
     assert (color[seen] == 200).all() and not color[~seen].any()
+
+
+def test_a_turned_and_zoomed_result_shows_what_the_lens_saw_there() -> None:
+    """As a stereo pair is rectified: the result's axes are turned from the lens's, its focal length is shorter."""
+    R = rpyToMatrix(0.02, -0.1, 0.05)
+    result = replace(LARGE, fx=0.8 * LARGE.fx, fy=0.8 * LARGE.fy)
+    seen = Undistortion(result, "plumb_bob", np.array([0.1, 0, 0, 0, 0]), lens=LARGE, R=R).valid
+    u, v = np.meshgrid(np.arange(64), np.arange(48))
+    rays = np.stack([(u - result.cx) / result.fx, (v - result.cy) / result.fy, np.ones(u.shape)], axis=2)
+    x, y, z = np.moveaxis(rays @ R, 2, 0)  # R leads from the lens's axes to the result's
+    x, y = x / z, y / z
+    bent = 1 + 0.1 * (x * x + y * y)
+    column, row = LARGE.fx * x * bent + LARGE.cx, LARGE.fy * y * bent + LARGE.cy
+    assert np.array_equal(seen, (column >= 0) & (column <= 63) & (row >= 0) & (row <= 47))
 
 
 def test_a_barrel_shows_every_pixel_of_its_own_pinhole() -> None:

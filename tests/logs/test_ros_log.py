@@ -17,6 +17,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs import survey as surveys
 from splatctrl_cli.logs.survey import survey
 from splatctrl_cli.records import JointState, Record, RgbdFrame
+from splatctrl_cli.scene.keyframes import make_view
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import CameraTopics, SourceOptions, open_source
 from tests.containers.test_log_formats import as_ros1_bag, assert_same
@@ -152,6 +153,19 @@ def test_rectified_images_take_the_projection_and_keep_their_pixels(tmp_path: Pa
     frame = frames_of(make_log(tmp_path / "log.mcap", recipe))[0]
     assert (frame.intrinsics.fx, frame.intrinsics.cx, frame.intrinsics.cy) == (28.0, 16.0, 12.0)
     assert np.array_equal(frame.color, color_pixels(0))
+    x, y = (np.arange(WIDTH) - 16.0) / 28.0, (np.arange(HEIGHT)[:, None] - 12.0) / 28.0
+    column, row = (30.0 * value * (1 + 0.4 * (x**2 + y**2)) + centre for value, centre in ((x, 15.5), (y, 11.5)))
+    seen = (column >= 0) & (column <= WIDTH - 1) & (row >= 0) & (row <= HEIGHT - 1)
+    assert frame.valid is not None and np.array_equal(frame.valid, seen)
+    assert 0.5 < seen.mean() < 1.0 and not make_view(frame, frame.depth > 0).target.counted[~seen].any()
+
+
+@pytest.mark.parametrize("distortion", [(0.0,) * 5, (0.4, 0.0), (-500.0, 0, 0, 0, 0)])
+def test_of_rectified_images_nothing_is_left_out_where_the_lens_is_not_known(
+    tmp_path: Path, distortion: tuple[float, ...]
+) -> None:
+    recipe = LogRecipe(color_name="image_rect_color", distortion=distortion, projection_focal=28.0)
+    assert frames_of(make_log(tmp_path / "log.mcap", recipe))[0].valid is None
 
 
 def test_a_fixed_pose_stands_in_for_tf(tmp_path: Path) -> None:

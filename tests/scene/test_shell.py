@@ -80,6 +80,16 @@ def test_a_block_across_the_border_is_whole_in_the_map_within_and_in_the_shell_b
     assert int(((shell.centers[:, 2] > 0.15) & (shell.opacities > 0.3)).sum()) > 3
 
 
+def test_pixels_that_are_not_valid_show_nothing_beyond_although_they_have_depth() -> None:
+    """As the black corners of an undistorted image, where the depth of another lens is registered to it."""
+    whole = seen(0)[0]
+    valid = np.ones(whole.depth.shape, bool)
+    valid[:, :20] = False
+    view, all_of_it = (fitter().view(f) for f in (replace(whole, valid=valid), whole))
+    assert beyond(all_of_it, MIN_RANGE)[:, :20].any()
+    assert np.array_equal(beyond(view, MIN_RANGE), beyond(all_of_it, MIN_RANGE) & valid)
+
+
 def test_a_splat_of_the_shell_that_comes_within_reach_is_removed() -> None:
     """Also on the floor, which no view sees through."""
     target = run(fitter(), [0.0])
