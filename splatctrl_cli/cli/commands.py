@@ -9,6 +9,7 @@ from pathlib import Path
 
 from splatctrl_cli import __version__
 from splatctrl_cli.cli.options import (
+    POSE,
     add_common,
     add_gates,
     add_junit,
@@ -17,7 +18,9 @@ from splatctrl_cli.cli.options import (
     add_packages,
     add_seed,
     add_settings,
+    add_source,
     add_threads,
+    pose,
 )
 from splatctrl_cli.cli.parser import Options, Parser, real, whole
 from splatctrl_cli.cli.recording_options import (
@@ -168,6 +171,18 @@ def _robot_pairs(add: Options, parser: Parser) -> None:
     add_seed(add, "the sampling")
 
 
+def _robot_learn(add: Options, parser: Parser) -> None:
+    add("LOG", "a log or capture with joint states, in which the arm moves in view of the cameras", Path)
+    _robot(add, parser)
+    add_output(add, "self-model, which --self-model of reconstruct and replay takes", default="self.npz")
+    outside = "how far outside of a link's visual surface its parts are looked for"
+    add("--reach M", outside, real(0.01, 0.5, "m"), 0.06)
+    more = add.group("robot")
+    more(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)
+    add_lock(more)
+    add_source(add)
+
+
 def _robot_info(add: Options, parser: Parser) -> None:
     _robot(add, parser, spheres="none, or those of the URDF")
     add_lock(add)
@@ -309,7 +324,7 @@ COMMANDS = {
         options=view_options,
     ),
     "robot": Command(
-        summary="fit and measure a robot's collision spheres, list its pairs and limits",
+        summary="fit and measure a robot's spheres, list its pairs, learn its own surface",
         examples=("robot spheres --urdf arm.urdf --max-spheres 80 -o spheres.yaml", f"robot check {ROBOT}"),
         actions={
             "spheres": Command(
@@ -328,6 +343,11 @@ COMMANDS = {
                 summary="list which links may collide with each other, and why others may not",
                 run="robot:run_pairs",
                 options=_robot_pairs,
+            ),
+            "learn": Command(
+                summary="learn from a recording what is fixed to the links beside the URDF's geometry",
+                run="robot:run_learn",
+                options=_robot_learn,
             ),
             "info": Command(
                 summary="show joints with limits, links, shapes and spheres",

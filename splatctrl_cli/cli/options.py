@@ -143,6 +143,10 @@ def add_packages(add: Options) -> None:
     add("--packages DIR ...", packages, Path)
 
 
+def add_self_model(add: Options) -> None:
+    add("--self-model FILE.npz", "what robot learn found of its surface beside the URDF's", Path)
+
+
 def add_lock(add: Options) -> None:
     held = "hold a joint, and what mimics it, at a value [rad or m]"
     add("--lock JOINT=VALUE ...", held)

@@ -14,6 +14,7 @@ from splatctrl_cli.cli.options import (
     add_lock,
     add_output,
     add_packages,
+    add_self_model,
     add_source,
     numbers,
     pose,
@@ -56,6 +57,7 @@ def _add_robot(add: Options) -> None:
     add(f"--base {POSE}", "pose of the URDF's root in world (default: identity)", pose)
     add_lock(add)
     add_packages(add)
+    add_self_model(add)
     add("--srdf FILE", "leave the pairs of its disable_collisions out of the self-collision rows", Path)
     add_declare(add)
 

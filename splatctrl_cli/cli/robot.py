@@ -1,10 +1,10 @@
-"""``splatctrl robot``: fit collision spheres, measure a set of them, list self-collision pairs, show a robot."""
+"""``splatctrl robot``: fit collision spheres, measure them, list self-collision pairs, learn parts, show a robot."""
 
 import argparse
 import math
 
 from splatctrl_cli.cli.common import Console, table
-from splatctrl_cli.cli.options import locked_joints, request_of
+from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.jobs.robot import (
     CoverageResult,
@@ -18,8 +18,10 @@ from splatctrl_cli.jobs.robot import (
     fit_robot,
     robot_pairs,
 )
+from splatctrl_cli.jobs.self_model import LearnRequest, learn_robot
 from splatctrl_cli.robot.coverage import LinkCoverage
 from splatctrl_cli.robot.self_collision import LinkPair
+from splatctrl_cli.robot.self_model import LearnedLink
 from splatctrl_cli.robot.sphere_files import RENAMED
 from splatctrl_cli.robot.sphere_fit import FitOptions
 
@@ -65,6 +67,36 @@ def run_info(args: argparse.Namespace) -> int:
     result = describe_robot(request_of(RobotRequest, args, locked=locked_joints(args)))
     Console(args).result(result.as_dict(), _robot_lines(result))
     return 0
+
+
+def run_learn(args: argparse.Namespace) -> int:
+    console = Console(args)
+    request = request_of(LearnRequest, args, options=source_options(args), locked=locked_joints(args))
+    result = learn_robot(request, console)
+    found = result.model.learned
+    header = (
+        "link",
+        "pixels",
+        "configurations",
+        "outside 95 % mm",
+        "most mm",
+        "area cm2",
+        "at x, y, z mm",
+        "since s",
+    )
+    unknown = [f"not learned: {link}: {why}" for link, why in result.model.unknown.items()]
+    num = len(result.model.pieces())
+    summary = f"{num} of {len(found)} learned links have parts that {args.urdf.name} does not have"
+    lines = [summary, "", *table(header, [_learned_row(part) for part in found]), "", *unknown]
+    console.result(result.as_dict(), [*lines, f"written: {result.out}"])
+    return 0
+
+
+def _learned_row(part: LearnedLink) -> tuple[object, ...]:
+    outside, has_part = [f"{1e3 * value:.1f}" for value in part.stands_out], len(part.triangles) > 0
+    place = ", ".join(f"{1e3 * value:.0f}" for value in part.place) if has_part else ""
+    since = f"{part.since:.1f}" if has_part else ""
+    return part.link, part.num_pixels, part.num_configurations, *outside, f"{1e4 * part.area:.0f}", place, since
 
 
 def _coverage_lines(result: CoverageResult) -> list[str]:

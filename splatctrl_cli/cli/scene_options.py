@@ -13,6 +13,7 @@ from splatctrl_cli.cli.options import (
     add_gates,
     add_output,
     add_scan,
+    add_self_model,
     add_settings,
     add_source,
     add_threads,
@@ -33,6 +34,7 @@ def reconstruct_options(add: Options, parser: Parser) -> None:
     add("--resume", "continue an interrupted run, to the same bytes")
     add("--urdf FILE", "the robot (default: the log's own): labels its splats, sets the workspace", Path)
     add("--spheres FILE.yaml", "its collision spheres", Path)
+    add_self_model(add)
     add(f"--box {BOX}", "workspace [m] (default: the robot's reach, else the valid depth)")
     budget = "budget of splats (default: 5000)"
     add("--max-splats N", budget, setting(SceneConfig, "max_splats"))

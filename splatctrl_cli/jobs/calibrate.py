@@ -190,23 +190,14 @@ def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tup
     """Up to `CALIBRATION_FRAMES` of each camera by stamp, taken at the same moments, without colour, and the board
     where they show it. Raises NotEvaluableError where none does.
     """
-    stamps: dict[str, list[int]] = {}
-    for stamp, camera, _ in source.poses():
-        stamps.setdefault(camera, []).append(stamp)
-    if not stamps:
-        raise InputError(f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
-    moments = spread(min(stamps.values(), key=len), fixed.CALIBRATION_FRAMES)
-    chosen = {
-        (camera, its[int(np.argmin(np.abs(np.array(its) - moment)))])
-        for camera, its in stamps.items()
-        for moment in moments
-    }
+    stamps = stamps_by_camera(source)
+    chosen = frames_nearest(stamps, spread(min(stamps.values(), key=len), fixed.CALIBRATION_FRAMES))
     frames: list[RgbdFrame] = []
     sightings: list[Sighting | None] = []
     others: Counter[tuple[int, int]] = Counter()
     for item in source.stored():
         if isinstance(item, StoredFrame) and (item.camera, item.stamp_ns) in chosen:
-            frames.append(_without_color(item))
+            frames.append(depth_frame(item))
             if board is not None:
                 sightings.append(sighting_of(board, item.frame))
                 other = None if any(sightings) or sum(others.values()) > 3 else other_size(item.frame)
@@ -216,6 +207,25 @@ def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tup
     if board is not None and not any(sightings):
         raise _no_board(board, len(frames), others)
     return frames, [sighting for sighting in sightings if sighting is not None]
+
+
+def stamps_by_camera(source: FrameSource) -> dict[str, list[int]]:
+    """Stamps [ns] of each camera's frames. Raises InputError where there is no frame."""
+    stamps: dict[str, list[int]] = {}
+    for stamp, camera, _ in source.poses():
+        stamps.setdefault(camera, []).append(stamp)
+    if not stamps:
+        raise InputError(f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
+    return stamps
+
+
+def frames_nearest(stamps: Mapping[str, Sequence[int]], moments: Sequence[int]) -> set[tuple[str, int]]:
+    """Camera and stamp [ns] of each camera's frames nearest to the moments [ns]."""
+    return {
+        (camera, its[int(np.argmin(np.abs(np.array(its) - moment)))])
+        for camera, its in stamps.items()
+        for moment in moments
+    }
 
 
 def _no_board(board: Board, num_frames: int, others: Counter[tuple[int, int]]) -> NotEvaluableError:
@@ -233,7 +243,7 @@ def _no_board(board: Board, num_frames: int, others: Counter[tuple[int, int]]) -
     return NotEvaluableError(text, remedy="show its printed side, whole and lit, to every camera, or give its size")
 
 
-def _without_color(stored: StoredFrame) -> RgbdFrame:
+def depth_frame(stored: StoredFrame) -> RgbdFrame:
     """A frame's depth within `VIEWS_RANGE`, of what is no person."""
     low, high = VIEWS_RANGE
     is_used = (stored.depth >= low) & (stored.depth <= high)

@@ -4,15 +4,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import DAMAGE, read_arrays
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.logs.survey import NAME, RobotDescription
 from splatctrl_cli.records import RecordSource
+from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.model_difference import model_difference
+from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 from splatctrl_cli.sources.calibrated import LOGGED
 from splatctrl_cli.sources.source import logged_descriptions
 from splatctrl_cli.states.state_source import StateSource
 
+LARGEST_SELF_MODEL = 2**30  # bytes
 TAKE = "leave --urdf out to take the log's own, or correct the file"
 
 
@@ -37,6 +41,23 @@ def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILE
     if words := differs(file, paths):
         progress.log(f"warning: {words}; {TAKE}")
     return file
+
+
+def with_self_model(model: RobotModel, path: Path | None) -> RobotModel:
+    """The robot with the parts that a self-model (`robot learn`) adds to its surface; unchanged without a file.
+
+    Raises InputError for a file that cannot be read or belongs to another robot.
+    """
+    if path is None:
+        return model
+    try:
+        found = SelfModel.of_arrays(read_arrays(path, most=LARGEST_SELF_MODEL))
+    except (*DAMAGE, OSError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path}: not a self-model: {error}", remedy="write it with: splatctrl robot learn"
+        ) from None
+    found.check_robot(model.surface, model.urdf.links, path)
+    return model.with_pieces(found.pieces())
 
 
 def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:

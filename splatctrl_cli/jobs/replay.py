@@ -167,7 +167,7 @@ def _read(
         for frame in frames_of(source):
             motion.add(frame)
     scene = opened_scene(request, model, declared, folder, progress, source, observe)
-    given = (request.urdf, request.spheres, request.srdf, request.truth, request.declare)
+    given = (request.urdf, request.spheres, request.self_model, request.srdf, request.truth, request.declare)
     files = [path for path in given if path is not None]
     digests = {**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}}
     inputs = ReplayInputs(

@@ -166,6 +166,10 @@ class RobotModel:
             self._surface = RobotSurface.of(self.urdf, self.sphere_set, self._packages)
         return self._surface
 
+    def with_pieces(self, pieces: Sequence[tuple[str, Float64]]) -> "RobotModel":
+        """The same robot, to whose surface triangles (F, 3, 3) [m] in the frames of links belong as well."""
+        return self._changed(_surface=self.surface.joined(pieces))
+
     def extents(self) -> dict[str, list[float]]:
         """Where `surface` has each link, in one posture: `RobotSurface.extents`."""
         q = np.asarray(0.3 * (1 + np.arange(len(self.joint_names)) % 3), np.float64)  # bent, so that each axis shows

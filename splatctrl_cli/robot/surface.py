@@ -138,6 +138,14 @@ class RobotSurface:
             num_carried=len(shapes),
         )
 
+    def joined(self, pieces: Sequence[tuple[str, Float64]]) -> "RobotSurface":
+        """The same with further triangles (F, 3, 3) [m], each piece in the frame of one of `links`."""
+        added = [np.full(len(part), self.links.index(link), np.int16) for link, part in pieces]
+        triangles, owners = np.concatenate([self.triangles, *(p for _, p in pieces)]), self.triangle_links
+        owners = np.concatenate([owners, *added])
+        trees = {int(k): TriangleTree(triangles[owners == k]) for k in np.unique(np.concatenate([[], *added]))}
+        return replace(self, triangles=triangles, triangle_links=owners, trees={**self.trees, **trees})
+
     @property
     def vague(self) -> list[int]:
         """Numbers of the links whose solids only enclose what is there: spheres, and boxes around what is carried."""

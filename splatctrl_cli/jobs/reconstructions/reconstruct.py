@@ -11,7 +11,7 @@ from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.device import FitDevice
-from splatctrl_cli.jobs.logged_robot import other_frame, urdf_of
+from splatctrl_cli.jobs.logged_robot import other_frame, urdf_of, with_self_model
 from splatctrl_cli.jobs.open_recording import guessed_unit
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstructions.reconstruction import Reconstruction, ReconstructRequest, training_cameras
@@ -92,6 +92,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
 
 def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[str, Any]:
     files = {name: getattr(request, name) for name in ("urdf", "spheres", "points", "declare")}
+    files["self-model"] = request.self_model
     return identity({"seed": request.seed, **request.options}, files, request.config, inputs)
 
 
@@ -140,8 +141,9 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
     """The request's robot, with what a person should know of it said."""
     urdf = urdf_of(request.urdf, [request.recording] if request.recording else [], progress)
     if urdf is None:
-        if request.spheres is not None:
-            raise UsageError(f"--spheres {request.spheres}: needs the robot", remedy="give --urdf as well")
+        for option, path in (("spheres", request.spheres), ("self-model", request.self_model)):
+            if path is not None:
+                raise UsageError(f"--{option} {path}: needs the robot", remedy="give --urdf as well")
         return None
     if guess := guessed_unit(request.source):
         raise InputError(
@@ -153,12 +155,13 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
         if request.source.joint_names:
             model = model.moved_by(request.source.joint_names)
             model.joint_order(request.source.joint_names)
+        model = with_self_model(model, request.self_model)
         if request.urdf is None:
             _check_fits(urdf, request.source)
             progress.log(f"the robot is the log's own: {urdf.path}")
         notes = model.surface.notes
     except InputError as error:
-        if request.urdf is not None or request.spheres is not None:
+        if any((request.urdf, request.spheres, request.self_model)):
             raise
         progress.log(f"warning: the robot stays in the map: {error.message}; {error.remedy}")  # nobody asked for it
         return None

@@ -69,6 +69,7 @@ class ReconstructRequest:
     recording: Path | None = None
     urdf: Path | None = None
     spheres: Path | None = None
+    self_model: Path | None = None
     box: Box | None = None
     points: Path | None = None
     declare: Path | None = None

@@ -19,7 +19,7 @@ from splatctrl_cli.config.fixed import COVERED_COARSE, SELF_POSTURES
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.jobs.logged_robot import other_frame, urdf_of
+from splatctrl_cli.jobs.logged_robot import other_frame, urdf_of, with_self_model
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.state_columns import StateColumns
@@ -73,7 +73,7 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
         )
     if request.urdf is None and request.base is None and (words := other_frame(urdf, source)):
         progress.log(f"warning: the robot is placed at the origin: {words}; give --base if it stood elsewhere")
-    return model.moved_by(source.joint_names), source
+    return with_self_model(model.moved_by(source.joint_names), request.self_model), source
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -50,6 +50,7 @@ class ReplayRequest:
     allow_disagreement: bool = False
     max_pose_jump: float = POSE_JUMP
     spheres: Path | None = None
+    self_model: Path | None = None
     base: tuple[float, ...] | None = None
     locked: Mapping[str, float] = made_by(default_factory=dict)
     packages: tuple[Path, ...] = ()

@@ -1,0 +1,115 @@
+"""What `robot learn` does: choose frame sets of a recording in which the arm moved, and fuse what they show of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.config.fixed import STATES_CLOSE_NS
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import savez
+from splatctrl_cli.files.output import finite, output_path
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.calibrate import depth_frame, frames_nearest, stamps_by_camera
+from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.records import Float64, RgbdFrame, SphereSet, spread
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_model import REACH, SelfModel, choose_moments, learn
+from splatctrl_cli.sources.source import open_source
+
+MOST_MOMENTS = 2000  # of a recording, among which those are chosen that are read
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnRequest:
+    """Learn the self-model of the robot `urdf` from `log` into the file `out`; spheres, packages, base and locked as
+    `replay` takes them. reach [m]: how far outside of a link's visual surface its parts are looked for.
+    """
+
+    log: Path
+    urdf: Path
+    out: Path = Path("self.npz")
+    options: SourceOptions = field(default_factory=SourceOptions)
+    spheres: Path | None = None
+    packages: tuple[Path, ...] = ()
+    base: tuple[float, ...] | None = None
+    locked: Mapping[str, float] = field(default_factory=dict)
+    reach: float = REACH
+    force: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnResult:
+    """The file and what stands in it; num_frames: that were read."""
+
+    out: Path
+    model: SelfModel
+    num_frames: int
+
+    def as_dict(self) -> dict[str, Any]:
+        links = [
+            {
+                "link": part.link,
+                "num_pixels": part.num_pixels,
+                "num_configurations": part.num_configurations,
+                "outside_95_m": part.stands_out[0],
+                "outside_most_m": part.stands_out[1],
+                "area_m2": part.area,
+                "place_m": [finite(value) for value in part.place.tolist()],
+                "since_s": finite(part.since),
+            }
+            for part in self.model.learned
+        ]
+        return {"out": str(self.out), "frames": self.num_frames, "links": links, "unknown": dict(self.model.unknown)}
+
+
+def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> LearnResult:
+    """Learn and write. Raises InputError for a recording in which the arm does not move or is not known."""
+    none = SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
+    model = RobotModel.from_urdf(
+        request.urdf,
+        request.spheres or none,
+        T_world_base=None if request.base is None else transform_from(request.base[:3], request.base[3:]),
+        locked=request.locked,
+        packages=request.packages,
+    )
+    with output_path(request.out, force=request.force, is_folder=False) as partial:
+        source = open_source(request.log, request.options)
+        if not source.joint_names:
+            raise InputError(f"{source.name}: expected joint states, got none", remedy="record /joint_states")
+        frames, T_world_link = _read(model.moved_by(source.joint_names), source, progress)
+        found = learn(model.surface, model.urdf.links, frames, T_world_link, name=source.name, reach=request.reach)
+        savez(partial, found.arrays())
+    return LearnResult(out=request.out, model=found, num_frames=len(frames))
+
+
+def _read(model: RobotModel, source: FrameSource, progress: Progress) -> tuple[list[RgbdFrame], Float64]:
+    """Frames of the moments between which the arm moved farthest, by stamp, and the poses (V, L, 4, 4) of the links
+    of its surface.
+    """
+    posture = source.states.of_joints(model.joint_order(source.joint_names)).postures(STATES_CLOSE_NS)
+    surface, stamps = model.surface, stamps_by_camera(source)
+
+    def placed(stamp_ns: int) -> Float64 | None:
+        q = posture(stamp_ns)
+        return None if q is None else surface.poses({link: model.frame_pose(q, link) for link in surface.links})
+
+    found = [(stamp, placed(stamp)) for stamp in spread(min(stamps.values(), key=len), MOST_MOMENTS)]
+    posed = [(stamp, T) for stamp, T in found if T is not None]
+    if not posed:
+        raise InputError(f"{source.name}: no frame has a joint state within {1e-9 * STATES_CLOSE_NS:g} s")
+    order = choose_moments(surface, np.array([T for _, T in posed]))
+    chosen = frames_nearest(stamps, [posed[number][0] for number in order])
+    frames, poses = [], []
+    for item in source.stored():
+        if isinstance(item, StoredFrame) and (item.camera, item.stamp_ns) in chosen:
+            T = placed(item.stamp_ns)
+            if T is not None:
+                frames.append(depth_frame(item))
+                poses.append(T)
+    progress.log(f"robot learn: {len(frames)} frames of {len(order)} moments")
+    return frames, np.array(poses)

@@ -1,0 +1,161 @@
+"""A self-model of an arm whose link has a bracket that its URDF lacks, beside a wall and a box that stay."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import read_arrays, savez
+from splatctrl_cli.geometry import look_at, pose_at, turn_about_z
+from splatctrl_cli.kernels.triangles import TriangleTree
+from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
+from splatctrl_cli.robot.self_model import VOXEL, SelfModel, choose_moments, learn
+from splatctrl_cli.robot.surface import RobotSurface
+from splatctrl_cli.robot.urdf import Shape
+
+LENS = Intrinsics(fx=300.0, fy=300.0, cx=159.5, cy=119.5, width=320, height=240)
+EYES = ((1.1, 0.1, 0.6), (-0.2, -1.1, 0.5), (0.2, 1.0, 0.9))
+LINKS = ("base", "arm")
+BRACKET = Shape(link="arm", kind="box", size=(0.03, 0.05, 0.04), T_link_shape=pose_at((0.2, 0.0, 0.06)))
+ROBOT = RobotSurface.from_parts(
+    [
+        Shape(link="base", kind="box", size=(0.16, 0.16, 0.3), T_link_shape=pose_at((0, 0, 0.15))),
+        Shape(
+            link="arm",
+            kind="capsule",
+            size=(0.045, 0.3),
+            T_link_shape=pose_at((0.2, 0.0, 0.0), np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])),
+        ),
+    ],
+    fixed=("base",),
+)
+
+
+def shapes(*, has_bracket: bool = True) -> list[Shape]:
+    """What is truly there: the robot, its bracket, a wall, a box near the arm's path, and one beside the base."""
+    return [
+        Shape(link="base", kind="box", size=(0.16, 0.16, 0.3), T_link_shape=pose_at((0, 0, 0.15))),
+        Shape(link="base", kind="box", size=(0.05, 0.05, 0.1), T_link_shape=pose_at((0.12, 0.0, 0.05))),
+        Shape(
+            link="arm",
+            kind="capsule",
+            size=(0.045, 0.3),
+            T_link_shape=pose_at((0.2, 0.0, 0.0), np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])),
+        ),
+        *([BRACKET] if has_bracket else []),
+        Shape(link="world", kind="box", size=(0.02, 3.0, 3.0), T_link_shape=pose_at((-0.6, 0.0, 0.5))),
+        Shape(link="world", kind="box", size=(3.0, 3.0, 0.02), T_link_shape=pose_at((0.0, 0.0, -0.01))),
+        Shape(link="world", kind="box", size=(0.1, 0.1, 0.3), T_link_shape=pose_at((0.3, 0.35, 0.15))),
+    ]
+
+
+def scene(*, has_bracket: bool = True) -> RobotSurface:
+    return RobotSurface.from_parts(shapes(has_bracket=has_bracket))
+
+
+def poses(turn: float, lift: float) -> dict[str, Float64]:
+    """Of base, arm and world: the arm turns about z and, at its shoulder 0.36 m up, lifts."""
+    c, s = np.cos(lift), np.sin(lift)
+    T = pose_at((0.0, 0.0, 0.36), turn_about_z(turn)[:3, :3] @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
+    return {"base": np.eye(4), "arm": T, "world": np.eye(4)}
+
+
+def recorded(
+    moves: list[tuple[float, float]], truth: RobotSurface, noise: float = 0.0
+) -> tuple[list[RgbdFrame], Float64]:
+    frames, at = [], []
+    rng = np.random.default_rng(0)
+    for number, (turn, lift) in enumerate(moves):
+        for camera, eye in enumerate(EYES):
+            T = look_at(np.array(eye), np.array([0.1, 0.0, 0.35]))
+            there = poses(turn, lift)
+            empty = np.zeros((LENS.height, LENS.width), np.float32)
+            depth = truth.render(truth.poses(there), LENS, T, empty).depth
+            depth = np.where(depth > 0, depth + noise * depth**2 * rng.standard_normal(depth.shape), 0)
+            frames.append(
+                RgbdFrame(
+                    stamp_ns=number * 100_000_000,
+                    camera=str(camera),
+                    color=np.zeros((1, 1, 3), np.uint8),
+                    depth=depth.astype(np.float32),
+                    intrinsics=LENS,
+                    T_world_camera=T,
+                )
+            )
+            at.append(ROBOT.poses(there))
+    return frames, np.array(at)
+
+
+MOVES = [(0.9 * np.sin(0.5 * k), 0.35 * np.sin(0.9 * k + 1.0)) for k in range(15)]
+
+
+@cache
+def learned(*, has_bracket: bool = True, noise: float = 0.0) -> SelfModel:
+    frames, at = recorded(MOVES, scene(has_bracket=has_bracket), noise)
+    return learn(ROBOT, LINKS, frames, at)
+
+
+def from_bracket(points: Float64) -> Float64:
+    """Signed distance [m] of points in the arm's frame."""
+    alone = RobotSurface.from_parts([BRACKET])
+    return alone.distance(np.eye(4)[None], points)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_a_bracket_that_the_urdf_lacks_is_found_within_a_voxel_and_nothing_else_is(noise: float) -> None:
+    ((link, triangles),) = learned(noise=noise).pieces()
+    assert link == "arm"
+    assert from_bracket(triangles.reshape(-1, 3)).max() < VOXEL
+    sides = [(0.2 + x, y, 0.08) for x in (-0.01, 0, 0.01) for y in (-0.02, 0.0, 0.02)]
+    sides += [(0.2 + x, y, 0.07) for x in (-0.015, 0.015) for y in (-0.02, 0.0, 0.02)]
+    assert TriangleTree(triangles).closest(np.array(sides))[0].max() < VOXEL
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_an_arm_as_its_urdf_draws_it_gets_no_parts(noise: float) -> None:
+    assert learned(has_bracket=False, noise=noise).pieces() == []
+
+
+def test_links_that_do_not_move_are_named() -> None:
+    assert [*learned().unknown] == ["base"] and "moves too little" in learned().unknown["base"]
+    frames, at = recorded([(0.1, 0.0)] * 6, scene())
+    with pytest.raises(InputError, match="the arm does not move: base, arm cannot be learned"):
+        learn(ROBOT, LINKS, frames, at)
+
+
+def test_a_plate_that_the_arm_moves_along_stays_in_the_world() -> None:
+    """Level under the arm, 20 mm from it, it has one place in the frame of an arm that only turns."""
+    plate = Shape(link="world", kind="box", size=(1.2, 1.2, 0.02), T_link_shape=pose_at((0.0, 0.0, 0.285)))
+    truth = RobotSurface.from_parts([*shapes(has_bracket=False), plate])
+    frames, at = recorded([(-0.9 + 0.12 * k, 0.0) for k in range(15)], truth)
+    assert learn(ROBOT, LINKS, frames, at).pieces() == []
+
+
+def test_the_pieces_belong_to_the_surface_that_is_rendered_and_measured() -> None:
+    surface = ROBOT.joined(learned().pieces())
+    T = surface.poses(poses(0.0, 0.0))
+    point = np.array([[0.2, 0.0, 0.36 + 0.18]])  # 10 cm above the bracket's top
+    assert surface.distance(T, point) == pytest.approx(0.1, abs=VOXEL)
+    assert ROBOT.distance(T, point) == pytest.approx(0.135, abs=1e-6)
+
+
+def test_a_self_model_is_read_as_it_was_written_and_refused_for_another_robot(tmp_path: Path) -> None:
+    path = tmp_path / "self.npz"
+    savez(path, learned().arrays())
+    found = SelfModel.of_arrays(read_arrays(path, most=2**30))
+    assert np.array_equal(found.pieces()[0][1], learned().pieces()[0][1])
+    assert found.unknown == learned().unknown and found.learned[0].since == learned().learned[0].since
+    found.check_robot(ROBOT, LINKS, path)
+    with pytest.raises(InputError, match="another robot: gripper are not links of both"):
+        found.check_robot(ROBOT, (*LINKS, "gripper"), path)
+    with pytest.raises(InputError, match="its visual geometry differs"):
+        found.check_robot(replace(ROBOT, sizes=1.1 * ROBOT.sizes), LINKS, path)
+
+
+def test_moments_are_those_between_which_the_arm_moved_farthest() -> None:
+    at = np.array([ROBOT.poses(poses(turn, 0.0)) for turn in (0.0, 0.001, 0.4, 0.41, 0.8)])
+    assert choose_moments(ROBOT, at) == [0, 2, 4]
+    assert choose_moments(ROBOT, at, most=2) == [0, 4]
