@@ -21,7 +21,7 @@ from splatctrl_cli.kernels.surface_image import (
 )
 from splatctrl_cli.kernels.triangles import TriangleTree
 from splatctrl_cli.mesh_distance import load_mesh
-from splatctrl_cli.records import Bool, Box, Float32, Float64, Intrinsics, SphereSet
+from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, SphereSet
 from splatctrl_cli.robot.link_meshes import mesh_path, placed
 from splatctrl_cli.robot.urdf import Shape, UrdfFile, visual_urdf
 
@@ -219,18 +219,11 @@ class RobotSurface:
         for number, tree in self.trees.items():
             if counts[number]:
                 points = transform_points(invert_transform(T_world_link[number]), points_world)
-                is_inside = self._is_inside(number, points)
+                is_inside = tree.holds(points)
                 bound = np.where(is_inside, np.inf, np.minimum(np.maximum(least, 0.0), within))
                 found = tree.closest(points, bound)[0]
                 least = np.minimum(least, np.where(is_inside, -found, found))
         return least
-
-    def _is_inside(self, number: int, points: Float64) -> Bool:
-        """Points (Q, 3) [m], in the frame of a link with triangles, that these enclose."""
-        corners = self.triangles[self.triangle_links == number]
-        is_inside = np.all((points > corners.min(axis=(0, 1))) & (points < corners.max(axis=(0, 1))), axis=1)
-        is_inside[is_inside] = self.trees[number].holds(points[is_inside])
-        return np.asarray(is_inside)
 
     def _solids(self, T_solid: NDArray[np.floating]) -> Float64:
         """Rows (P, 16) of `SurfaceScene` for the frame from which T_solid (P, 4, 4) leads to each solid's own."""

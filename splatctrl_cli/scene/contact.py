@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import CONTACT_REACH, CONTACT_THICKNESS
+from splatctrl_cli.config.fixed import CONTACT_REACH, CONTACT_THICKNESS, ROBOT_REACH
 from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.records import Bool, Label, RgbdFrame, SplatSet
 from splatctrl_cli.robot.declared_contact import Declarations
@@ -84,13 +84,13 @@ def contact_seeds(
 def hidden_objects(
     buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig
 ) -> NDArray[np.intp]:
-    """Slots (K,) of objects within `CONTACT_REACH` of the robot, its base included, that no pixel shows.
+    """Slots (K,) of objects within `ROBOT_REACH` of the robot, its base included, that no pixel shows.
 
     What an image shows there is the robot; fitting them to it would pull them out of their object.
     """
     if robot is None:
         return np.zeros(0, np.intp)
     slots = np.flatnonzero(buffer.is_alive & (buffer.labels != Label.ROBOT))
-    slots = slots[robot.distance(buffer.centers[slots]) < CONTACT_REACH]
+    slots = slots[robot.distance(buffer.centers[slots]) < ROBOT_REACH]
     is_hidden = shown_kinds(buffer.centers[slots], seen, config) != PixelKind.OBJECT
     return np.asarray(slots[is_hidden], np.intp)

@@ -9,7 +9,6 @@ import numpy as np
 
 from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel
 from splatctrl_cli.config.fixed import (
-    CONTACT_REACH,
     EVICT_EVERY,
     NEAREST_REACH,
     NOT_COVERED,
@@ -132,9 +131,10 @@ class SceneFitter:
         self.descent.keep([*self.window.newest, *self.window.keyframes])
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
         hidden = hidden_objects(self.buffer, robot, seen, self.occupancy.config)
-        as_they_were = self.buffer.parameters[hidden].copy()
+        as_they_were = self.buffer.parameters.copy()
         terms = self.descent.run(self.window.schedule(num_iterations, rng), self.descent.settings())
-        self.buffer.parameters[hidden] = as_they_were
+        hidden = np.union1d(hidden, hidden_objects(self.buffer, robot, seen, self.occupancy.config))  # drifted there
+        self.buffer.parameters[hidden] = as_they_were[hidden]
         self._prune(robot, views, seen, removed)
         filled += self._show_contact(robot, views, seen)
         filled += self._fill_gaps(views, masks, removed, half=self.num_steps % 2 if self.num_steps else None)
@@ -365,13 +365,12 @@ class SceneFitter:
 
     def _keep_to_surface(self, robot: RobotPosture | None, seen: Seen) -> None:
         """Let no object's splat near the robot reach farther than the depth that shows its surface, or half of
-        `contact_radius`; those in contact keep all of it.
+        `contact_radius`.
         """
         if robot is None:
             return
         slots = np.flatnonzero(self._standing_for(Label.OBJECT))
-        gap = robot.distance(self.buffer.centers[slots])
-        slots = slots[(gap > CONTACT_REACH) & (gap < ROBOT_REACH)]
+        slots = slots[robot.distance(self.buffer.centers[slots]) < ROBOT_REACH]
         room = room_beneath(self.buffer.centers[slots], seen, self.occupancy.config)
         most = np.maximum(room, 0.5 * self.config.contact_radius)
         self.buffer.set_radius(slots, np.minimum(self.buffer.radii[slots], most))

@@ -7,10 +7,12 @@ import pytest
 import trimesh
 from pinocchio.rpy import rpyToMatrix
 
+from splatctrl_cli.control.audit import BallDistance, part_clearances
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import pose_at
+from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
+from tests.reference.triangles import distance_to_triangles
 from tests.robot.shapes import arm_of, l_shape, written
 
 BALL = '<sphere radius="0.02"/>'
@@ -109,3 +111,61 @@ def test_what_stands_for_a_link_without_its_visual_geometry_is_said_with_the_rea
     assert RobotModel.from_urdf(urdf, SPHERES).surface.notes == (bare,)
     urdf = written(tmp_path, arm_of(BALL, BALL))
     assert RobotModel.from_urdf(urdf, SPHERES).surface.notes == ()
+
+
+def with_visual(folder: Path, visual: str) -> RobotModel:
+    """A tip that collides as a box of 0.4 m and is seen as a mesh."""
+    text = arm_of(BALL, '<box size="0.4 0.4 0.4"/>')
+    drawn = f'<link name="tip"><visual><geometry><mesh filename="{visual}"/></geometry></visual>'
+    spheres = SphereSet(links=("base", "tip"), centers=np.array([[0, 0, 0], [0.1, 0.1, 0.05]]), radii=SPHERES.radii)
+    return RobotModel.from_urdf(written(folder, text.replace('<link name="tip">', drawn)), spheres)
+
+
+def test_a_link_is_as_it_is_seen_and_as_it_collides_where_that_cannot_be_read(tmp_path: Path) -> None:
+    l_shape().export(tmp_path / "ell.stl")
+    seen, gone = with_visual(tmp_path, "ell.stl").surface, with_visual(tmp_path, "gone.stl").surface
+    assert len(seen.triangles) == len(l_shape().faces) and len(seen.kinds) == 1
+    assert not len(gone.triangles) and len(gone.kinds) == 2
+    assert seen.by_spheres == gone.by_spheres == ()
+
+
+def test_the_distance_to_a_mesh_is_exact_and_negative_inside(tmp_path: Path) -> None:
+    l_shape().export(tmp_path / "ell.stl")
+    model = with_visual(tmp_path, "ell.stl")
+    points = np.random.default_rng(3).uniform(-0.1, 0.4, (400, 3)) + np.array([0, 0, 0.3])
+    arms = [trimesh.creation.box(bounds=b) for b in ([[0, 0, 0], [0.3, 0.1, 0.1]], [[0, 0, 0], [0.1, 0.3, 0.1]])]
+    gaps = []
+    for arm in arms:
+        beyond = np.maximum(arm.bounds[0] - (points - [0, 0, 0.3]), (points - [0, 0, 0.3]) - arm.bounds[1])
+        gaps.append(np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0))
+    to_ball = np.linalg.norm(points, axis=1) - 0.02
+    outside = np.min(gaps, axis=0) > 0
+    found = distance(model, points)
+    np.testing.assert_allclose(found[outside], np.minimum(np.min(gaps, axis=0), to_ball)[outside], atol=1e-6)
+    assert (found[~outside] < 0).all() and np.sum(~outside) > 10
+    near = model.surface.distance(
+        model.surface.poses({link: model.frame_pose(np.zeros(1), link) for link in model.surface.links}),
+        points, within=0.05, without=["base"],
+    )  # fmt: skip
+    is_far = np.min(gaps, axis=0) > 0.05 + 1e-6
+    assert np.isinf(near[is_far]).all() and np.isfinite(near[~is_far]).all()
+
+
+@pytest.mark.parametrize("q", [-0.7, 0.0, 0.4])
+def test_a_link_with_triangles_is_as_clear_as_its_surface_and_no_sphere_says_less(tmp_path: Path, q: float) -> None:
+    l_shape().export(tmp_path / "ell.stl")
+    model = with_visual(tmp_path, "ell.stl")
+    centers = np.random.default_rng(4).uniform(-0.6, 0.6, (30, 3)) + np.array([0.9, 0, 0.3])
+    radii = np.full(30, 0.02)
+
+    def of_points(points: Float64) -> Float64:
+        return np.asarray((np.linalg.norm(points[:, None] - centers, axis=2) - radii).min(axis=1))
+
+    scene = BallDistance(of_points=of_points, centers=centers, radii=radii)
+    each, is_surface = part_clearances(model, np.array([[q]]), scene)
+    T = model.frame_pose(np.array([q]), "tip")
+    there = transform_points(invert_transform(T), centers)
+    assert each.min() == pytest.approx(distance_to_triangles(there, l_shape().triangles).min() - 0.02, abs=1e-6)
+    assert is_surface.all()
+    assert not part_clearances(model, np.array([[q]]), of_points)[1].any()
+    assert part_clearances(model, np.array([[q]]), of_points)[0].min() < each.min()  # a ball of 0.3 m

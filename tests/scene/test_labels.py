@@ -11,7 +11,7 @@ from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.labels import human_splats, relabel, shown_kinds
+from splatctrl_cli.scene.labels import human_splats, relabel, room_beneath, shown_kinds
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask
@@ -306,3 +306,15 @@ def test_a_splat_on_the_robot_just_behind_an_object_is_not_taken_for_the_object(
     mask = self_mask(view, robot, OccupancyConfig())
     kinds = shown_kinds(np.float32([[0.0, 0.0, 0.4], [0.0, 0.0, 0.412]]), [(view, mask)], OccupancyConfig())
     assert kinds.tolist() == [PixelKind.NOTHING, PixelKind.OBJECT]
+
+
+def test_a_splat_reaches_as_far_as_it_lies_behind_the_surface_that_depth_shows() -> None:
+    """The floor is at z = 0, the camera above it."""
+    robot, config = ball(0.3), OccupancyConfig()
+    view = seen_with(robot)
+    seen = [(view, self_mask(view, robot, config))]
+    points = np.float32([[0.3, 0.2, -0.012], [0.3, 0.2, 0.005], [0.3, 0.2, -0.2], [0.0, 0.0, 0.0]])
+    error = 2 * config.depth_error * float(view.depth[2, 2]) ** 2
+    room = room_beneath(points, seen, config)
+    np.testing.assert_allclose(room[:2], [0.012 + error, error], atol=1e-3)
+    assert np.isinf(room[2:]).all()  # behind another surface, and behind the robot

@@ -193,7 +193,7 @@ void TriangleTree::look(const double* p, Hit& best) const {
 }
 
 double TriangleTree::surrounds(const double* p) const {
-  if (nodes_.empty()) return 0.0;
+  if (nodes_.empty() || box_squared(nodes_[0], p) > 0.0) return 0.0;
   double total = 0.0;
   int waiting[kDepth], num = 0;
   waiting[num++] = 0;

@@ -19,7 +19,7 @@ class TriangleTree {
   void closest(const double* points, int num_points, const double* bound, double* distance, std::int64_t* face,
                double* shares, int num_threads) const;
 
-  // How often the triangles surround each point (N): more than a half inside. Far triangles count as one dipole
+  // How often the triangles surround each point (N), 0 outside the box about them: more than a half inside. Far triangles count as one dipole
   // (Barill, Dickson, Schmidt, Levin, Jacobson, Fast winding numbers for soups and clouds, 2018).
   void winding(const double* points, int num_points, double* number, int num_threads) const;
 
