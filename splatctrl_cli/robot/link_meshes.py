@@ -149,12 +149,13 @@ def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
 
 def _unit_words(shape: MeshShape, length: float) -> str:
     """The unit in which a mesh of `length` [m], as scaled, would be as long as links are; else what to correct."""
-    raw = length / float(np.abs(shape.scale).max())
-    for name, unit in UNITS.items():
-        if LINK_LENGTHS[0] <= raw * unit <= LINK_LENGTHS[1]:
-            scale = " ".join(f"{unit * sign:g}" for sign in np.sign(shape.scale))
-            return f'looks like {name}: scale="{scale}"'
-    return "correct its scale"
+    raw, signs = length / float(np.abs(shape.scale).max()), np.sign(shape.scale)
+    words = (
+        f'looks like {name}: scale="{" ".join(f"{unit * sign:g}" for sign in signs)}"'
+        for name, unit in UNITS.items()
+        if LINK_LENGTHS[0] <= raw * unit <= LINK_LENGTHS[1]
+    )
+    return next(words, "correct its scale")
 
 
 def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:

@@ -38,9 +38,8 @@ def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
     """
     depth = view.target.depth
     left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0)
-    for shown in (view.frame.valid, None if mounted is None else ~mounted):
-        left_out &= True if shown is None else shown
-    return np.asarray(left_out)
+    left_out &= True if view.frame.valid is None else view.frame.valid
+    return np.asarray(left_out if mounted is None else left_out & ~mounted)
 
 
 class Shell:
