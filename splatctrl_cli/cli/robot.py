@@ -6,6 +6,7 @@ import math
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
+from splatctrl_cli.files.output import finite
 from splatctrl_cli.jobs.robot import (
     CoverageResult,
     PairsResult,
@@ -24,6 +25,8 @@ from splatctrl_cli.robot.self_collision import LinkPair
 from splatctrl_cli.robot.self_model import LearnedLink
 from splatctrl_cli.robot.sphere_files import RENAMED
 from splatctrl_cli.robot.sphere_fit import FitOptions
+
+LEARNED = ("num_pixels", "num_configurations", "area", "outside_95", "outside_most", "since")
 
 
 def run_spheres(args: argparse.Namespace) -> int:
@@ -72,31 +75,30 @@ def run_info(args: argparse.Namespace) -> int:
 def run_learn(args: argparse.Namespace) -> int:
     console = Console(args)
     request = request_of(LearnRequest, args, options=source_options(args), locked=locked_joints(args))
-    result = learn_robot(request, console)
-    found = result.model.learned
-    header = (
-        "link",
-        "pixels",
-        "configurations",
-        "outside 95 % mm",
-        "most mm",
-        "area cm2",
-        "at x, y, z mm",
-        "since s",
-    )
-    unknown = [f"not learned: {link}: {why}" for link, why in result.model.unknown.items()]
-    num = len(result.model.pieces())
-    summary = f"{num} of {len(found)} learned links have parts that {args.urdf.name} does not have"
-    lines = [summary, "", *table(header, [_learned_row(part) for part in found]), "", *unknown]
-    console.result(result.as_dict(), [*lines, f"written: {result.out}"])
+    model = learn_robot(request, console)
+    header = ("link", "pixels", "postures", "parts cm2", "outside 95 % mm", "most mm", "at x, y, z mm", "since s")
+    lines = [
+        f"{len(model.pieces())} of {len(model.learned)} learned links have parts that {args.urdf.name} does not have",
+        "",
+        *table(header, [_learned_row(part) for part in model.learned]),
+        "",
+        *(f"not learned: {link} {why}" for link, why in model.unknown.items()),
+        f"written: {request.out}",
+    ]
+    found = [
+        {name: finite(getattr(part, name)) for name in LEARNED}
+        | {"link": part.link, "place": [*map(finite, part.place)]}
+        for part in model.learned
+    ]
+    console.result({"out": str(request.out), "links": found, "unknown": dict(model.unknown)}, lines)
     return 0
 
 
 def _learned_row(part: LearnedLink) -> tuple[object, ...]:
-    outside, has_part = [f"{1e3 * value:.1f}" for value in part.stands_out], len(part.triangles) > 0
-    place = ", ".join(f"{1e3 * value:.0f}" for value in part.place) if has_part else ""
-    since = f"{part.since:.1f}" if has_part else ""
-    return part.link, part.num_pixels, part.num_configurations, *outside, f"{1e4 * part.area:.0f}", place, since
+    outside = [f"{1e3 * value:.1f}" for value in (part.outside_95, part.outside_most)]
+    place = ", ".join(f"{1e3 * value:.0f}" for value in part.place) if len(part.triangles) else ""
+    since = f"{part.since:.1f}" if len(part.triangles) else ""
+    return part.link, part.num_pixels, part.num_configurations, f"{1e4 * part.area:.0f}", *outside, place, since
 
 
 def _coverage_lines(result: CoverageResult) -> list[str]:

@@ -3,14 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from splatctrl_cli.config.fixed import STATES_CLOSE_NS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import savez
-from splatctrl_cli.files.output import finite, output_path
+from splatctrl_cli.files.output import output_path
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.calibrate import depth_frame, frames_nearest, stamps_by_camera
 from splatctrl_cli.jobs.progress import SILENT, Progress
@@ -18,7 +17,8 @@ from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.records import Float64, RgbdFrame, SphereSet, spread
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_model import REACH, SelfModel, choose_moments, learn
+from splatctrl_cli.robot.self_fusion import REACH, choose_moments, learn
+from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.sources.source import open_source
 
 MOST_MOMENTS = 2000  # of a recording, among which those are chosen that are read
@@ -42,33 +42,8 @@ class LearnRequest:
     force: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class LearnResult:
-    """The file and what stands in it; num_frames: that were read."""
-
-    out: Path
-    model: SelfModel
-    num_frames: int
-
-    def as_dict(self) -> dict[str, Any]:
-        links = [
-            {
-                "link": part.link,
-                "num_pixels": part.num_pixels,
-                "num_configurations": part.num_configurations,
-                "outside_95_m": part.stands_out[0],
-                "outside_most_m": part.stands_out[1],
-                "area_m2": part.area,
-                "place_m": [finite(value) for value in part.place.tolist()],
-                "since_s": finite(part.since),
-            }
-            for part in self.model.learned
-        ]
-        return {"out": str(self.out), "frames": self.num_frames, "links": links, "unknown": dict(self.model.unknown)}
-
-
-def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> LearnResult:
-    """Learn and write. Raises InputError for a recording in which the arm does not move or is not known."""
+def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel:
+    """Learn and write the self-model. Raises InputError for a recording that shows no link moving."""
     none = SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
     model = RobotModel.from_urdf(
         request.urdf,
@@ -84,7 +59,7 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> LearnResu
         frames, T_world_link = _read(model.moved_by(source.joint_names), source, progress)
         found = learn(model.surface, model.urdf.links, frames, T_world_link, name=source.name, reach=request.reach)
         savez(partial, found.arrays())
-    return LearnResult(out=request.out, model=found, num_frames=len(frames))
+    return found
 
 
 def _read(model: RobotModel, source: FrameSource, progress: Progress) -> tuple[list[RgbdFrame], Float64]:

@@ -1,0 +1,346 @@
+"""Learns a self-model: depth fused in each link's frame over clearly different configurations.
+
+Projective signed distances (Curless and Levoy, A volumetric method for building complex models from range images,
+1996). L links, V views, K configurations of a link, N cells, F triangles.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from skimage.measure import marching_cubes
+
+from splatctrl_cli.config.fixed import MASK_SIGMAS
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import back_project, invert_transform, project, strided_lens, transform_points
+from splatctrl_cli.records import Bool, Float32, Float64, Index, Intrinsics, RgbdFrame
+from splatctrl_cli.robot.self_model import LearnedLink, SelfModel, surface_digest
+from splatctrl_cli.robot.surface import RobotSurface
+
+VOXEL = 0.004  # [m]
+TRUNCATION = 3 * VOXEL  # [m] before and behind a measured surface
+REACH = 0.06  # [m] outside of a link's visual surface, in which its parts are looked for
+STEP = 0.03  # [m] by which some corner of a link's box moves between clearly different configurations
+SAME = 0.01  # [m] within which cameras of one moment see a link in one configuration
+NUM_CONFIGURATIONS = 5  # that a cell has to be a surface in
+FREE_SHARE = 0.3  # of the configurations that see a cell; where more see through it, it is no robot
+TURN = 0.97  # mean length of a surface's normals in world, below which they turn by 15 degrees or more
+LEAST_CELLS = 24  # of a part, 1.5 cm^3
+MOST_LOST = 0.5  # of a piece, which more cells that belong elsewhere make no part
+MOST_SETS = 40  # frame sets
+WIDE = 320  # pixels of an image across, to which it is thinned
+MEDIAN_SIGMA = 1.4826  # standard deviation of a normal distribution by its median size
+FAR_OFF = 0.03  # [m] from the rendered robot, beyond which a pixel shows something else
+UNEXPLAINED, EXPLAINED = -1, -2
+BLOCK = 3  # cells along an edge
+
+
+def choose_moments(surface: RobotSurface, T_world_link: Float64, most: int = MOST_SETS) -> list[int]:
+    """Numbers of at most `most` of M moments, in order, between which the links moved farthest (farthest-point
+    sampling). T_world_link: (M, L, 4, 4).
+    """
+    corners = _boxes(surface)[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
+    placed = _moved(T_world_link, corners).reshape(len(T_world_link), -1, 3)
+    chosen, gap = [0], np.full(len(placed), np.inf)
+    while len(chosen) < most:
+        gap = np.minimum(gap, np.linalg.norm(placed - placed[chosen[-1]], axis=2).max(axis=1))
+        if gap.max() < STEP:
+            break
+        chosen.append(int(gap.argmax()))
+    return sorted(chosen)
+
+
+def learn(
+    surface: RobotSurface,
+    links: Sequence[str],
+    frames: Sequence[RgbdFrame],
+    T_world_link: Float64,
+    *,
+    name: str = "recording",
+    reach: float = REACH,
+) -> SelfModel:
+    """The self-model that V frames of a robot show, with the links of its surface at T_world_link (V, L, 4, 4).
+
+    links: all of the robot's. reach [m]: how far outside a link's visual surface its parts are looked for. A cell of
+    a link's grid is robot where it is a surface in `NUM_CONFIGURATIONS` of the link, no more than `FREE_SHARE` of
+    those that see it see through it, no plane that stays in the world explains it, and it moves against each nearer
+    link. Raises InputError where no link can be learned.
+    """
+    boxes = _boxes(surface)
+    corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
+    placed = _moved(T_world_link, corners)
+    views = _views(surface, frames, T_world_link, np.stack([placed.min(axis=2), placed.max(axis=2)], axis=2), reach)
+    learned, unknown = [], {}
+    for number, link in enumerate(surface.links):
+        configurations = _configurations(placed[:, number])
+        num = int(configurations.max(initial=-1)) + 1
+        used = [(view, int(k)) for view, k in zip(views, configurations, strict=True) if k >= 0]
+        if num < NUM_CONFIGURATIONS:
+            unknown[link] = f"moves too little ({num} configurations): its parts stay like the scene"
+        elif (found := _learn_link(surface, number, boxes[number], used, reach)) is None:
+            unknown[link] = f"no camera sees it in {NUM_CONFIGURATIONS} configurations"
+        else:
+            learned.append(found)
+    if not learned:
+        raise InputError(
+            f"{name}: no link can be learned: {'; '.join(f'{link} {why}' for link, why in unknown.items())}",
+            remedy=f"record the arm moving by {1e3 * NUM_CONFIGURATIONS * STEP:.0f} mm in view of the cameras",
+        )
+    return SelfModel(links=tuple(links), digest=surface_digest(surface), learned=tuple(learned), unknown=unknown)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _View:
+    """A thinned image: depth (H, W) float32 [m]; links (H, W) int16, the link that explains a pixel, `UNEXPLAINED` or
+    `EXPLAINED` by some; points_world (M, 3) [m] of what no link explains.
+    """
+
+    stamp_ns: int
+    lens: Intrinsics
+    T_camera_world: Float64
+    T_world_link: Float64
+    depth: Float32
+    links: NDArray[np.int16]
+    points_world: Float64
+
+
+def _views(
+    surface: RobotSurface, frames: Sequence[RgbdFrame], T_world_link: Float64, boxes: Float64, reach: float
+) -> list[_View]:
+    """Frames beside the rendered robot, whose surface explains a pixel as far as the recording's noise. boxes (V, L,
+    2, 3) [m], world: of the links; what is within `reach` of them and not explained is kept.
+    """
+    thinned, ratios, views = [], [np.zeros(1)], []
+    for frame, T in zip(frames, T_world_link, strict=True):
+        stride = max(1, round(frame.depth.shape[1] / WIDE))
+        lens, depth = strided_lens(frame.intrinsics, stride), np.ascontiguousarray(frame.depth[::stride, ::stride])
+        shown = surface.render(T, lens, frame.T_world_camera, depth)
+        is_close = (depth > 0) & (shown.depth > 0) & (np.abs(depth - shown.depth) < FAR_OFF)
+        thinned.append((lens, depth, shown))
+        ratios.append(np.abs(depth - shown.depth)[is_close] / np.square(depth[is_close]))
+    noise = MEDIAN_SIGMA * float(np.median(np.concatenate(ratios)))
+    for frame, T, near, (lens, depth, shown) in zip(frames, T_world_link, boxes, thinned, strict=True):
+        tolerance = (VOXEL + MASK_SIGMAS * noise * np.square(depth)).astype(np.float32)
+        is_link = (shown.depth > 0) & (np.abs(shown.depth - depth) <= tolerance)
+        links = np.where(is_link, shown.link, np.int16(UNEXPLAINED))
+        pixels = np.argwhere((depth > 0) & ~is_link)
+        points = transform_points(frame.T_world_camera, back_project(lens, depth)[tuple(pixels.T)])
+        is_near = np.any([_is_in(box, points, reach) for box in near], axis=0)
+        v, u = pixels[is_near].T
+        points = points[is_near]
+        is_own = surface.distance(T, points, within=tolerance[v, u]) <= tolerance[v, u]
+        links[v[is_own], u[is_own]] = EXPLAINED
+        view = _View(
+            stamp_ns=frame.stamp_ns, lens=lens, T_camera_world=invert_transform(frame.T_world_camera),
+            T_world_link=T, depth=depth, links=links, points_world=points[~is_own],
+        )  # fmt: skip
+        views.append(view)
+    return views
+
+
+def _learn_link(
+    surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
+) -> LearnedLink | None:
+    """A link with its box (2, 3) by the views that see it, each with its configuration; None where it is seen in too
+    few.
+    """
+    points = [transform_points(invert_transform(v.T_world_link[number]), v.points_world) for v, _ in used]
+    points = [part[_is_in(box, part, reach)] for part in points]
+    at = np.array([k for _, k in used])
+    origin, mask = _candidates(np.concatenate(points), at.repeat([len(part) for part in points]))
+    cells = origin + VOXEL * np.argwhere(mask)
+    gap = _own_distance(surface, number, cells, reach)
+    is_near = (gap <= reach) & (gap > -TRUNCATION)
+    mask[mask], cells, gap = is_near, cells[is_near], gap[is_near]
+    in_order = [used[int(np.argmax(at == k))][0] for k in range(at.max() + 1)]
+    measured, seen, free = _fuse(cells, number, used, len(in_order))
+    counts, num_free = np.sum(seen & ~free, axis=0), np.sum(free, axis=0)
+    is_robot = np.isfinite(measured) & (counts >= NUM_CONFIGURATIONS) & (num_free <= FREE_SHARE * (counts + num_free))
+    solid = np.where(is_robot, np.maximum(measured, VOXEL - gap), TRUNCATION)
+    is_solid = solid < 0
+    poses = np.array([view.T_world_link for view in in_order])
+    normals = _normals(_spread(mask, measured, np.nan))[mask][is_solid]
+    its = (cells[is_solid], seen[:, is_solid])
+    is_else = np.zeros(len(cells), bool)
+    is_else[is_solid] = _stays_in_world(*its, normals, poses[:, number])
+    is_else[is_solid] |= _is_on_other_link(surface, number, *its, gap[is_solid], poses)
+    distance = _without_others(_spread(mask, solid, TRUNCATION), _spread(mask, is_else, 0) > 0)
+    is_part = (distance < 0)[mask]
+    num_own = np.array([np.count_nonzero(view.links == number) for view, _ in used])
+    if not is_part.any() and len(np.unique(at[num_own >= LEAST_CELLS])) < NUM_CONFIGURATIONS:
+        return None
+    place, since, heights = np.full(3, np.nan), np.nan, np.append(gap[is_part], [] if is_part.any() else [0.0])
+    if is_part.any():
+        place = cells[is_part][heights.argmax()]
+        first = np.argmax(np.cumsum(seen[:, is_part], axis=0) >= NUM_CONFIGURATIONS, axis=0)
+        stamps = np.array([view.stamp_ns for view in in_order])
+        since = 1e-9 * float(np.median(stamps[first]) - stamps.min())
+    return LearnedLink(
+        link=surface.links[number],
+        origin=origin,
+        voxel=VOXEL,
+        distance=np.where(_spread(mask, counts + num_free, 0) > 0, distance, np.float32(np.nan)),
+        configurations=_spread(mask, counts, 0).astype(np.uint8),
+        triangles=_triangles(distance, origin),
+        outside_95=float(np.quantile(heights, 0.95)),
+        outside_most=float(heights.max()),
+        place=place,
+        since=since,
+        num_pixels=int(num_own.sum()) + sum(map(len, points)),
+        num_configurations=len(in_order),
+    )
+
+
+def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: int) -> tuple[Float64, Bool, Bool]:
+    """Of cells (N, 3) [m], in a link's frame: their mean distance (N,) [m] before the measured surface, positive
+    outside, and whether they are a surface, and free, in each configuration (K, N).
+    """
+    total, weight = np.zeros(len(cells)), np.full(len(cells), 1e-9)
+    seen, free = np.zeros((num, len(cells)), bool), np.zeros((num, len(cells)), bool)
+    for view, k in used:
+        points = transform_points(view.T_camera_world @ view.T_world_link[number], cells)
+        ahead = np.flatnonzero(points[:, 2] > TRUNCATION)
+        u, v = np.floor(project(view.lens, points[ahead]) + 0.5).astype(int).T
+        lands = (u >= 0) & (v >= 0) & (u < view.lens.width) & (v < view.lens.height)
+        ahead, u, v = ahead[lands], u[lands], v[lands]
+        before, link = view.depth[v, u] - points[ahead, 2], view.links[v, u]
+        is_free = before > TRUNCATION
+        is_seen = (np.abs(before) <= TRUNCATION) & ((link == UNEXPLAINED) | (link == number))
+        is_known = (is_free | is_seen) & (view.depth[v, u] > 0)
+        share = np.clip((before + TRUNCATION) / (TRUNCATION - VOXEL), 0.0, 1.0) * is_known
+        total[ahead] += share * np.minimum(before, TRUNCATION)
+        weight[ahead] += share
+        seen[k, ahead] |= is_seen & is_known
+        free[k, ahead] |= is_free & is_known
+    return np.where(weight > 0.5, total / weight, np.nan), seen, free
+
+
+def _stays_in_world(cells: Float64, seen: Bool, normals: Float64, poses: Float64) -> Bool:
+    """Cells (N,) whose surface a plane that stays in the world explains in the configurations (K, N) that see it: its
+    normal does not turn, and it does not move along it by `STEP`. normals (N, 3), link frame; T_world_link (K, 4, 4).
+    """
+    turned = np.einsum("kij,nj->kni", poses[:, :3, :3], normals)
+    normal = np.einsum("kn,kni->ni", seen / np.maximum(seen.sum(axis=0), 1), turned)
+    length = np.linalg.norm(normal, axis=1)
+    along = np.einsum("kni,ni->kn", _moved(poses, cells), normal) / np.maximum(length, 1e-6)
+    return np.asarray((length >= TURN) & (_span(along[..., None], seen) < STEP))
+
+
+def _is_on_other_link(
+    surface: RobotSurface, number: int, cells: Float64, seen: Bool, gap: Float64, poses: Float64
+) -> Bool:
+    """Cells (N,) that lie nearer to a link against which they do not move by `STEP`; T_world_link (K, L, 4, 4)."""
+    found = np.zeros(len(cells), bool)
+    for other in range(len(surface.links)):
+        between = np.linalg.inv(poses[:, other]) @ poses[:, number]
+        places = _moved(between, cells)
+        if other != number and len(cells):
+            is_still = _span(places, seen) < STEP
+            at = places[seen.argmax(axis=0), np.arange(len(cells))]
+            found |= is_still & (_own_distance(surface, other, at, REACH) < gap)
+    return found
+
+
+def _moved(T: Float64, points: Float64) -> Float64:
+    """Points ([L,] N, 3) in each of K frames (K, [L,] N, 3), moved by T (K, [L,] 4, 4)."""
+    return np.asarray(np.einsum("...ij,...nj->...ni", T[..., :3, :3], points) + T[..., None, :3, 3])
+
+
+def _span(values: Float64, seen: Bool) -> Float64:
+    """Diagonal (N,) of the box about the values (K, N, D) that are seen (K, N)."""
+    is_seen = seen[..., None]
+    span = np.where(is_seen, values, -np.inf).max(axis=0) - np.where(is_seen, values, np.inf).min(axis=0)
+    return np.asarray(np.linalg.norm(span, axis=-1))
+
+
+def _candidates(points: Float64, configurations: Index) -> tuple[Float64, Bool]:
+    """Centre (3,) [m] of the first cell and mask (X, Y, Z) of the cells around points (M, 3) [m] that are there in
+    enough configurations (M,).
+    """
+    edge = BLOCK * VOXEL
+    block = np.floor(points / edge).astype(np.int64)
+    both = np.unique(np.column_stack([block, configurations]), axis=0)
+    blocks, counts = np.unique(both[:, :3], axis=0, return_counts=True)
+    blocks = blocks[counts >= NUM_CONFIGURATIONS]
+    if not len(blocks):
+        return np.zeros(3), np.zeros((2, 2, 2), bool)
+    first = blocks.min(axis=0) - 2
+    mask = np.zeros(np.ptp(blocks, axis=0) + 5, bool)
+    mask[tuple((blocks - first).T)] = True
+    mask = ndimage.binary_dilation(mask, np.ones((3, 3, 3), bool))
+    return edge * first + VOXEL / 2, mask.repeat(BLOCK, 0).repeat(BLOCK, 1).repeat(BLOCK, 2)
+
+
+def _spread(mask: Bool, values: NDArray[Any], rest: float) -> Float32:
+    """Values (N,) of the cells of a mask (X, Y, Z), in a grid (X, Y, Z) with the rest."""
+    grid = np.full(mask.shape, np.float32(rest))
+    grid[mask] = values
+    return grid
+
+
+def _normals(distance: Float32) -> Float64:
+    """Unit normals (X, Y, Z, 3), outwards, of a grid smoothed over its cells; NaN ones are as the nearest other."""
+    nearest = ndimage.distance_transform_edt(np.isnan(distance), return_distances=False, return_indices=True)
+    filled = distance[tuple(nearest)]
+    slopes = [ndimage.gaussian_filter(filled, 1.5, order=order) for order in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    normals = np.stack(slopes, axis=-1).astype(np.float64)
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12))
+
+
+def _without_others(distance: Float32, is_else: Bool) -> Float32:
+    """The grid without cells that are no part of the link, without pieces of which they are the most, and without
+    pieces of fewer than `LEAST_CELLS`.
+    """
+    for left_out in (is_else, np.zeros_like(is_else)):
+        pieces, num = ndimage.label(distance < 0)
+        sizes = np.bincount(pieces.ravel(), minlength=num + 1)
+        lost = np.bincount(pieces.ravel(), left_out.ravel(), num + 1)
+        is_out = (sizes < LEAST_CELLS) | (lost > MOST_LOST * sizes)
+        is_out[0] = False
+        distance = np.where(is_out[pieces] | left_out, np.float32(TRUNCATION), distance)
+    return distance
+
+
+def _triangles(distance: Float32, origin: Float64) -> Float64:
+    """Closed surface (F, 3, 3) [m] around the cells below 0, anticlockwise from outside."""
+    if not (distance < 0).any():
+        return np.zeros((0, 3, 3))
+    vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="ascent")
+    return np.asarray(origin + VOXEL * vertices[faces], np.float64)
+
+
+def _own_distance(surface: RobotSurface, number: int, points: Float64, within: float) -> Float64:
+    """Signed distance (N,) [m] of points (N, 3) in a link's frame to its visual surface alone; infinite beyond
+    `within` [m].
+    """
+    others = [link for k, link in enumerate(surface.links) if k != number]
+    still = np.tile(np.eye(4), (len(surface.links), 1, 1))
+    return surface.distance(still, points, without=others, within=within)
+
+
+def _boxes(surface: RobotSurface) -> Float64:
+    """Lower and upper corner (L, 2, 3) [m] of each link's box, in its frame."""
+    extents = surface.extents(np.tile(np.eye(4), (len(surface.links), 1, 1)))
+    return np.array([extents[link][:6] for link in surface.links]).reshape(-1, 2, 3)
+
+
+def _is_in(box: Float64, points: Float64, reach: float) -> Bool:
+    """Points (N, 3) [m] within `reach` of a box (2, 3)."""
+    return np.asarray(np.all((points >= box[0] - reach) & (points <= box[1] + reach), axis=1))
+
+
+def _configurations(placed: Float64) -> Index:
+    """Which of a link's clearly different configurations each view has (V,), -1: none; corners (V, 8, 3) [m]."""
+    keys: list[Float64] = []
+    found = np.full(len(placed), -1)
+    for number, corners in enumerate(placed):
+        gaps = np.array([np.linalg.norm(corners - key, axis=1).max() for key in keys])
+        if len(keys) < 255 and gaps.min(initial=np.inf) >= STEP:
+            keys.append(corners)
+            found[number] = len(keys) - 1
+        elif keys and gaps.min() <= SAME:
+            found[number] = int(gaps.argmin())
+    return found
