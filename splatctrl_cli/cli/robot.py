@@ -83,6 +83,11 @@ def run_learn(args: argparse.Namespace) -> int:
         *table(header, [_learned_row(part) for part in model.learned]),
         "",
         *(f"not learned: {link} {why}" for link, why in model.unknown.items()),
+        *(
+            f"{part.link}: its parts go as far as --reach ({1e3 * args.reach:.0f} mm); a larger one may show more"
+            for part in model.learned
+            if part.outside_most > args.reach - part.voxel
+        ),
         f"written: {request.out}",
     ]
     found = [
