@@ -361,7 +361,9 @@ class SceneFitter:
         seeds = contact_seeds(
             seen, mappable, robot, splats, self.config, num_threads=self.num_threads, each=self._each
         )
-        return self.buffer.fill(seeds.select(self._is_grounded(seeds.centers, views)), self.config.initial_opacity)
+        least = max((mask.reach for _, mask in seen), default=0.0)  # what noise leaves: nearer, no view tells
+        seeds = seeds.select(self._is_grounded(seeds.centers, views, least))
+        return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _keep_to_surface(self, robot: RobotPosture | None, seen: Seen) -> None:
         """Let no object's splat near the robot reach farther than the depth that shows its surface, or half of
@@ -381,9 +383,12 @@ class SceneFitter:
         removed["weak"] += num_weak
         return filled
 
-    def _is_grounded(self, points: Float32, views: Sequence[View]) -> Bool:
-        """Points (K,) that no view sees through: what one sensor measured and another looks past was noise."""
-        return ~seen_through(points, views, self.occupancy.config.see_through, self.num_threads)
+    def _is_grounded(self, points: Float32, views: Sequence[View], least: float = np.inf) -> Bool:
+        """Points (K,) that no view sees through by `see_through`, or by `least` [m] where that is less: what one
+        sensor measured and another looks past was noise.
+        """
+        gap = min(self.occupancy.config.see_through, least or np.inf)
+        return ~seen_through(points, views, gap, self.num_threads)
 
     def _audit(
         self, views: Sequence[View], filled: Filled, removed: dict[str, int], known: dict[int, LossTerms]
