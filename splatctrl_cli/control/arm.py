@@ -10,16 +10,6 @@ from splatctrl_cli.kernels.chain import Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
 
 
-class Balls(Protocol):
-    """centers (N, 3) and radii (N,) [m]."""
-
-    @property
-    def centers(self) -> NDArray[np.floating]: ...
-
-    @property
-    def radii(self) -> NDArray[np.floating]: ...
-
-
 class ArmModel(Protocol):
     """A kinematic chain with collision spheres; `splatctrl_cli.robot.model.RobotModel` is one.
 
@@ -77,7 +67,9 @@ class ArmModel(Protocol):
 
     def self_pairs(self) -> NDArray[np.integer]: ...
 
-    def surface_gaps(self, positions: Float64, scene: Balls) -> Mapping[str, Float64]: ...
+    def surface_gaps(
+        self, positions: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
+    ) -> Mapping[str, Float64]: ...
 
     def reach(self) -> float: ...
 

@@ -112,7 +112,9 @@ def part_clearances(
     there = model.sphere_centers_batch(positions) if centers is None else centers
     points = np.ascontiguousarray(there[:, moving].reshape(-1, 3))
     each = distance_to(points).reshape(len(positions), len(moving)) - model.sphere_set.radii[moving]
-    gaps = model.surface_gaps(positions, distance_to) if isinstance(distance_to, BallDistance) else {}
+    gaps: Mapping[str, Float64] = {}
+    if isinstance(distance_to, BallDistance):
+        gaps = model.surface_gaps(positions, distance_to.centers, distance_to.radii)
     links = np.array(model.sphere_set.links)[moving]
     for link, gap in gaps.items():
         of_link = np.flatnonzero(links == link)

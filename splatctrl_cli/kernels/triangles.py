@@ -5,6 +5,7 @@ count.
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.kernels import Bool, Float64, Int64, native
 
@@ -34,7 +35,9 @@ class TriangleTree:
         self._native.winding(np.ascontiguousarray(points, np.float64), number, self._num_threads)
         return np.asarray(number > INSIDE)
 
-    def gaps(self, poses: Float64, centers: Float64, radii: Float64) -> tuple[Float64, Int64]:
+    def gaps(
+        self, poses: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
+    ) -> tuple[Float64, Int64]:
         """Signed gap (T,) [m] from the nearest of balls (N, 3), (N,) [m] to the triangles, negative inside, in each
         of poses (T, 4, 4) from the balls' frame to the triangles'; and the ball's number. Infinite and -1 without
         any.

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio
+from numpy.typing import NDArray
 
-from splatctrl_cli.control.arm import Balls
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.records import Bool, Box, Float64, Index, SphereSet
@@ -264,14 +264,15 @@ class RobotModel:
         """T_world_frame (4, 4) of a link at q (J,). Raises InputError for a frame that is not there."""
         return np.vstack([self._framed(q, frame)[0], [0.0, 0.0, 0.0, 1.0]])
 
-    def surface_gaps(self, positions: Float64, scene: Balls) -> dict[str, Float64]:
-        """By link with triangles, the signed gap (T,) [m] between its surface and the nearest of a scene's balls, at
-        joint positions (T, J).
+    def surface_gaps(
+        self, positions: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
+    ) -> dict[str, Float64]:
+        """By link with triangles, the signed gap (T,) [m] between its surface and the nearest of balls (N, 3), (N,)
+        [m], world, at joint positions (T, J).
         """
         surface = self.surface
         drawn = {surface.links[number]: tree for number, tree in surface.trees.items()}
         poses = {link: np.array([self.frame_pose(q, link) for q in positions]) for link in drawn}
-        centers, radii = np.asarray(scene.centers, np.float64), np.asarray(scene.radii, np.float64)
         return {link: tree.gaps(np.linalg.inv(poses[link]), centers, radii)[0] for link, tree in drawn.items()}
 
     def frame_jacobian(self, q: Float64, frame: str) -> Float64:
