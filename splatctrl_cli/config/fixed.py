@@ -49,7 +49,7 @@ SCALE_DEPTH = 0.8  # [m] of a table at arm's length, in the median: the map's le
 NOISE_BLOCKS = 27  # along a row of an image, in each of which the noise of depth is looked for
 NOISE_LEAST_SIDE = 8  # [px] of a block
 NOISE_QUANTILE = 0.1  # of the blocks that lie on one surface, at least
-NOISE_WIDER = 3  # times as wide are the blocks that show noise which neighbouring pixels share
+NOISE_WIDER = (2, 3)  # times as wide are the blocks that show noise which neighbouring pixels share
 NOISE_FEWEST = 20  # blocks, of which fewer tell nothing
 SCALE_NEAREST = 0.5  # of the depth of the nearest tenth: nearer is noise, or what the camera carries
 

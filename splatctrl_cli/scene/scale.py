@@ -64,11 +64,11 @@ def depth_noise(images: Sequence[Float32]) -> float:
     That of a depth z is this times z^2, as for sensors that measure disparity (Khoshelham and Elberink 2012: 1.425e-3
     of a Kinect). The inverse depth of a plane is linear in the pixel: what a linear fit leaves of a block of pixels
     is noise where the block lies on one surface, so that of many blocks one of the smallest is taken. Where noise of
-    neighbouring pixels is alike, a fit takes much of it away: blocks of `NOISE_WIDER` times the side say more, up to
-    twice as much; what is beyond that is shape.
+    neighbouring pixels is alike, a fit takes much of it away: blocks two or three times as wide say more, up to twice
+    as much; what is beyond that is shape.
     """
-    narrow, wide = (_linear_noise(images, times) for times in (1, NOISE_WIDER))
-    return max(narrow, min(wide, 2 * narrow))
+    narrow, *wider = (_linear_noise(images, times) for times in (1, *NOISE_WIDER))
+    return max(narrow, min(max(wider), 2 * narrow))
 
 
 def _linear_noise(images: Sequence[Float32], times: int) -> float:
