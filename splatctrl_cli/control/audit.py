@@ -26,7 +26,7 @@ class BallDistance:
     radii: NDArray[np.floating]
 
     def __call__(self, points: Float64) -> Float64:
-        """Of points (Q, 3) [m]."""
+        """The distance (Q,) [m] of points (Q, 3)."""
         return self.of_points(points)
 
 
@@ -131,10 +131,8 @@ def moving_clearance(
     model: ArmModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Clearance, Float64]:
     """The smallest of `part_clearances` of every posture (T, J), and all of them (T, M) [m]."""
-    distance, moving = (
-        part_clearances(model, positions, distance_to, centers)[0],
-        np.flatnonzero(model.moving_spheres),
-    )
+    distance, _ = part_clearances(model, positions, distance_to, centers)
+    moving = np.flatnonzero(model.moving_spheres)
     nearest = np.argmin(distance, axis=1)
     least = Clearance(distance=distance[np.arange(len(distance)), nearest], sphere=moving[nearest])
     return least, distance

@@ -51,7 +51,7 @@ def with_self_model(model: RobotModel, path: Path | None) -> RobotModel:
     if path is None:
         return model
     try:
-        found = SelfModel.of_arrays(read_arrays(path, most=LARGEST_SELF_MODEL))
+        found = SelfModel.from_arrays(read_arrays(path, most=LARGEST_SELF_MODEL))
     except (*DAMAGE, OSError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path}: not a self-model: {error}", remedy="write it with: splatctrl robot learn"

@@ -1,4 +1,4 @@
-"""What `robot learn` does: choose frame sets of a recording in which the arm moved, and fuse what they show of it."""
+"""The job of `robot learn`: it chooses frame sets in which the arm has moved, and fuses what they show of it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -20,8 +20,8 @@ class TriangleTree:
         self._native: Any = native.TriangleTree(np.ascontiguousarray(corners, np.float64))
 
     def closest(self, points: Float64, bound: Float64 | float = np.inf) -> tuple[Float64, Int64, Float64]:
-        """Of points (N, 3) [m]: distance (N,) [m] to the nearest triangle, its number (N,) and the barycentric
-        coordinates (N, 3) of the nearest point on it; infinite, -1 and 0 where it is farther than `bound` (N,) [m].
+        """The triangle nearest to each of points (N, 3) [m]: its distance (N,) [m], its number (N,), and the
+        barycentric coordinates (N, 3) of its nearest point; infinite, -1 and 0 beyond `bound` (N,) [m].
         """
         points = np.ascontiguousarray(points, np.float64)
         most = np.array(np.broadcast_to(np.float64(bound), len(points)))

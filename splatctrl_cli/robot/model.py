@@ -267,13 +267,15 @@ class RobotModel:
     def surface_gaps(
         self, positions: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
     ) -> dict[str, Float64]:
-        """By link with triangles, the signed gap (T,) [m] between its surface and the nearest of balls (N, 3), (N,)
-        [m], world, at joint positions (T, J).
+        """The signed gap (T,) [m] of each link that has triangles from the nearest of balls (N, 3), (N,) [m], world.
+
+        It is that of all the link's geometry and of what it carries, at joint positions (T, J).
         """
         surface = self.surface
-        drawn = {surface.links[number]: tree for number, tree in surface.trees.items()}
-        poses = {link: np.array([self.frame_pose(q, link) for q in positions]) for link in drawn}
-        return {link: tree.gaps(np.linalg.inv(poses[link]), centers, radii)[0] for link, tree in drawn.items()}
+        return {
+            link: surface.gaps(link, np.array([self.frame_pose(q, link) for q in positions]), centers, radii)
+            for link in {surface.links[number]: None for number in surface.trees}
+        }
 
     def frame_jacobian(self, q: Float64, frame: str) -> Float64:
         """Jacobian (6, J) of a link's origin, world axes: linear velocity rows [m] first, then angular."""

@@ -195,8 +195,10 @@ def _learn_link(
 
 
 def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: int) -> tuple[Float64, Bool, Bool]:
-    """Of cells (N, 3) [m], in a link's frame: their mean distance (N,) [m] before the measured surface, positive
-    outside, and whether they are a surface, and free, in each configuration (K, N).
+    """Where depth puts the surface beside each of cells (N, 3) [m] in a link's frame.
+
+    Returned are their mean distance (N,) [m] before it, positive outside; whether each configuration (K, N) sees a
+    surface there; and whether it sees through the cell.
     """
     total, weight = np.zeros(len(cells)), np.full(len(cells), 1e-9)
     seen, free = np.zeros((num, len(cells)), bool), np.zeros((num, len(cells)), bool)

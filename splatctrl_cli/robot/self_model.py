@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float32, Float64
+from splatctrl_cli.robot.coverage import areas
 from splatctrl_cli.robot.surface import RobotSurface
 
 
@@ -40,9 +41,8 @@ class LearnedLink:
 
     @property
     def area(self) -> float:
-        """Of the triangles [m^2]."""
-        sides = np.diff(self.triangles, axis=1)
-        return float(0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
+        """The area [m^2] of the part's triangles."""
+        return float(areas(self.triangles).sum())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +69,8 @@ class SelfModel:
         }
 
     @classmethod
-    def of_arrays(cls, found: Mapping[str, Any]) -> Self:
-        """What `arrays` gave. Raises KeyError, TypeError or ValueError for other arrays."""
+    def from_arrays(cls, found: Mapping[str, Any]) -> Self:
+        """The self-model that `arrays` wrote. Raises KeyError, TypeError or ValueError for other arrays."""
         names = [field.name for field in fields(LearnedLink)]
         rows = [{name: found[f"{link}.{name}"] for name in names} for link in found["learned"]]
         learned = [LearnedLink(**{k: v if v.ndim else v.item() for k, v in row.items()}) for row in rows]

@@ -225,6 +225,22 @@ class RobotSurface:
                 least = np.minimum(least, np.where(is_inside, -found, found))
         return least
 
+    def gaps(
+        self, link: str, T_world_link: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
+    ) -> Float64:
+        """Signed gap (T,) [m] of a link's triangles, solids and carried boxes from the nearest of balls (N, 3), (N,)
+        [m], with the link at T_world_link (T, 4, 4); infinite without any ball.
+        """
+        numbers = [number for number, name in enumerate(self.links) if name == link]
+        to_link = np.asarray(np.linalg.inv(T_world_link), np.float64)
+        found = [self.trees[number].gaps(to_link, centers, radii)[0] for number in numbers if number in self.trees]
+        own = np.isin(self.solid_links, numbers)
+        if own.any():
+            solids = self._solids(np.linalg.inv(self.T_link_solid))[own]
+            away = [solid_distance(transform_points(T, centers), solids) - radii for T in to_link]
+            found.append(np.array([gap.min(initial=np.inf) for gap in away]))
+        return np.asarray(np.min(found, axis=0))
+
     def _solids(self, T_solid: NDArray[np.floating]) -> Float64:
         """Rows (P, 16) of `SurfaceScene` for the frame from which T_solid (P, 4, 4) leads to each solid's own."""
         return np.column_stack([self.kinds, T_solid[:, :3, :3].reshape(-1, 9), T_solid[:, :3, 3], self.sizes])
@@ -248,7 +264,7 @@ def _areas(kinds: Float64, sizes: Float64) -> Float64:
 
 
 def _read(urdf: UrdfFile, folders: Sequence[Path]) -> tuple[list[tuple[str, Float64]], dict[str, str]]:
-    """Of each mesh its link and its triangles (F, 3, 3) in that frame; and why something of a link is not read."""
+    """The link and the triangles (F, 3, 3) of each mesh, in the link's frame; and by link why one cannot be read."""
     pieces, unread = [], {link: f"{urdf.path}: <{tag}> cannot be read" for link, tag in urdf.other_shapes}
     for mesh in urdf.meshes:
         try:

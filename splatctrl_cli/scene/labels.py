@@ -76,8 +76,10 @@ def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
 
 
 def room_beneath(centers: Float32, seen: Seen, config: OccupancyConfig) -> Float64:
-    """How far (N,) [m] the spheres about centers (N, 3) [m] may reach, as depth shows objects: how far each centre is
-    behind the surface that it stands for, and the sensor's error; the least over the views, infinite without any.
+    """The largest radius (N,) [m] with which spheres about centers (N, 3) [m] stay behind what depth shows.
+
+    It is how far a centre lies behind an object's pixel, plus the sensor's error: the least over the views, infinite
+    where none shows a surface near the centre.
     """
     room = np.full(len(centers), np.inf)
     for frame, mask in seen:

@@ -128,11 +128,11 @@ def _specks(
     others: Sequence[RgbdFrame],
     config: OccupancyConfig,
 ) -> Bool:
-    """Of found pixels (H, W) of a part of a frame those before the robot or at its outline in a piece that is too
-    little to be believed, and that no surface found elsewhere carries on.
+    """Object pixels (H, W) that are too few to believe: small pieces before the robot or at its outline.
 
-    By the area (H, W) [m^2] of each pixel: less than `MASK_SPECK`, or than `MASK_ALONE` where there are other frames
-    and none measured half of its points. One pixel by itself is too little, too.
+    A piece is a speck where it is one pixel, or smaller than `MASK_SPECK` by the area (H, W) [m^2] of its pixels; or
+    than `MASK_ALONE`, where there are other frames and none of them measured half of its points. It is none where a
+    surface that was found elsewhere carries it on. found, before (H, W): of a part of the frame.
     """
     depth, chosen, elsewhere = frame.depth[part], found & before, found & ~before
     num, piece, stats, _ = cv2.connectedComponentsWithStats(chosen.view(np.uint8), connectivity=8)

@@ -146,7 +146,7 @@ def test_the_pieces_belong_to_the_surface_that_is_rendered_and_measured() -> Non
 def test_a_self_model_is_read_as_it_was_written_and_refused_for_another_robot(tmp_path: Path) -> None:
     path = tmp_path / "self.npz"
     savez(path, learned().arrays())
-    found = SelfModel.of_arrays(read_arrays(path, most=2**30))
+    found = SelfModel.from_arrays(read_arrays(path, most=2**30))
     assert np.array_equal(found.pieces()[0][1], learned().pieces()[0][1])
     assert found.unknown == learned().unknown and found.learned[0].since == learned().learned[0].since
     found.check_robot(ROBOT, LINKS, path)

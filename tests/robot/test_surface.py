@@ -10,7 +10,7 @@ from pinocchio.rpy import rpyToMatrix
 from splatctrl_cli.control.audit import BallDistance, part_clearances
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
-from splatctrl_cli.records import Float64, SphereSet
+from splatctrl_cli.records import Box, Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
 from tests.reference.triangles import distance_to_triangles
 from tests.robot.shapes import arm_of, l_shape, written
@@ -117,7 +117,9 @@ def with_visual(folder: Path, visual: str) -> RobotModel:
     """A tip that collides as a box of 0.4 m and is seen as a mesh."""
     text = arm_of(BALL, '<box size="0.4 0.4 0.4"/>')
     drawn = f'<link name="tip"><visual><geometry><mesh filename="{visual}"/></geometry></visual>'
-    spheres = SphereSet(links=("base", "tip"), centers=np.array([[0, 0, 0], [0.1, 0.1, 0.05]]), radii=SPHERES.radii)
+    spheres = SphereSet(
+        links=("base", "tip"), centers=np.array([[0, 0, 0], [0.1, 0.1, 0.05]]), radii=SPHERES.radii.copy()
+    )
     return RobotModel.from_urdf(written(folder, text.replace('<link name="tip">', drawn)), spheres)
 
 
@@ -169,3 +171,22 @@ def test_a_link_with_triangles_is_as_clear_as_its_surface_and_no_sphere_says_les
     assert is_surface.all()
     assert not part_clearances(model, np.array([[q]]), of_points)[1].any()
     assert part_clearances(model, np.array([[q]]), of_points)[0].min() < each.min()  # a ball of 0.3 m
+    model.sphere_set.radii[:] = 0.01  # one that leaves the link uncovered says no more than its surface, either
+    assert part_clearances(model, np.array([[q]]), scene)[0].min() == pytest.approx(each.min(), abs=1e-9)
+
+
+def test_what_a_link_with_triangles_carries_or_has_of_boxes_counts_as_well(tmp_path: Path) -> None:
+    """A ball below a box beside the mesh: one that is carried, one that was learned, one of the URDF."""
+    l_shape().export(tmp_path / "ell.stl")
+    model = with_visual(tmp_path, "ell.stl")
+    q = np.zeros((1, 1))
+    scene = np.array([[0.0, 0.0, 0.3 - 0.55]]), np.array([0.05])
+    bare = model.surface_gaps(q, *scene)["tip"][0]
+    assert bare == pytest.approx(0.5, abs=1e-6)
+    box = Box(lower=np.array([-0.05, -0.05, -0.4]), upper=np.array([0.05, 0.05, -0.3]))
+    assert model.carrying([("tip", box)]).surface_gaps(q, *scene)["tip"][0] == pytest.approx(0.1, abs=1e-6)
+    part = [("tip", np.asarray(trimesh.creation.box(bounds=[box.lower, box.upper]).triangles))]
+    assert model.with_pieces(part).surface_gaps(q, *scene)["tip"][0] == pytest.approx(0.1, abs=1e-6)
+    capsules = RobotModel.from_urdf(written(tmp_path / "solid", arm_of(BALL, '<box size="0.4 0.4 0.4"/>')), SPHERES)
+    both = capsules.with_pieces([("tip", l_shape().triangles + np.array([0.0, 0.0, 1.0]))])
+    assert both.surface_gaps(q, *scene)["tip"][0] == pytest.approx(0.55 - 0.2 - 0.05, abs=1e-6)

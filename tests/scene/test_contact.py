@@ -1,15 +1,21 @@
 """What is put and kept beside the robot."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import CONTACT_REACH
-from splatctrl_cli.records import Box, Label
+from splatctrl_cli.config.fixed import CONTACT_REACH, ROBOT_REACH
+from splatctrl_cli.records import Box, Label, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Carried, Declarations
+from splatctrl_cli.scene import fitter as fitter_module
+from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.contact import contact_pixels, count_carried, hidden_objects
 from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.labels import room_beneath
+from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.seeding import world_points
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask
 from tests.scene.test_labels import VISITOR, ball, seen_with, splats_at
@@ -78,3 +84,50 @@ def test_what_the_robot_hides_of_an_object_is_not_fitted_to_the_robot() -> None:
     assert robot.surface is not None
     base = replace(robot, surface=replace(robot.surface, fixed=("arm",)))
     assert hidden_objects(slots, base, seen, OccupancyConfig()).tolist() == [0]  # what it stands on, too
+
+
+def robot_over_the_floor() -> tuple[SceneFitter, RobotPosture, RgbdFrame]:
+    """A fitter that has seen the floor, a ball 5 cm over it, and what a camera then sees."""
+    target, robot = SceneFitter(CONFIG, OccupancyConfig(), WORKSPACE), ball(0.15)
+    target.step([frame()], ball(5.0))
+    return target, robot, seen_with(robot)
+
+
+def test_near_the_robot_no_splat_reaches_past_the_surface_that_depth_shows() -> None:
+    target, robot, view = robot_over_the_floor()
+    target.buffer.set_radius(np.flatnonzero(target.buffer.is_alive), 0.02)
+    target.step([view], robot)
+    splats, config = target.splats(), OccupancyConfig()
+    is_near = (splats.labels == Label.OBJECT) & (robot.distance(splats.centers) < ROBOT_REACH)
+    room = room_beneath(splats.centers[is_near], [(view, self_mask(view, robot, config))], config)
+    assert np.isfinite(room).sum() > 20
+    assert (splats.radii[is_near] <= np.maximum(room, CONFIG.contact_radius / 2) * (1 + 1e-5)).all()
+
+
+def test_a_splat_that_the_descent_moves_behind_the_robot_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    target, robot, view = robot_over_the_floor()
+    own = target.descent.run
+    moved: list[int] = []
+
+    def drifting(*given: Any, **named: Any) -> Any:
+        terms = own(*given, **named)
+        shown = np.flatnonzero(target.buffer.is_alive & (np.hypot(*target.buffer.centers[:, :2].T) > 0.25))
+        moved.append(int(shown[0]))
+        target.buffer.centers[shown[0]] = [0.0, 0.0, 0.03]  # between the ball and the floor
+        return terms
+
+    monkeypatch.setattr(target.descent, "run", drifting)
+    target.step([view], robot)
+    assert np.hypot(*target.buffer.centers[moved[0], :2]) > 0.2
+
+
+def test_a_seed_in_contact_that_a_view_looks_past_is_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """12 mm over the floor: less than `see_through`, more than noise explains."""
+    target, robot, view = robot_over_the_floor()
+    center = np.float32([[0.25, 0.0, 0.012]])
+    seed = Seeds(centers=center, radii=np.float32([0.01]), colors=np.float32([[1, 0, 0]]))
+    monkeypatch.setattr(fitter_module, "contact_seeds", lambda *given, **named: seed)
+    before = self_mask(view, robot, OccupancyConfig()).reach
+    assert 0 < before < 0.012 < OccupancyConfig().see_through
+    target.step([view], robot)
+    assert np.linalg.norm(target.splats().centers - center, axis=1).min() > 1e-4

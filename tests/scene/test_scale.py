@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -85,6 +86,15 @@ def slanted(noise: float, seed: int = 0) -> Float32:
 def test_the_noise_of_depth_is_found_on_slanted_surfaces_and_beside_edges(noise: float) -> None:
     assert depth_noise([slanted(noise)]) == pytest.approx(noise, rel=0.15)
     assert depth_noise([slanted(noise, seed) for seed in range(3)]) == pytest.approx(noise, rel=0.15)
+
+
+def test_noise_that_neighbouring_pixels_share_is_found_though_a_narrow_fit_takes_it_away() -> None:
+    white = np.random.default_rng(0).normal(size=(480, 640))
+    shared = cv2.GaussianBlur(white, (0, 0), 4.0)
+    noise = 0.003 * shared / shared.std()
+    v, u = np.mgrid[0:480, 0:640]
+    depth = (1 / (0.6 + 0.9 * v / 480 + 0.2 * u / 640 + noise)).astype(np.float32)
+    assert depth_noise([depth]) == pytest.approx(0.003, rel=0.25)
 
 
 def test_depth_with_holes_everywhere_says_nothing_of_its_noise() -> None:

@@ -137,6 +137,19 @@ def test_a_little_before_the_robot_counts_where_another_frame_measured_it_too(
     assert (alone.kinds[60 : 60 + side, 79 : 79 + side] == PixelKind.OBJECT).all()
 
 
+def test_the_tip_of_a_surface_that_comes_from_elsewhere_is_no_speck() -> None:
+    rim = int(np.flatnonzero(SHOWN[60])[0])
+    tip, whole = ball_depth(), ball_depth()
+    tip[61, rim - 3] = whole[61, : rim - 2] = CENTER[2]  # beside the rim, by more than a reach
+    assert kinds(tip)[61, rim - 3] == PixelKind.MIXED
+    assert kinds(whole)[61, rim - 3] == PixelKind.OBJECT
+    for things, columns in ((tip, slice(rim - 3, rim - 2)), (whole, slice(0, rim - 2))):
+        things[61:67, columns] = CENTER[2]  # more than a speck, and no other frame measured it
+    bare = [frame(ball_depth())]
+    assert self_mask(frame(tip), robot(), CONFIG, bare).kinds[63, rim - 3] == PixelKind.MIXED
+    assert self_mask(frame(whole), robot(), CONFIG, bare).kinds[63, rim - 3] == PixelKind.OBJECT
+
+
 def drawn() -> RobotPosture:
     """The ball as triangles."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
