@@ -82,7 +82,7 @@ def self_mask(
         return mask
     reach = pixels_of(config.self_mask_tolerance, frame, shown.depth)
     wide = 3 * reach + 3  # pixels, beyond which nothing is explained, mixed or inside
-    part = _grown(box, wide, frame.depth.shape)
+    part = _grown(box, wide + 1, frame.depth.shape)  # one more, where a surface may go on
     depth, rendered, kinds = frame.depth[part], shown.depth[part], kinds[part]
     link, inside = shown.link[part], shown.inside[part]
     has_depth, is_robot = depth > 0, rendered > 0

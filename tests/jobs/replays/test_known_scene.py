@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.events import Obstacle
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.grid_files.npz_grid import read_npz, write_npz
 from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene, fields_at, known_space
 from splatctrl_cli.jobs.replays.state_pass import ReplayRecord
@@ -70,6 +73,30 @@ def test_the_space_about_the_arm_is_asked_between_states_that_are_far_apart(is_c
     assert first > 0.02
     assert (second == 0.0) if is_continuous else (second > 0.02)
     assert np.isinf(second) or record.near["edge_place"][1] == pytest.approx(edge)
+
+
+def test_what_spheres_leave_uncovered_is_not_taken_from_a_surface_that_is_measured() -> None:
+    """A ball 30 cm before the hand of an arm that triangles draw, whose spheres leave 5 cm uncovered."""
+    arm, q = simulated_arm(), np.array([[0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785]])
+    link = arm.sphere_set.links[-1]
+    drawn = arm.with_pieces([(link, np.asarray(trimesh.creation.icosphere(radius=0.02).triangles))])
+    model = drawn._changed(sphere_deficit=np.where(np.array(arm.sphere_set.links) == link, 0.05, 0.0))
+    center = model.sphere_centers(q[0])[-1] + [0.0, 0.0, -0.3]
+    ball = SphereField(center[None], np.array([0.01]))
+    scene = BallDistance(of_points=lambda points: ball.query(points)[0], centers=center[None], radii=np.array([0.01]))
+    nothing = Obstacle(distance=1.0, position=(np.nan, np.nan, np.nan))
+    fields = KnownFields(
+        barrier=ball,
+        distances={"exact": scene, "barrier": scene},
+        median_radius=0.01,
+        obstacles=lambda points: (nothing,) * len(points),
+    )
+    known = KnownScene(at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={})
+    record = ReplayRecord(model, known, config=Config(), max_map_age=1.0)
+    record.measured(np.array([0]), q, np.zeros((1, 7)))
+    gap = model.surface_gaps(q, scene.centers, scene.radii)[link][0]
+    assert record.audit.clearance["exact"].distance[0] == pytest.approx(gap)
+    assert record.between["surface"][0] == pytest.approx(gap)
 
 
 class Away:
