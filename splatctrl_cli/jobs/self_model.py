@@ -86,5 +86,5 @@ def _read(model: RobotModel, source: FrameSource, progress: Progress) -> tuple[l
             if T is not None:
                 frames.append(depth_frame(item))
                 poses.append(T)
-    progress.log(f"robot learn: {len(frames)} frames of {len(order)} moments")
+    progress.log(f"robot learn: {len(frames)} frames, moments: {len(order)}")
     return frames, np.array(poses)

@@ -79,14 +79,15 @@ def learn(
         num = int(configurations.max(initial=-1)) + 1
         used = [(view, int(k)) for view, k in zip(views, configurations, strict=True) if k >= 0]
         if num < NUM_CONFIGURATIONS:
-            unknown[link] = f"moves too little ({num} configurations): its parts stay like the scene"
+            unknown[link] = f"moves too little ({num} of {NUM_CONFIGURATIONS} configurations)"
         elif (found := _learn_link(surface, number, boxes[number], used, reach)) is None:
             unknown[link] = f"no camera sees it in {NUM_CONFIGURATIONS} configurations"
         else:
             learned.append(found)
     if not learned:
+        reasons = {why: ", ".join(link for link in unknown if unknown[link] == why) for why in unknown.values()}
         raise InputError(
-            f"{name}: no link can be learned: {'; '.join(f'{link} {why}' for link, why in unknown.items())}",
+            f"{name}: no link can be learned: {'; '.join(f'{each} {why}' for why, each in reasons.items())}",
             remedy=f"record the arm moving by {1e3 * NUM_CONFIGURATIONS * STEP:.0f} mm in view of the cameras",
         )
     return SelfModel(links=tuple(links), digest=surface_digest(surface), learned=tuple(learned), unknown=unknown)

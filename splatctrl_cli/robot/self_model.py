@@ -84,7 +84,7 @@ class SelfModel:
         """Raise InputError where the file `path` is of another robot than that of these links and visual surface."""
         other = ", ".join(sorted(set(self.links) ^ set(links))[:4])
         if other or self.digest != surface_digest(surface):
-            difference = f"{other} are not links of both" if other else "its visual geometry differs"
+            difference = f"one of the two lacks {other}" if other else "its visual geometry differs"
             raise InputError(
                 f"{path}: self-model of another robot: {difference}",
                 remedy="learn it again with this URDF, or give the robot that it was learned for",
