@@ -82,7 +82,7 @@ def run_learn(args: argparse.Namespace) -> int:
         "",
         *table(header, [_learned_row(part) for part in model.learned]),
         "",
-        *(f"not learned, so that what is fixed to it counts as the scene: {link} {why}" for link, why in model.unknown.items()),
+        *(f"not learned (what is fixed to it is scene): {link} {why}" for link, why in model.unknown.items()),
         *(
             f"{part.link}: its parts go as far as --reach ({1e3 * args.reach:.0f} mm); a larger one may show more"
             for part in model.learned
