@@ -82,6 +82,10 @@ class Balls:
         """The balls around voxels of edge `voxel` [m] at centers (K, 3)."""
         return cls(centers=centers, radius=0.5 * 3**0.5 * voxel, labels=labels)
 
+    def select(self, which: Bool) -> "Balls":
+        """Some of them (K,)."""
+        return Balls(centers=self.centers[which], radius=self.radius, labels=self.labels[which])
+
     @property
     def volume(self) -> float:
         """[m^3] of the voxels that they stand for."""

@@ -75,6 +75,7 @@ EVICT_EVERY = 5  # time steps: it takes as long as a few iterations; what has no
 EVICT_NEAREST = 8  # splats that are asked whether they stand for a voxel
 EVICT_ASKED = 8  # splats that are looked at for each missing slot, those that show least
 EVICT_NEARER = 0.3  # [m] by which a surface must be nearer to the robot's path than one given up for it
+MOST_GROWTH = 4  # times the default, to which the budget grows by itself
 NEAREST_REACH = 0.01  # [m] about a pixel, times the scale, in which no depth may be farther than what floats
 SPLIT_PARTS = 2  # Gaussians that a split one becomes (the baseline 3dgs)
 
@@ -85,11 +86,12 @@ GAP_DIRECTIONS = 3  # of four in which a gap has an object on both sides: two ar
 CARRIED_CELL = 0.03  # [m] edge at most of a cell of what is carried that has a sphere: sticks out 6 mm at most
 CONTACT_REACH = 0.02  # [m] an object so near to the robot may touch it where the robot hides it
 CONTACT_THICKNESS = 0.2  # [m] of a link at most: so far behind what a camera sees of it something may touch it
-SURFACE_WITHIN = 0.03  # [m] of a depth, a splat near the robot stands for the surface that it shows
+SHRINK = 0.8  # of a radius at a time, of a sphere that depth sees through at its edge
 WELL_INSIDE = 0.005  # [m] below the robot's surface; what nothing shows to be an object there is the robot's
 ROBOT_REACH = 0.2  # [m] from the robot's surface; beyond it nobody asks for the distance
 MASK_SPECK = 5e-5  # [m^2] of what is before the robot's surface alone: a 6 mm rod shows more from 9 mm length on
 MASK_ALONE = 4e-4  # [m^2] of it, if no other frame measured it
+MASK_EDGE = 128  # of an image's width, the pixels by which stereo fattens an outline: 5 of 640
 MASK_STEP = 0.02  # [m] between neighbouring pixels of one surface at most
 MASK_SURE = 4.0  # of the sensor's error, beyond which a piece before the robot is none of it
 MASK_SIGMAS = 2.0  # of the sensor's error that the robot's surface may explain
@@ -235,6 +237,7 @@ DEFAULT_SPHERES = 64  # of --num-spheres: as many as the public sets for the Pan
 
 # Verdict
 SLIGHTLY_UNDER = 1e-3  # [m] under a margin that solver, rounding and a map that is still being fitted may leave
+STATIC_REACH = 0.1  # [m] of a fixed sphere; what is farther away is measured from the sphere
 STATIC_CHANGE = 0.01  # [m] by which a fixed sphere must come nearer to count: splats move by less about a surface
 MOUNTED_CHANGE = 0.03  # [m] the same of one that stands near its mount, whose map grows in the first frames
 LIMIT_EXCEEDED = 1.01  # of a velocity or acceleration limit

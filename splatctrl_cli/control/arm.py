@@ -1,6 +1,6 @@
 """What the controller asks of a robot: the one seam between control and kinematics."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -16,8 +16,8 @@ class ArmModel(Protocol):
     J joints, S spheres; positions [m] and poses in world. sphere_deficit (S,) [m]: how far outside the spheres the
     surface of a sphere's body may be, NaN where nobody measured it. lever_arms (S, J): how far [m] a sphere goes, at
     most, per radian (or metre) of each joint. self_allowance (P,) [m]: how much less than the margin asked for each
-    of `self_pairs` keeps. surface_gaps: by link with triangles, its clearance (T,) [m] at postures (T, J). chain: its
-    bodies and spheres as the kernels walk them, None where only its methods know.
+    of `self_pairs` keeps. surface_gaps: by link with triangles, of all `links` or some, its clearance (T,) [m] at
+    postures (T, J). chain: its bodies and spheres as the kernels walk them, None where only its methods know.
     """
 
     @property
@@ -68,7 +68,11 @@ class ArmModel(Protocol):
     def self_pairs(self) -> NDArray[np.integer]: ...
 
     def surface_gaps(
-        self, positions: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
+        self,
+        positions: Float64,
+        centers: NDArray[np.floating],
+        radii: NDArray[np.floating],
+        links: Collection[str] | None = None,
     ) -> Mapping[str, Float64]: ...
 
     def reach(self) -> float: ...

@@ -9,6 +9,7 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, pose_error
@@ -163,16 +164,18 @@ def closed_loop(
     plan_detour: PlanDetour | None = None,
     record: StepRecord | None = None,
     commander: Commander = OURS,
+    distance_to: DistanceFunction | None = None,
 ) -> ReplayTrace:
     """Integrate the commander's velocities at `config.period` until the goal, a stall or `config.max_time`.
 
     field_at gives the field known at a stamp [ns], the same object for the same scene; scene_step_at the two newest
     scenes, for `config.distance_rate`. At a stall plan_detour is asked for a way out, `config.max_detours` times.
-    record: where the steps are kept, None for memory; commander: who gives the velocities. Raises InputError for a
-    start outside the limits or a goal out of reach, NotEvaluableError for a start in collision or outside the field.
+    record: where the steps are kept, None for memory; commander: who gives the velocities; distance_to: the exact
+    distance at the start, for `check_free`. Raises InputError for a start outside the limits or a goal out of reach,
+    NotEvaluableError for a start in collision or outside the field.
     """
     field = field_at(task.stamp_ns)
-    q, controller = _ready(model, config, task, field)
+    q, controller = _ready(model, config, task, field, distance_to)
     statics = static_violations(model, field, q, scene_margin(model, config))
     course, last_velocity = _Course(model, config, task, plan_detour), np.zeros(len(q))
     kept: StepRecord = InMemory() if record is None else record
@@ -218,7 +221,11 @@ def closed_loop(
 
 
 def _ready(
-    model: ArmModel, config: ControlConfig, task: ReplayTask, field: DistanceField
+    model: ArmModel,
+    config: ControlConfig,
+    task: ReplayTask,
+    field: DistanceField,
+    distance_to: DistanceFunction | None,
 ) -> tuple[Float64, QpIkController]:
     """The posture (J,) [rad] at the start and our controller. Raises as `closed_loop` does."""
     q = checked_posture(model, task.start, what="start")
@@ -226,7 +233,7 @@ def _ready(
     for waypoint in (*task.via, Waypoint(T_world_goal=task.T_world_goal)):
         check_goal(model, waypoint.T_world_goal)
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
-    check_free(model, field, q)
+    check_free(model, field, q, distance_to)
     return q, controller
 
 

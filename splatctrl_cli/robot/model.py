@@ -3,7 +3,7 @@
 Only the kinematics of the URDF is built (Pinocchio), so meshes need not be there. S spheres, J joints, T postures.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -265,16 +265,21 @@ class RobotModel:
         return np.vstack([self._framed(q, frame)[0], [0.0, 0.0, 0.0, 1.0]])
 
     def surface_gaps(
-        self, positions: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
+        self,
+        positions: Float64,
+        centers: NDArray[np.floating],
+        radii: NDArray[np.floating],
+        links: Collection[str] | None = None,
     ) -> dict[str, Float64]:
         """The signed gap (T,) [m] of each link that has triangles from the nearest of balls (N, 3), (N,) [m], world.
 
-        It is that of all the link's geometry and of what it carries, at joint positions (T, J).
+        It is that of all the link's geometry and of what it carries, at joint positions (T, J). links: these alone.
         """
         surface = self.surface
         return {
             link: surface.gaps(link, np.array([self.frame_pose(q, link) for q in positions]), centers, radii)
             for link in {surface.links[number]: None for number in surface.trees}
+            if links is None or link in links
         }
 
     def frame_jacobian(self, q: Float64, frame: str) -> Float64:

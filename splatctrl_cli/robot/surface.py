@@ -152,6 +152,11 @@ class RobotSurface:
         first = len(self.links) - self.num_carried
         return [k for k, name in enumerate(self.links) if k >= first or name in self.by_spheres]
 
+    @property
+    def is_drawn(self) -> bool:
+        """Whether all of it is what cameras see: nothing but the robot is within."""
+        return bool(self.trees) and not self.notes and not self.vague
+
     def poses(self, T_world_link: Mapping[str, Float64]) -> Float64:
         """(L, 4, 4) of `links`, from poses by name."""
         return np.array([T_world_link[link] for link in self.links], np.float64).reshape(-1, 4, 4)

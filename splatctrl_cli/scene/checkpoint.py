@@ -1,7 +1,7 @@
 """The whole state of a fitter as arrays, from which another goes on to the same bytes."""
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from splatctrl_cli.scene.keyframes import Window
 from splatctrl_cli.scene.posture import POSTURE_NAMES, RobotPosture
 from splatctrl_cli.scene.removal import REASONS
 from splatctrl_cli.scene.seeding import SeedDensity
+from splatctrl_cli.scene.self_mask import object_mask
 from splatctrl_cli.scene.time_steps import Refined
 from splatctrl_cli.voxels import LostEdges
 
@@ -52,6 +53,7 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
     for kind, views in (("newest", fitter.window.newest), ("keyframe", fitter.window.keyframes)):
         for index, view in enumerate(views):
             arrays |= {f"{kind}/{index}/{name}": array for name, array in _frame_arrays(view.frame).items()}
+    arrays |= {f"seen/{index}": mask.kinds for index, (_, mask) in enumerate(fitter.seen)}
     return arrays
 
 
@@ -92,6 +94,12 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
     fitter.window = Window(fitter.config)
     fitter.window.newest = [fitter.view(frame) for frame in _frames(arrays, "newest")]
     fitter.window.keyframes = [fitter.view(frame) for frame in _frames(arrays, "keyframe")]
+    kinds = [arrays[f"seen/{index}"] for index in range(sum(name.startswith("seen/") for name in arrays))]
+    frames = [view.frame for view in fitter.window.newest[len(fitter.window.newest) - len(kinds) :]]
+    fitter.seen = [
+        (frame, replace(object_mask(frame), kinds=np.asarray(kind, np.uint8)))
+        for frame, kind in zip(frames, kinds, strict=True)
+    ]
 
 
 def workspace_of(arrays: Arrays) -> Box:

@@ -10,12 +10,14 @@ import numpy as np
 from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel
 from splatctrl_cli.config.fixed import (
     EVICT_EVERY,
+    MASK_SIGMAS,
     NEAREST_REACH,
     NOT_COVERED,
     REFINE_BLOCKS,
     ROBOT_REACH,
     SEED_ASKED_VIEWS,
     SEED_MUCH_MORE,
+    WELL_INSIDE,
 )
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.cuda.fit import DeviceFit
@@ -25,8 +27,8 @@ from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
 from splatctrl_cli.scene.depth_holes import lost_edges, unanswered_points
 from splatctrl_cli.scene.descent import Descent
-from splatctrl_cli.scene.keyframes import View, Window, make_view, seen_through
-from splatctrl_cli.scene.labels import Seen, relabel, room_beneath
+from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, seen_through
+from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
 from splatctrl_cli.scene.posture import RobotPosture, carried
@@ -53,6 +55,7 @@ from splatctrl_cli.scene.self_mask import (
     object_mask,
     of_label,
     self_mask,
+    settled,
     without_mixed,
 )
 from splatctrl_cli.scene.shell import Shell
@@ -97,6 +100,7 @@ class SceneFitter:
         self.mounted: dict[str, Bool] = {}  # by camera, pixels (H, W) that show what it carries
         self.refined = Refined(num_blocks=0, filled=Filled(), removed=dict.fromkeys(REASONS, 0))
         self._unrepresented: Balls | None = None
+        self.seen: Seen = ()  # frames of the last time step, as its newest views have them, with their masks
 
     def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
         """Take in the frames of one time step: integrate, remove, add or relocate, optimise, label."""
@@ -106,12 +110,12 @@ class SceneFitter:
         config = self.occupancy.config
         masks = [object_mask(frame) for frame in frames]
         if robot is not None:
-            earlier = [view.frame for view in self.window.newest]
-            asked = [[*(other for other in frames if other is not frame), *earlier] for frame in frames]
-            masks = list(self._each(lambda f, others: self_mask(f, robot, config, others), frames, asked))
+            seen = list(zip(frames, self._each(lambda f: self_mask(f, robot, config), frames), strict=True))
+            others = [[*(other for other in seen if other is not one), *self.seen] for one in seen]
+            masks = [settled(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
         frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
-        views = list(self._each(self.view, frames))
-        seen = list(zip(frames, masks, strict=True))
+        views = list(self._each(self.view, frames, masks))
+        seen = self.seen = list(zip(frames, masks, strict=True))
         if self.descent.background is None:
             self.descent.background = self._behind(views)
         self.people.take_in(self.occupancy, frames)
@@ -138,7 +142,7 @@ class SceneFitter:
         self._prune(robot, views, seen, removed)
         filled += self._show_contact(robot, views, seen)
         filled += self._fill_gaps(views, masks, removed, half=self.num_steps % 2 if self.num_steps else None)
-        self._keep_to_surface(robot, seen)
+        self._keep_to_surface(robot, views, seen)
         if self.shell is not None:
             self.shell.step(self.window, self.mounted, self.descent.background)
         self.num_steps += 1
@@ -158,7 +162,7 @@ class SceneFitter:
         `progress` is called with the number of iterations done, after each of ten blocks; a restored fitter goes on
         with the block after the last one done.
         """
-        views = [*self.window.newest, *self.window.keyframes]
+        views = [self.view(view.frame) for view in (*self.window.newest, *self.window.keyframes)]
         for block in range(self.refined.num_blocks, REFINE_BLOCKS):
             self._refine_block(block, num_iterations, views)
             progress(num_iterations * (block + 1) // REFINE_BLOCKS)
@@ -200,19 +204,28 @@ class SceneFitter:
     def unrepresented(self) -> Balls:
         """What is occupied, not the robot, and has no splat, since the last time step or refining."""
         if self._unrepresented is None:
-            self._unrepresented = unrepresented_voxels(self.occupancy, self.splats(), self.config)
+            seen = [view.frame.depth[::8, ::8] for view in self.window.newest]
+            depth = np.concatenate([image[image > 0] for image in seen]) if seen else np.zeros(0, np.float32)
+            error = (
+                MASK_SIGMAS * self.occupancy.config.depth_error * float(np.median(depth)) ** 2 if len(depth) else 0.0
+            )
+            found = unrepresented_voxels(self.occupancy, self.splats(), self.config, error)
+            if self.posture is not None:
+                found = found.select(~self.posture.holds(found.centers, WELL_INSIDE))
+            self._unrepresented = found
         return self._unrepresented
 
     def known_voxels(self) -> KnownVoxels:
         """What is known of space as it is now."""
         return self.occupancy.known(self.unrepresented)
 
-    def view(self, frame: RgbdFrame) -> View:
-        """A frame as the optimiser takes it."""
+    def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
+        """A frame as the optimiser takes it; mask: of a robot that is in it."""
         min_range = self.occupancy.config.min_range
         mappable = inside_workspace(frame, world_points(frame), self.workspace, min_range)
         reach = NEAREST_REACH * (self.config.scale or 1.0)
-        return make_view(frame, mappable, self.mounted.get(frame.camera), reach=reach)
+        is_robot = None if mask is None else mask.kinds == PixelKind.ROBOT
+        return make_view(frame, mappable, self.mounted.get(frame.camera), is_robot=is_robot, reach=reach)
 
     def _find_mounted(self, frames: Sequence[RgbdFrame]) -> None:
         """Tell apart what a camera carries, once it has been in enough places."""
@@ -245,7 +258,11 @@ class SceneFitter:
 
     def _floating(self, views: Sequence[View]) -> Bool:
         """Slots (M,) of splats that some view sees through."""
-        return self.buffer.is_alive & ~self._is_grounded(self.buffer.centers, views)
+        is_floating = np.zeros(len(self.buffer.centers), bool)
+        for label in (Label.OBJECT, Label.ROBOT):
+            slots = np.flatnonzero(self._standing_for(label))
+            is_floating[slots] = ~self._is_grounded(self.buffer.centers[slots], views, label)
+        return is_floating
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
         """Remove what the optimiser moved off the robot, into the air or out, or made faint; counts in `removed`."""
@@ -286,7 +303,10 @@ class SceneFitter:
             asked = [views[(index + k) % len(views)] for k in others]
             wanted = (thinned(added[index] & of_label(masks[index], label), every) for label in found)
             sources = (candidates(view.frame, pixels, self.num_threads) for pixels in wanted)
-            return [source.select(self._is_grounded(source.points, asked)) for source in sources]
+            return [
+                source.select(self._is_grounded(source.points, asked, label))
+                for label, source in zip(found, sources, strict=True)
+            ]
 
         for offers in self._each(offered, range(len(views))):
             for sources, source in zip(found.values(), offers, strict=True):
@@ -306,7 +326,7 @@ class SceneFitter:
             live = self.buffer.centers[self._standing_for(label)]
             seeds = seeds_at(sources, live, self.density, self.config, self.num_threads)
             if len(views) > SEED_ASKED_VIEWS:
-                seeds = seeds.select(self._is_grounded(seeds.centers, views))
+                seeds = seeds.select(self._is_grounded(seeds.centers, views, label))
             filled += self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve, label=label)
         return filled
 
@@ -334,7 +354,7 @@ class SceneFitter:
                 num_threads=self.num_threads,
                 each=self._each,
             )
-            seeds = seeds.select(self._is_grounded(seeds.centers, views))
+            seeds = seeds.select(self._is_grounded(seeds.centers, views, label))
             num_missing = len(seeds) - int((~self.buffer.is_alive).sum())
             if label == Label.OBJECT and num_missing > 0 and self.num_steps % EVICT_EVERY == 0:
                 shown, gap = self.descent.misfits(views)[1], self.config.max_gap
@@ -362,20 +382,24 @@ class SceneFitter:
             seen, mappable, robot, splats, self.config, num_threads=self.num_threads, each=self._each
         )
         least = max((mask.reach for _, mask in seen), default=0.0)  # what noise leaves: nearer, no view tells
-        seeds = seeds.select(self._is_grounded(seeds.centers, views, least))
+        seeds = seeds.select(self._is_grounded(seeds.centers, views, least=least))
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
-    def _keep_to_surface(self, robot: RobotPosture | None, seen: Seen) -> None:
-        """Let no object's splat near the robot reach farther than the depth that shows its surface, or half of
-        `contact_radius`.
+    def _keep_to_surface(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> None:
+        """Let no object's splat near the robot stick out of what depth shows, down to half of `contact_radius`; nor
+        by more what no depth shows any longer.
         """
         if robot is None:
             return
+        config, least = self.occupancy.config, 0.5 * self.config.contact_radius
         slots = np.flatnonzero(self._standing_for(Label.OBJECT))
         slots = slots[robot.distance(self.buffer.centers[slots]) < ROBOT_REACH]
-        room = room_beneath(self.buffer.centers[slots], seen, self.occupancy.config)
-        most = np.maximum(room, 0.5 * self.config.contact_radius)
-        self.buffer.set_radius(slots, np.minimum(self.buffer.radii[slots], most))
+        error = max((mask.reach - config.self_mask_tolerance for _, mask in seen if mask.reach), default=0.0)
+        radii = kept_radii(
+            self.buffer.centers[slots], self.buffer.radii[slots], views, error, least, self.num_threads
+        )
+        is_hidden = np.isin(slots, hidden_objects(self.buffer, robot, seen, config))
+        self.buffer.set_radius(slots, np.where(is_hidden, np.minimum(radii, np.float32(least)), radii))
 
     def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
         """Put dead slots, beyond the reserve for gaps, to use where nothing asks for them; counts in `removed`."""
@@ -383,12 +407,14 @@ class SceneFitter:
         removed["weak"] += num_weak
         return filled
 
-    def _is_grounded(self, points: Float32, views: Sequence[View], least: float = np.inf) -> Bool:
-        """Points (K,) that no view sees through by `see_through`, or by `least` [m] where that is less: what one
-        sensor measured and another looks past was noise.
+    def _is_grounded(
+        self, points: Float32, views: Sequence[View], label: Label = Label.OBJECT, *, least: float = np.inf
+    ) -> Bool:
+        """Points (K,) of a label that no view sees through by `see_through`, or by `least` [m] where that is less:
+        what one sensor measured and another looks past was noise.
         """
         gap = min(self.occupancy.config.see_through, least or np.inf)
-        return ~seen_through(points, views, gap, self.num_threads)
+        return ~seen_through(points, views, gap, self.num_threads, label)
 
     def _audit(
         self, views: Sequence[View], filled: Filled, removed: dict[str, int], known: dict[int, LossTerms]

@@ -6,23 +6,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.config.fixed import NEAREST_REACH
+from splatctrl_cli.config.fixed import NEAREST_REACH, SHRINK
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.kernels import points
 from splatctrl_cli.kernels.raster import TargetView
-from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
-from splatctrl_cli.scene.removal import nearest_depth
+from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame
+from splatctrl_cli.scene.removal import least_around, nearest_depth
 from splatctrl_cli.scene.render import camera_array
+
+_STEPS = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)], np.float32) - 1
+DIRECTIONS = _STEPS / np.linalg.norm(_STEPS, axis=1, keepdims=True)  # (26, 3), of the points of a sphere's edge
 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A frame as the optimiser takes it; `nearest` (H, W) [m] is its `nearest_depth`."""
+    """A frame as the optimiser takes it; `nearest` (H, W) [m] is its `nearest_depth`, `nearest_object` that with the
+    robot's pixels told apart.
+    """
 
     frame: RgbdFrame
     camera: Float64
     target: TargetView
     nearest: Float32
+    nearest_object: Float32
 
     @property
     def mappable(self) -> Bool:
@@ -30,8 +36,15 @@ class View:
         return np.asarray((self.target.counted != 0) & (self.target.depth > 0))
 
 
-def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None, *, reach: float = NEAREST_REACH) -> View:
-    """A view of `frame`; `mappable` (H, W) are its pixels with a depth inside the workspace.
+def make_view(
+    frame: RgbdFrame,
+    mappable: Bool,
+    mounted: Bool | None = None,
+    *,
+    is_robot: Bool | None = None,
+    reach: float = NEAREST_REACH,
+) -> View:
+    """A view of `frame`; `mappable` (H, W) are its pixels with a depth inside the workspace, `is_robot` the robot's.
 
     Pixels without depth count in the colour loss; pixels that are not valid, whose depth lies outside the workspace,
     or that show what is `mounted` on the camera, do not count at all.
@@ -47,18 +60,45 @@ def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None, *, 
         counted=counted.astype(np.uint8),
     )
     camera = camera_array(frame.intrinsics, frame.T_world_camera)
-    return View(frame=frame, camera=camera, target=target, nearest=nearest_depth(frame, reach))
+    nearest = nearest_depth(frame, reach)
+    beside = nearest if is_robot is None else nearest_depth(frame, reach, is_robot)
+    return View(frame=frame, camera=camera, target=target, nearest=nearest, nearest_object=beside)
 
 
-def seen_through(centers: Float32, views: Sequence[View], tolerance: float, num_threads: int = 1) -> Bool:
+def seen_through(
+    centers: Float32, views: Sequence[View], tolerance: float, num_threads: int = 1, label: Label = Label.OBJECT
+) -> Bool:
     """Splats (N,) that float before what one of the views measured: nearer than every valid depth around their pixel.
 
     "Around" is what `nearest_depth` says, and "nearer" by more than `tolerance` [m], so that neither a silhouette nor
     the sensor's noise takes a splat off its surface. Finer than the voxels: a voxel that holds both a surface and the
-    air before it stays occupied.
+    air before it stays occupied. label: of the splats.
     """
-    cameras, nearest = [view.camera for view in views], [view.nearest for view in views]
+    cameras = [view.camera for view in views]
+    nearest = [view.nearest if label == Label.ROBOT else view.nearest_object for view in views]
     return points.seen_through(centers, cameras, nearest, tolerance, num_threads)
+
+
+def kept_radii(
+    centers: Float32, radii: Float32, views: Sequence[View], tolerance: float, least: float, num_threads: int = 1
+) -> Float32:
+    """Radii (N,) [m] with which spheres stay within what the views measured: a sphere shrinks, down to `least` [m],
+    as long as a view sees a point of its edge before all depth of the next pixels by more than `tolerance` [m].
+    """
+    cameras = [view.camera for view in views]
+    nearest = [
+        least_around(np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)), 1) for view in views
+    ]
+    kept = np.array(radii, np.float32)
+    left = np.arange(len(kept))
+    while len(left):
+        edge = centers[left, None] + kept[left, None, None] * DIRECTIONS
+        floats = points.seen_through(
+            np.ascontiguousarray(edge.reshape(-1, 3)), cameras, nearest, tolerance, num_threads
+        )
+        left = left[floats.reshape(len(left), -1).any(axis=1) & (kept[left] > least)]
+        kept[left] = np.maximum(SHRINK * kept[left], np.float32(least))
+    return kept
 
 
 class Window:

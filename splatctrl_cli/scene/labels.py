@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import MASK_SIGMAS, SURFACE_WITHIN, WELL_INSIDE
-from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame, UInt8
+from splatctrl_cli.config.fixed import WELL_INSIDE
+from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
@@ -41,7 +41,7 @@ def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPostu
     By the pixel whose depth a splat explains best: one of the robot makes it the robot's, one of an object takes it
     from the robot. A splat that no pixel shows keeps its label: what the robot hides or touches is still there, and
     the robot's own splats stay its own where they are within `see_through` of its body. Well inside the body, in a
-    voxel that no object's pixel has hit, a splat is the robot's.
+    voxel that no object's pixel has hit, a splat is the robot's; and in any, where all of the robot is drawn.
     """
     alive, config = buffer.is_alive, occupancy.config
     kind = shown_kinds(buffer.centers, seen, config)
@@ -51,6 +51,8 @@ def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPostu
     unseen = np.flatnonzero(alive & (kind == PixelKind.NOTHING) & (was_robot | ~is_solid))
     depth = -robot.distance(buffer.centers[unseen])
     is_robot[unseen] = np.where(was_robot[unseen], depth > -config.see_through, depth > WELL_INSIDE)
+    solid = np.flatnonzero(alive & (kind == PixelKind.NOTHING) & ~was_robot & is_solid)
+    is_robot[solid] = robot.holds(buffer.centers[solid], WELL_INSIDE)
     return is_robot, np.asarray(alive & (kind == PixelKind.OBJECT))
 
 
@@ -73,23 +75,6 @@ def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
         is_told = is_inside & (is_object | is_robot) & (gap < best)
         best[is_told], kinds[is_told] = gap[is_told], kind[is_told]
     return kinds
-
-
-def room_beneath(centers: Float32, seen: Seen, config: OccupancyConfig) -> Float64:
-    """The largest radius (N,) [m] with which spheres about centers (N, 3) [m] stay behind what depth shows.
-
-    It is how far a centre lies behind an object's pixel, plus the sensor's error: the least over the views, infinite
-    where none shows a surface near the centre.
-    """
-    room = np.full(len(centers), np.inf)
-    for frame, mask in seen:
-        pixel, z = pixels_at(frame, centers)
-        measured = np.where(pixel >= 0, frame.depth.ravel()[pixel], 0.0).astype(np.float64)
-        behind = z - measured
-        is_told = (pixel >= 0) & (mask.kinds.ravel()[pixel] == PixelKind.OBJECT) & (np.abs(behind) < SURFACE_WITHIN)
-        error = MASK_SIGMAS * config.depth_error * measured * measured
-        room[is_told] = np.minimum(room, np.maximum(behind, 0.0) + error)[is_told]
-    return room
 
 
 def human_splats(buffer: SplatBuffer, occupancy: OccupancyMap) -> Bool:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import ROBOT_REACH
-from splatctrl_cli.records import Box, Float32, Float64
+from splatctrl_cli.records import Bool, Box, Float32, Float64
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.surface import RobotSurface
 
@@ -39,6 +39,12 @@ class RobotPosture:
         """
         surface, T = self.seen_at(max(self.T_world_surface, default=0))
         return surface.distance(T, points_world, without=without, within=ROBOT_REACH, num_threads=self.num_threads)
+
+    def holds(self, points_world: NDArray[np.floating], depth: float) -> Bool:
+        """Points (N, 3) [m] more than `depth` [m] within a robot of which all is drawn: no object is there."""
+        if self.surface is None or not self.surface.is_drawn:
+            return np.zeros(len(points_world), bool)
+        return np.asarray(self.distance(points_world) < -depth)
 
     def distance_to_moving(self, points_world: NDArray[np.floating]) -> Float64:
         """The same to the links that joints move."""

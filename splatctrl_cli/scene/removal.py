@@ -14,16 +14,25 @@ from splatctrl_cli.scene.occupancy import OccupancyMap
 REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain", "trail", "robot", "weak", "evicted")
 
 
-def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH) -> Float32:
+def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH, is_robot: Bool | None = None) -> Float32:
     """The least valid depth (H, W) [m] within `reach` [m] of each pixel, as far as that goes at the frame's median
-    depth; infinite where there is none.
+    depth; infinite where there is none. The robot's pixels count for themselves and their neighbours alone: beside
+    the robot, what is before everything else floats.
     """
+    depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
     valid = frame.depth[frame.depth > 0]
     if not len(valid):
-        return np.full(frame.depth.shape, np.inf, np.float32)
+        return depth
     half = max(1, round(reach * frame.intrinsics.fx / float(np.median(valid))))
-    depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
-    return np.asarray(cv2.erode(depth, np.ones((2 * half + 1, 2 * half + 1), np.uint8)), np.float32)
+    if is_robot is None or not is_robot.any():
+        return least_around(depth, half)
+    return np.minimum(least_around(np.where(is_robot, np.float32(np.inf), depth), half), least_around(depth, 1))
+
+
+def least_around(depth: Float32, half: int) -> Float32:
+    """The least value (H, W) of the square of 2 half + 1 pixels around each."""
+    window = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
+    return np.asarray(cv2.erode(depth, window, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def removals(

@@ -9,11 +9,14 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import (
     CONTACT_THICKNESS,
     MASK_ALONE,
+    MASK_EDGE,
     MASK_FAR_OFF,
     MASK_PIXELS,
     MASK_SIGMAS,
@@ -28,12 +31,15 @@ from splatctrl_cli.scene.time_steps import AuditRow
 
 
 class PixelKind(IntEnum):
-    """What a depth pixel shows. MIXED: at the robot's outline, a depth of neither the robot nor what is beside it."""
+    """What a depth pixel shows. MIXED: beside the robot, a depth that is evidence of nothing. DOUBTED: an object
+    there, if another frame measured it.
+    """
 
     NOTHING = 0
     OBJECT = 1
     ROBOT = 2
     MIXED = 3
+    DOUBTED = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,20 +57,15 @@ class SelfMask:
     reach: float = 0.0
 
 
-def self_mask(
-    frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig, others: Sequence[RgbdFrame] = ()
-) -> SelfMask:
+def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
     """The pixels of a frame by what they show, with the robot as it was at the frame's stamp.
-
-    others: frames of other cameras or of just before, which may confirm what little this one shows beside the robot.
 
     A pixel is robot where its depth z lies within `self_mask_tolerance` + 2 `depth_error` z^2 of the depths that the
     rendered robot has within a few pixels: as many as the tolerance is wide at the robot's depth, so that a slanted
     surface and an outline that is off by the calibration are explained too; of a robot drawn by triangles, so is a
     point as near to any of them, or inside: it is seen through a slit. Spheres that stand for a link enclose its
-    surface and are not it, as boxes do what it carries: what lies inside them is robot. At the outline, what is
-    behind the robot and before everything that is seen beside it is mixed: the pixel sees both; and so is a speck
-    before the robot's surface (`_specks`): noise, where two links meet. Everything else with a depth is an object.
+    surface and are not it, as boxes do what it carries: what lies inside them is robot. Everything else with a depth
+    is an object, where its piece of surface shows enough of itself (`_judged`).
     """
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     shown = surface.render(
@@ -81,31 +82,32 @@ def self_mask(
     if box is None:
         return mask
     reach = pixels_of(config.self_mask_tolerance, frame, shown.depth)
-    wide = 3 * reach + 3  # pixels, beyond which nothing is explained, mixed or inside
+    edge = max(round(frame.intrinsics.width / MASK_EDGE), reach)
+    wide = 2 * edge + reach + 1  # pixels, beyond which nothing is explained, doubted or inside
     part = _grown(box, wide + 1, frame.depth.shape)  # one more, where a surface may go on
     depth, rendered, kinds = frame.depth[part], shown.depth[part], kinds[part]
     link, inside = shown.link[part], shown.inside[part]
     has_depth, is_robot = depth > 0, rendered > 0
     tolerance = tolerance_at(depth, config)
-    nearest = nearest_within(rendered, is_robot, reach) - tolerance
-    is_explained = has_depth & (depth >= nearest)
+    is_explained = has_depth & (depth >= nearest_within(rendered, is_robot, reach) - tolerance)
     is_explained &= depth <= farthest_within(rendered, reach) + tolerance
     if surface.vague:
         is_explained |= np.isin(inside, surface.vague)
-    before = np.isfinite(nearest_within(rendered, is_robot, wide)) & has_depth
-    before &= depth < farthest_within(rendered, wide) + CONTACT_THICKNESS
-    is_sure = np.ones_like(before)
+    beside = np.isfinite(nearest_within(rendered, is_robot, wide)) & has_depth
+    is_sure = depth < nearest_within(rendered, is_robot, edge)  # infinite away from the outline
+    is_sure |= cv2.erode(is_robot.view(np.uint8), _window(edge)).view(bool)
     if surface.trees:
-        v, u = np.nonzero((is_robot | before) & has_depth & ~is_explained)
+        is_near = depth < farthest_within(rendered, wide) + CONTACT_THICKNESS
+        v, u = np.nonzero(beside & is_near & ~is_explained)
         rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
-        sure = tolerance_at(depth[v, u], config, MASK_SURE)
+        sure = tolerance_at(depth[v, u], config, MASK_SURE) + edge * depth[v, u] / np.float32(frame.intrinsics.fx)
         gap = surface.distance(T_world_link, transform_points(frame.T_world_camera, rays), within=sure)
-        is_explained[v, u], is_sure[v, u] = gap <= tolerance[v, u], gap > sure
+        is_explained[v, u] = gap <= tolerance[v, u]
+        is_sure[v, u] &= gap > sure
     kinds[is_explained] = PixelKind.ROBOT
-    core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
-    kinds[_mixed(depth, has_depth & ~is_explained, nearest, core, tolerance, reach)] = PixelKind.MIXED
     area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0)
-    kinds[_specks(frame, part, kinds == PixelKind.OBJECT, before, area, others, config)] = PixelKind.MIXED
+    _judge(kinds, depth, beside, area)
+    core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     offset = depth - rendered
     is_told = core & has_depth & (np.abs(offset) <= MASK_FAR_OFF) & (link < len(surface.links) - surface.num_carried)
     is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
@@ -119,40 +121,64 @@ def self_mask(
     )
 
 
-def _specks(
-    frame: RgbdFrame,
-    part: tuple[slice, slice],
-    found: Bool,
-    before: Bool,
-    area: Float64,
-    others: Sequence[RgbdFrame],
-    config: OccupancyConfig,
-) -> Bool:
-    """Object pixels (H, W) that are too few to believe: small pieces before the robot or at its outline.
+def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64) -> None:
+    """Find the object pixels (H, W) beside the robot that are too few to believe, in place.
 
-    A piece is a speck where it is one pixel, or smaller than `MASK_SPECK` by the area (H, W) [m^2] of its pixels; or
-    than `MASK_ALONE`, where there are other frames and none of them measured half of its points. It is none where a
-    surface that was found elsewhere carries it on. found, before (H, W): of a part of the frame.
+    They are taken by piece of surface: neighbours whose depths differ by less than `MASK_STEP`. A piece that goes on
+    away from the robot is an object. Of the others one is mixed where the area [m^2] of its pixels, as far as neither
+    the sensor's error nor the outline accounts for them, is less than `MASK_SPECK`; doubted, than `MASK_ALONE`.
     """
-    depth, chosen, elsewhere = frame.depth[part], found & before, found & ~before
-    num, piece, stats, _ = cv2.connectedComponentsWithStats(chosen.view(np.uint8), connectivity=8)
-    if num == 1:
-        return chosen
-    farthest = farthest_within(np.where(elsewhere, depth, np.float32(0.0)), 1)
-    goes_on = (nearest_within(depth, elsewhere, 1) < depth + MASK_STEP) & (farthest > depth - MASK_STEP)
-    spread, ends = (np.bincount(piece.ravel(), weights.ravel(), num) for weights in (area, goes_on))
-    is_speck = ((spread < MASK_SPECK) | (stats[:, cv2.CC_STAT_AREA] == 1)) & (ends == 0)
-    is_doubted = ~is_speck & (spread < MASK_ALONE) & (ends == 0) & (len(others) > 0)
-    is_speck[0] = is_doubted[0] = False
-    v, u = np.nonzero(is_doubted[piece])
-    rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
-    points, owner, size = transform_points(frame.T_world_camera, rays), piece[v, u], stats[:, cv2.CC_STAT_AREA]
-    for other in others if len(owner) else ():
+    is_object = kinds == PixelKind.OBJECT
+    chosen = is_object & beside
+    num = int(np.count_nonzero(chosen))
+    if not num:
+        return
+    number = np.full(depth.shape, -1, np.int32)
+    number[is_object] = num
+    number[chosen] = np.arange(num)
+    first, second = [], []
+    for dv, du in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a = (slice(0, depth.shape[0] - dv), slice(max(-du, 0), depth.shape[1] - max(du, 0)))
+        b = (slice(dv, depth.shape[0]), slice(max(du, 0), depth.shape[1] + min(du, 0)))
+        is_one = (number[a] >= 0) & (number[b] >= 0) & (chosen[a] | chosen[b])
+        is_one &= np.abs(depth[a] - depth[b]) < MASK_STEP
+        first.append(number[a][is_one])
+        second.append(number[b][is_one])
+    pairs = np.concatenate(first), np.concatenate(second)
+    graph = coo_array((np.ones(len(pairs[0]), bool), pairs), shape=(num + 1, num + 1))
+    piece = connected_components(graph, directed=False)[1]
+    shown = np.bincount(piece[:num], area[chosen], int(piece.max()) + 1)
+    shown[piece[num]] = np.inf  # goes on
+    judged = np.full(len(shown), PixelKind.OBJECT, np.uint8)
+    judged[shown < MASK_ALONE] = PixelKind.DOUBTED
+    judged[shown < MASK_SPECK] = PixelKind.MIXED
+    kinds[chosen] = judged[piece[:num]]
+
+
+def settled(
+    frame: RgbdFrame, mask: SelfMask, others: Sequence[tuple[RgbdFrame, SelfMask]], config: OccupancyConfig
+) -> SelfMask:
+    """A mask without doubted pixels: objects by piece where one of the other frames measured half of it.
+
+    others: of other cameras at that time, and of the time step before, in which what was doubted is settled. Where
+    there are none, what is doubted counts.
+    """
+    is_doubted = mask.kinds == PixelKind.DOUBTED
+    if not is_doubted.any():
+        return mask
+    num, piece, stats, _ = cv2.connectedComponentsWithStats(is_doubted.view(np.uint8), connectivity=8)
+    v, u = np.nonzero(is_doubted)
+    points = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, frame.depth[v, u]))
+    is_object, owner = np.full(num, not others), piece[v, u]
+    for other, its in others:
         pixel, z = pixels_at(other, points)
         measured = np.where(pixel >= 0, other.depth.ravel()[pixel], np.float32(0.0))
-        agrees = (measured > 0) & (np.abs(z - measured) <= tolerance_at(measured, config))
-        is_doubted &= np.bincount(owner, agrees, num) < 0.5 * size
-    return np.asarray((is_speck | is_doubted)[piece])
+        agrees = np.isin(its.kinds.ravel()[pixel], (PixelKind.OBJECT, PixelKind.DOUBTED)) & (measured > 0)
+        agrees &= np.abs(z - measured) <= tolerance_at(measured, config)
+        is_object |= np.bincount(owner, agrees, num) >= 0.5 * stats[:, cv2.CC_STAT_AREA]
+    kinds = mask.kinds.copy()
+    kinds[v, u] = np.where(is_object[owner], np.uint8(PixelKind.OBJECT), np.uint8(PixelKind.MIXED))
+    return replace(mask, kinds=kinds)
 
 
 def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float32]:
@@ -302,24 +328,11 @@ def self_mask_metrics(rows: Sequence[AuditRow]) -> dict[str, Any]:
     }
 
 
-def _mixed(depth: Float32, candidate: Bool, front: Float32, core: Bool, tolerance: Float32, reach: int) -> Bool:
-    """Candidates beside or at the outline (`front` is finite there, `core` is not) that lie behind the robot's front
-    and before all that is measured a little farther out; where nothing is, those that have no candidate beside them:
-    a curved link falls away from the camera steeper at its rim than a pixel tells.
-    """
-    at_edge = candidate & ~core & np.isfinite(front) & (depth > front)
-    beside = candidate & ~np.isfinite(front)
-    nearest_beside = nearest_within(depth, beside, 2 * reach + 2)
-    num_near = cv2.boxFilter(candidate.view(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    is_alone = np.isfinite(nearest_beside) | (num_near == 1)
-    return np.asarray(at_edge & is_alone & (depth < nearest_beside - tolerance))
-
-
 def nearest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:
     """Least depth (H, W) of the chosen pixels within `reach` pixels; inf where there are none."""
     kept = np.full(depth.shape, np.inf, np.float32)
     cv2.copyTo(depth, chosen.view(np.uint8), kept)
-    return np.asarray(cv2.erode(kept, _window(reach)), np.float32)
+    return np.asarray(cv2.erode(kept, _window(reach), borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def farthest_within(depth: Float32, reach: int) -> Float32:

@@ -18,15 +18,15 @@ from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.voxels import SWEPT, Balls, KnownVoxels, VoxelState
 
 
-def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: SceneConfig) -> Balls:
+def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: SceneConfig, error: float = 0.0) -> Balls:
     """The occupied voxels (`OccupancyMap.occupied_voxels`) that no splat stands for, as balls.
 
     A splat of an object or a person stands for a voxel whose centre is at most `representing_reach` from its sphere
-    (of eight splats with the nearest centres). The robot's splats stand for nothing: fields leave them out. A ball
-    has the label human where its voxel does.
+    (of eight splats with the nearest centres), with the sensor's error [m]. The robot's splats stand for nothing:
+    fields leave them out. A ball has the label human where its voxel does.
     """
     others = splats.select(splats.labels != Label.ROBOT)
-    reach = representing_reach(config, occupancy.config.voxel)
+    reach = representing_reach(config, occupancy.config.voxel, error)
     voxels = occupancy.occupied_voxels()
     voxels = voxels[~_surely_near(occupancy, others, reach).reshape(-1)[voxels]]
     centers = occupancy.centers_of(voxels)
@@ -36,12 +36,13 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
     return Balls.of_voxels(centers[is_missing], occupancy.config.voxel, labels)
 
 
-def representing_reach(config: SceneConfig, voxel: float) -> float:
+def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) -> float:
     """How far [m] a voxel's centre may be from a splat's sphere that stands for it.
 
-    `max_gap` and half a voxel, beyond which gap filling adds a splat; at most a voxel's diagonal.
+    `max_gap` and half a voxel, beyond which gap filling adds a splat, and the sensor's error [m]; at most a voxel's
+    diagonal.
     """
-    return min(config.max_gap + 0.5 * voxel, 3**0.5 * voxel)
+    return min(config.max_gap + 0.5 * voxel + error, 3**0.5 * voxel)
 
 
 def bare_voxels(
@@ -76,8 +77,9 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
 
 @dataclass(frozen=True, kw_only=True)
 class GridAgreement:
-    """on_surface: share of the num_splats splats of objects and people in or next to a voxel that was seen and is not
-    free; represented: share of the num_voxels occupied voxels that a splat or a ball stands for. NaN of none.
+    """on_surface: share of the splats of objects and people that are in or next to a voxel that is not free, of
+    those that are outside the grid, or in or next to a voxel that was seen; represented: share of the num_voxels
+    occupied voxels that a splat or a ball stands for. NaN of none. num_splats: all of objects and people.
     """
 
     on_surface: float
@@ -104,13 +106,15 @@ def agreement_with_grid(
     others = splats.select(splats.labels != Label.ROBOT)
     cell = np.floor((others.centers.astype(np.float64) - grid.origin) / grid.voxel + 0.5)
     is_inside = np.all((cell >= 0) & (cell < states.shape), axis=1)
+    cells = tuple(cell[is_inside].astype(np.int64).T)
     may_hold = maximum_filter(np.isin(states, (VoxelState.OCCUPIED, VoxelState.UNCERTAIN)), size=3)
-    on_surface = may_hold[tuple(cell[is_inside].astype(np.int64).T)].sum()
+    was_seen = maximum_filter(states != VoxelState.NEVER_SEEN, size=3)  # what is farther than depth counts is not
+    num_told = was_seen[cells].sum() + np.count_nonzero(~is_inside)
     least = max(
         float(np.log(occupancy.occupied_above / (1 - occupancy.occupied_above))), 1.5 * occupancy.log_odds_hit
     )
-    cells = np.argwhere((grid.log_odds > least) & (grid.entity & SWEPT == 0))
-    centers = (grid.origin + grid.voxel * cells).astype(np.float32)
+    occupied = np.argwhere((grid.log_odds > least) & (grid.entity & SWEPT == 0))
+    centers = (grid.origin + grid.voxel * occupied).astype(np.float32)
     is_missing = SplatTree(splats.centers, splats.radii, 1).are_further(
         centers, representing_reach(scene, grid.voxel)
     )
@@ -118,7 +122,7 @@ def agreement_with_grid(
         distance, _ = cKDTree(known.unrepresented.centers).query(centers[is_missing])
         is_missing[is_missing] = distance > 0.5 * grid.voxel
     return GridAgreement(
-        on_surface=float(on_surface / len(others)) if len(others) else np.nan,
+        on_surface=float(may_hold[cells].sum() / num_told) if num_told else np.nan,
         represented=1.0 - float(is_missing.mean()) if len(centers) else np.nan,
         num_splats=len(others),
         num_voxels=len(centers),

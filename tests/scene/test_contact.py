@@ -14,7 +14,7 @@ from splatctrl_cli.scene import fitter as fitter_module
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.contact import contact_pixels, count_carried, hidden_objects
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.labels import room_beneath
+from splatctrl_cli.scene.keyframes import kept_radii
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.seeding import world_points
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask
@@ -51,7 +51,8 @@ def test_objects_in_contact_get_splats_of_one_radius_up_to_what_is_measured() ->
     is_object = splats.labels == Label.OBJECT
     is_near = is_object & (robot.distance_to_moving(splats.centers) < CONTACT_REACH)
     assert is_near.sum() > 5
-    np.testing.assert_allclose(splats.radii[is_near], CONFIG.contact_radius, rtol=1e-5)
+    hidden = CONFIG.contact_radius / 2  # what the ball hides, and at a silhouette
+    assert ((splats.radii[is_near] > (1 - 1e-5) * hidden) & (splats.radii[is_near] <= CONFIG.contact_radius)).all()
     clearance = (
         np.min(np.linalg.norm(splats.centers[is_object] - [0, 0, 0.28], axis=1) - splats.radii[is_object]) - 0.08
     )
@@ -99,9 +100,10 @@ def test_near_the_robot_no_splat_reaches_past_the_surface_that_depth_shows() -> 
     target.step([view], robot)
     splats, config = target.splats(), OccupancyConfig()
     is_near = (splats.labels == Label.OBJECT) & (robot.distance(splats.centers) < ROBOT_REACH)
-    room = room_beneath(splats.centers[is_near], [(view, self_mask(view, robot, config))], config)
-    assert np.isfinite(room).sum() > 20
-    assert (splats.radii[is_near] <= np.maximum(room, CONFIG.contact_radius / 2) * (1 + 1e-5)).all()
+    centers, radii, least = splats.centers[is_near], splats.radii[is_near], 0.5 * CONFIG.contact_radius
+    assert (radii > least).sum() > 5 < (radii == np.float32(least)).sum()
+    error = self_mask(view, robot, config).reach - config.self_mask_tolerance
+    assert (kept_radii(centers, radii, [target.view(view)], error, least) == radii).all()
 
 
 def test_a_splat_that_the_descent_moves_behind_the_robot_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.scene.keyframes import View, Window, make_view
+from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view
 from tests.scene.wall import frame
 
 CONFIG = SceneConfig(window=3)
@@ -72,3 +72,17 @@ def test_pixels_that_the_lens_did_not_see_count_neither_for_colour_nor_for_depth
     made = make_view(replace(seen, valid=valid), seen.depth > 0)
     assert np.array_equal(made.target.counted > 0, valid)
     assert np.array_equal(made.mappable, valid & (seen.depth > 0))
+
+
+def test_a_sphere_sticks_out_of_what_depth_shows_by_the_sensors_error_at_most() -> None:
+    """On the floor, beneath it, at the rim of a block and within it, and where no camera looks."""
+    view = make_view(frame(block=0.2), frame(block=0.2).depth > 0)
+    centers = np.float32(
+        [[0.25, 0.2, 0.0], [0.25, 0.2, -0.015], [0.09, 0.0, 0.19], [0.0, 0.0, 0.15], [9.0, 0.0, 0.0]]
+    )
+    kept = kept_radii(centers, np.full(5, 0.03, np.float32), [view], 0.004, 0.005)
+    assert kept[0] == np.float32(0.005)
+    assert 0.015 < kept[1] < 0.02
+    assert 0.01 < kept[2] < 0.028  # the next pixel is 1 cm away
+    assert kept[3] == kept[4] == np.float32(0.03)
+    assert (kept_radii(centers, np.full(5, 0.003, np.float32), [view], 0.004, 0.005) == np.float32(0.003)).all()

@@ -3,6 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
+import trimesh
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.geometry import back_project, pose_at, transform_points
@@ -11,7 +13,7 @@ from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.labels import human_splats, relabel, room_beneath, shown_kinds
+from splatctrl_cli.scene.labels import human_splats, relabel, robot_splats, shown_kinds
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask
@@ -308,13 +310,19 @@ def test_a_splat_on_the_robot_just_behind_an_object_is_not_taken_for_the_object(
     assert kinds.tolist() == [PixelKind.NOTHING, PixelKind.OBJECT]
 
 
-def test_a_splat_reaches_as_far_as_it_lies_behind_the_surface_that_depth_shows() -> None:
-    """The floor is at z = 0, the camera above it."""
-    robot, config = ball(0.3), OccupancyConfig()
-    view = seen_with(robot)
-    seen = [(view, self_mask(view, robot, config))]
-    points = np.float32([[0.3, 0.2, -0.012], [0.3, 0.2, 0.005], [0.3, 0.2, -0.2], [0.0, 0.0, 0.0]])
-    error = 2 * config.depth_error * float(view.depth[2, 2]) ** 2
-    room = room_beneath(points, seen, config)
-    np.testing.assert_allclose(room[:2], [0.012 + error, error], atol=1e-3)
-    assert np.isinf(room[2:]).all()  # behind another surface, and behind the robot
+@pytest.mark.parametrize("is_drawn", [False, True])
+def test_within_a_robot_of_which_all_is_drawn_no_splat_is_an_objects(is_drawn: bool) -> None:
+    """A splat 4 cm within a ball, in a voxel that an object's pixel has hit; a box or a hull may be larger than what
+    it stands for.
+    """
+    robot, buffer, grid = ball(0.3), SplatBuffer(1), grid_of()
+    if is_drawn:
+        triangles = trimesh.creation.icosphere(radius=0.1).triangles + np.array([0.0, 0.0, 0.3])
+        drawn = RobotSurface.from_parts([], [("arm", triangles)])
+        robot = replace(robot, surface=drawn, T_world_surface={0: np.eye(4)[None]})
+    center = np.float32([[0.0, 0.0, 0.34]])
+    buffer.fill(Seeds(centers=center, radii=np.float32([0.01]), colors=np.zeros((1, 3), np.float32)), 0.5)
+    grid.entity[:] = SOLID
+    assert robot_splats(buffer, grid, robot, [])[0].tolist() == [is_drawn]
+    assert robot.holds(center, 0.03).tolist() == [is_drawn]
+    assert not robot.holds(center, 0.07).any()

@@ -94,6 +94,21 @@ def test_a_silhouette_does_not_make_its_own_splats_float() -> None:
     assert seen_through(rim, [view(frame(block=0.2))], 0.015).tolist() == [False, False, True]
 
 
+def test_beside_the_robot_only_what_is_no_robot_keeps_a_splat_that_a_pixel_looks_past() -> None:
+    """The robot is the block; its own splats may stand three pixels beside its silhouette, an object's not."""
+    seen = frame(block=0.2)
+    beside = make_view(seen, seen.depth > 0, is_robot=seen.depth < 0.9, reach=0.04)
+    points = np.float32([[0.105, 0.0, 0.2], [0.12, 0.0, 0.2], [0.12, 0.0, 0.0]])
+    assert seen_through(points, [beside], 0.015).tolist() == [False, True, False]
+    assert not seen_through(points, [beside], 0.015, label=Label.ROBOT).any()
+
+
+def test_an_image_that_ends_without_depth_sees_through_nothing_there() -> None:
+    seen = frame()
+    seen.depth[:, :20] = 0.0
+    assert not seen_through(np.float32([[-0.45, 0.0, 0.3]]), [view(seen)], 0.015).any()
+
+
 def test_what_no_camera_looks_at_does_not_float() -> None:
     blind = frame()
     blind.depth[:] = 0.0

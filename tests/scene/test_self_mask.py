@@ -1,5 +1,6 @@
 """Which depth pixels are the robot's, on a ball (the robot) above a floor, beside, before and behind blocks."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,11 +9,11 @@ import trimesh
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, RgbdFrame
+from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, RgbdFrame, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.scene.posture import RobotPosture
-from splatctrl_cli.scene.self_mask import PixelKind, audited, link_residuals, self_mask, without_mixed
+from splatctrl_cli.scene.self_mask import PixelKind, audited, link_residuals, self_mask, settled, without_mixed
 from tests.plain import plain_frame
 
 K = Intrinsics(fx=160.0, fy=160.0, cx=79.5, cy=59.5, width=160, height=120)
@@ -47,8 +48,17 @@ def robot(*, by_spheres: bool = False, extra: float = 0.0) -> RobotPosture:
     )
 
 
-def kinds(depth: Float64, posture: RobotPosture | None = None) -> np.ndarray:
-    return self_mask(frame(depth), posture or robot(), CONFIG).kinds
+def kinds(
+    depth: Float64,
+    posture: RobotPosture | None = None,
+    others: Sequence[Float64] = (),
+    config: OccupancyConfig = CONFIG,
+) -> UInt8:
+    """Settled by the depths of other frames."""
+    (view, mask), *beside = [
+        (view, self_mask(view, posture or robot(), config)) for view in (frame(each) for each in (depth, *others))
+    ]
+    return settled(view, mask, beside, config).kinds
 
 
 SHOWN = np.isfinite(ball_depth())
@@ -100,14 +110,26 @@ def test_a_depth_between_the_robot_and_the_floor_at_its_outline_is_mixed_and_lef
     assert without_mixed(view, mask).depth[~SHOWN].all()
 
 
-@pytest.mark.parametrize(("rows", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.OBJECT)])
-def test_a_lone_depth_at_the_rim_before_nothing_is_mixed_and_a_thin_thing_there_is_not(
-    rows: int, kind: PixelKind
+@pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.MIXED), (3, PixelKind.OBJECT)])
+def test_what_is_behind_the_outline_counts_where_it_shows_beyond_the_width_of_an_edge(
+    columns: int, kind: PixelKind
 ) -> None:
+    """The first pixel beside the robot is an edge's; each is 34 mm^2."""
     depth = np.where(SHOWN, ball_depth(), 0.0)  # nothing else returns a depth
-    rim = np.flatnonzero(SHOWN[60])[0] - 1
-    depth[60 : 60 + rows, rim] = CENTER[2] + 0.03
-    assert (kinds(depth)[60 : 60 + rows, rim] == kind).all()
+    end = np.flatnonzero(SHOWN[60])[0]
+    depth[60, end - columns : end] = CENTER[2] + 0.03
+    assert (kinds(depth)[60, end - columns : end] == kind).all()
+
+
+def test_depths_that_lie_between_the_robot_and_what_is_behind_are_no_part_of_either() -> None:
+    """As a laser returns them at an outline, each another one, beside a surface that goes on."""
+    depth = np.minimum(ball_depth(), FLOOR)
+    rim = SHOWN ^ np.isfinite(ball_depth(radius=RADIUS + 0.006))
+    depth[rim] = 0.93 + 0.22 * np.random.default_rng(0).random(rim.sum())
+    found = kinds(depth)[rim]
+    assert (found == PixelKind.MIXED).mean() > 0.8
+    is_kept = found == PixelKind.OBJECT
+    assert (depth[rim][is_kept] > FLOOR - 0.06).all()  # as near to the floor as neighbours of one surface may be
 
 
 @pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.MIXED), (3, PixelKind.OBJECT)])
@@ -131,21 +153,20 @@ def test_a_little_before_the_robot_counts_where_another_frame_measured_it_too(
     now, before = ball_depth(), ball_depth()
     now[60 : 60 + side, 79 : 79 + side] -= gap
     before[60 : 60 + side, 79 : 79 + side] -= earlier
-    mask = self_mask(frame(now), robot(), CONFIG, [frame(before)])
-    assert (mask.kinds[60 : 60 + side, 79 : 79 + side] == kind).all()
-    alone = self_mask(frame(now), robot(), CONFIG)  # nothing that could have shown it
-    assert (alone.kinds[60 : 60 + side, 79 : 79 + side] == PixelKind.OBJECT).all()
+    piece = slice(60, 60 + side), slice(79, 79 + side)
+    assert (kinds(now, others=[before])[piece] == kind).all()
+    assert (kinds(now)[piece] == PixelKind.OBJECT).all()  # nothing that could have shown it
 
 
-@pytest.mark.parametrize("others", [[], [frame(ball_depth())]])
-def test_the_tip_of_a_surface_that_comes_from_elsewhere_is_no_speck(others: list[RgbdFrame]) -> None:
+@pytest.mark.parametrize("others", [[], [ball_depth()]])
+def test_the_tip_of_a_surface_that_comes_from_elsewhere_is_no_speck(others: list[Float64]) -> None:
     """One column of pixels just so near to the rim that a piece may be a speck; with others six pixels, 190 mm^2."""
-    column = int(np.flatnonzero(SHOWN[60])[0]) - 6
+    column = int(np.flatnonzero(SHOWN[60])[0]) - 4
     rows = slice(61, 67) if others else slice(61, 62)
     tip, whole = ball_depth(), ball_depth()
     tip[rows, column] = whole[rows, : column + 1] = CENTER[2]
-    assert (self_mask(frame(tip), robot(), CONFIG, others).kinds[rows, column] == PixelKind.MIXED).all()
-    assert (self_mask(frame(whole), robot(), CONFIG, others).kinds[rows, column] == PixelKind.OBJECT).all()
+    assert (kinds(tip, others=others)[rows, column] == PixelKind.MIXED).all()
+    assert (kinds(whole, others=others)[rows, column] == PixelKind.OBJECT).all()
 
 
 def drawn() -> RobotPosture:
@@ -168,7 +189,7 @@ def test_before_a_mesh_what_noise_may_explain_is_evidence_of_nothing(gap: float,
     config = replace(CONFIG, depth_error=0.004)  # twice of it 5 mm, four times 10 mm
     depth = ball_depth()
     depth[54:66, 74:86] -= gap
-    found = self_mask(frame(depth), drawn(), config).kinds[54:66, 74:86]
+    found = kinds(depth, drawn(), config=config)[54:66, 74:86]
     assert ((found == PixelKind.OBJECT) == is_object).all()
     assert (found == PixelKind.MIXED).any() != is_object
 

@@ -1,5 +1,6 @@
 """The fitter over a source's time steps, with what is written on the way and the checkpoints to go on from."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -8,7 +9,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from splatctrl_cli.config import Config
+from splatctrl_cli.config import Config, SceneConfig
+from splatctrl_cli.config.fixed import MOST_GROWTH
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.files.ply import read_points
@@ -188,8 +190,7 @@ class Reconstruction:
             step = replace(step, frames=tuple(frames))
         self.agreement.check(step, self.config.occupancy, console)
         if self.fitter is None:
-            self.fitter = self._new_fitter(self._workspace(step))
-            self.device.give(self.fitter, step.frames, console)
+            self.fitter = self._begin(step, console)
             if self.cloud is not None:
                 self.fitter.plant(self.cloud)
         elif not self.source.has_clock and self.fitter.num_steps == 1:
@@ -202,6 +203,9 @@ class Reconstruction:
             self.fitter.descent.heard = Wait(console, what, "iterations", scene.first_iterations).announce().step
         posture = self._posture(step)
         row = self.fitter.step(step.frames, posture)
+        if self.fitter.num_steps == 1 and self._grow_budget(row, console):
+            self.fitter = self._begin(step, console)
+            row = self.fitter.step(step.frames, posture)
         self._count_carried(step, posture)
         self.stamps.extend(frame.stamp_ns for frame in step.frames)
         self._record(row)
@@ -210,6 +214,25 @@ class Reconstruction:
         if self.source.has_clock and (self._kept.is_due(index, step.stamp_ns) or self._kept.shows_news(self.fitter)):
             self.snapshot(step.stamp_ns)
         return row
+
+    def _begin(self, step: TimeStep, console: Progress) -> SceneFitter:
+        """A fitter whose first time step this is to be."""
+        fitter = self._new_fitter(self._workspace(step))
+        self.device.give(fitter, step.frames, console)
+        return fitter
+
+    def _grow_budget(self, row: AuditRow, console: Progress) -> bool:
+        """Beside a robot, give a budget left at its default what the first time step lacked, and a quarter more; says
+        whether it did. What has no splat there is taken for a whole voxel.
+        """
+        least = SceneConfig().max_splats
+        if self.robot is None or not row.unmet or self.config.scene.max_splats != least:
+            return False
+        wanted = 1.25 * (least + row.unmet + row.evicted)
+        budget = min(1000 * math.ceil(wanted / 1000), MOST_GROWTH * least)
+        self.config = self.config.derived(scene=self.config.scene.derived(max_splats=budget))
+        console.log(f"the first frames show more than {least} splats can stand for: takes {budget}")
+        return True
 
     def _warn_of_small_budget(self, row: AuditRow, console: Progress) -> None:
         if row.unmet:
@@ -319,6 +342,8 @@ class Reconstruction:
         self.device.history = progress.get("devices", [{**Device().as_dict(), "from_iteration": 0}])
         depth = progress["depth"]
         self._fit_to(None if depth is None else RecordedDepth(**depth))
+        budget = len(checkpoint.state["is_alive"])
+        self.config = self.config.derived(scene=self.config.scene.derived(max_splats=budget))
         self.fitter = self._new_fitter(workspace_of(checkpoint.state))
         restore_fitter(self.fitter, checkpoint.state)
 

@@ -149,6 +149,7 @@ def _trace(
         plan_detour=planned_ways_out(inputs, task, config),
         record=record,
         commander=commander,
+        distance_to=scene.at(task.stamp_ns).distances["exact"],
     )
 
 

@@ -234,11 +234,12 @@ class ReplayRecord:
             return
         self._last_scene, before, self._seen_before = known, self._seen_before, self._scene.seen_at(stamp)
         centers = self._model.sphere_centers(part.position[0])
-        for name, value in static_clearance(self._model, known.distances["exact"], part.position[0]).items():
-            first, least = self.statics.get(name, (value, value))
+        found = static_clearance(self._model, known.distances["exact"], part.position[0])
+        for name, (own, value) in found.items():
+            first, least = self.statics.get(name, (own, value))
             if value < first and before is not None:
                 (nearest,) = known.obstacles(centers[self._number[name]][None])
-                first = value if before.last_ns(np.array([nearest.position]))[0] < 0 else first
+                first = own if before.last_ns(np.array([nearest.position]))[0] < 0 else first
             self.statics[name] = (first, min(least, value))
 
     def _look_around(self, part: AuditTrace) -> None:

@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.jobs.reconstructions import reconstruction
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene_files import scene_writer
 from splatctrl_cli.scene_files.scene_folder import open_scene
@@ -82,6 +84,23 @@ def test_a_run_stopped_while_it_writes_goes_on_to_the_same_bytes(
     assert main([*given, "--resume"]) == 0
     assert contents(tmp_path / "scene") == whole[kind]
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
+
+
+@pytest.mark.parametrize(("default", "budget"), [(600, 600), (500, 2000)])
+def test_a_budget_left_at_its_default_grows_to_what_the_first_frames_show(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, default: int, budget: int
+) -> None:
+    """600 were asked for, or a default of 500 was left alone; four times as many at most. A stopped run keeps it."""
+    monkeypatch.setattr(reconstruction, "SceneConfig", lambda: SceneConfig(max_splats=default + (default == 600)))
+    given = [word if word != "600" else str(default) for word in command(recording, "log", tmp_path / "scene")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_writer, "savez", failing(scene_writer.savez, 2, KeyboardInterrupt()))
+        assert main(given) == 130
+    assert main([*given, "--resume"]) == 0
+    document = json.loads((tmp_path / "scene" / "run.json").read_text())
+    assert document["config"]["scene"]["max_splats"] == budget
+    assert main([*given[: given.index("-o")], "-o", str(tmp_path / "whole"), *FAST[:1], str(default), *FAST[2:]]) == 0
+    assert contents(tmp_path / "scene") == contents(tmp_path / "whole")
 
 
 def test_a_full_disk_is_exit_code_6_and_what_was_written_goes_on(
