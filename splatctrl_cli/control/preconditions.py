@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.config.fixed import STATIC_REACH
 from splatctrl_cli.control.arm import ArmModel, sphere_names
-from splatctrl_cli.control.audit import BallDistance, DistanceFunction, part_clearances
+from splatctrl_cli.control.audit import DistanceFunction, part_clearances
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.records import DistanceField, Float64
 
@@ -117,32 +116,6 @@ def static_violations(
         for s, d in zip(still, distance, strict=True)
         if d < least[s]
     )
-
-
-def static_clearance(model: ArmModel, distance_to: DistanceFunction, q: Float64) -> dict[str, tuple[float, float]]:
-    """The clearance [m] of every sphere that no joint moves, by name, and of the part that it stands for.
-
-    Where its link has triangles, the part is as near as the link's surface to the balls of the scene that are nearest
-    to this sphere, and no nearer than the sphere.
-    """
-    still = np.flatnonzero(~np.asarray(model.moving_spheres))
-    if not len(still):
-        return {}
-    names, links = sphere_names(model.sphere_set), np.array(model.sphere_set.links)[still]
-    centers, radii = np.ascontiguousarray(model.sphere_centers(q)[still]), model.sphere_set.radii[still]
-    own = distance_to(centers) - radii
-    part = own.copy()
-    if isinstance(distance_to, BallDistance):
-        away = np.linalg.norm(centers[:, None] - distance_to.centers, axis=2) - radii[:, None] - distance_to.radii
-        for link in dict.fromkeys(links.tolist()):
-            of_link = np.flatnonzero(links == link)
-            owner = of_link[away[of_link].argmin(axis=0)]
-            for k in of_link:
-                balls = (owner == k) & (away[k] < STATIC_REACH)
-                gaps = model.surface_gaps(q[None], distance_to.centers[balls], distance_to.radii[balls], {link})
-                if balls.any() and link in gaps:
-                    part[k] = max(own[k], gaps[link][0])
-    return {names[s]: (float(mine), float(its)) for s, mine, its in zip(still, own, part, strict=True)}
 
 
 def sphere_clearance(

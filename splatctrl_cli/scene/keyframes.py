@@ -83,20 +83,26 @@ def kept_radii(
     centers: Float32, radii: Float32, views: Sequence[View], tolerance: float, least: float, num_threads: int = 1
 ) -> Float32:
     """Radii (N,) [m] with which spheres stay within what the views measured: a sphere shrinks, down to `least` [m],
-    as long as a view sees a point of its edge before all depth of the next pixels by more than `tolerance` [m].
+    as long as a view sees a point of its edge before all depth of the next pixels by more than `tolerance` [m], or
+    the point that is nearest to the camera before the depth of the centre's pixel.
     """
     cameras = [view.camera for view in views]
-    nearest = [
-        least_around(np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)), 1) for view in views
-    ]
+    depths = [np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)) for view in views]
+    nearest = [least_around(depth, 1) for depth in depths]
+    places = np.array([view.frame.T_world_camera[:3, 3] for view in views], np.float32).reshape(-1, 3)
+    towards = places - centers[:, None]
+    towards /= np.linalg.norm(towards, axis=2, keepdims=True)
     kept = np.array(radii, np.float32)
     left = np.arange(len(kept))
     while len(left):
         edge = centers[left, None] + kept[left, None, None] * DIRECTIONS
-        floats = points.seen_through(
-            np.ascontiguousarray(edge.reshape(-1, 3)), cameras, nearest, tolerance, num_threads
-        )
-        left = left[floats.reshape(len(left), -1).any(axis=1) & (kept[left] > least)]
+        edge = np.ascontiguousarray(edge.reshape(-1, 3))
+        floats = points.seen_through(edge, cameras, nearest, tolerance, num_threads).reshape(len(left), -1)
+        is_out = floats.any(axis=1)
+        for number, camera in enumerate(cameras):  # of what is before a centre, its own pixel tells
+            before = np.ascontiguousarray(centers[left] + kept[left, None] * towards[left, number])
+            is_out |= points.seen_through(before, [camera], [depths[number]], tolerance, num_threads)
+        left = left[is_out & (kept[left] > least)]
         kept[left] = np.maximum(SHRINK * kept[left], np.float32(least))
     return kept
 

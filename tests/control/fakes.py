@@ -1,9 +1,10 @@
 """A planar two-link arm in plain NumPy and two distance fields, all with known answers."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.kernels.chain import Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
 
@@ -115,6 +116,27 @@ class Plane:
 def far_away() -> Balls:
     """A field with nothing near the arm."""
     return Balls([[50.0, 0, 0]], [1.0])
+
+
+class ThinArm(PlanarArm):
+    """Its links' own surfaces are balls 2 cm smaller than its spheres."""
+
+    def surface_gaps(
+        self, positions: Float64, centers: Float64, radii: Float64, links: Collection[str] | None = None
+    ) -> dict[str, Float64]:
+        of = np.array(self.sphere_set.links)
+        away = np.linalg.norm(self.sphere_centers(positions[0])[:, None] - centers, axis=2)
+        gap = away - self.sphere_set.radii[:, None] + 0.02 - radii
+        return {link: np.array([gap[of == link].min()]) for link in links or dict.fromkeys(of.tolist())}
+
+
+def scene_of(centers: list[list[float]], radii: list[float]) -> BallDistance:
+    balls = Balls(centers, radii)
+
+    def of_points(points: Float64) -> Float64:
+        return balls.query(points)[0]
+
+    return BallDistance(of_points=of_points, centers=np.array(centers), radii=np.array(radii))
 
 
 def _unit(angle: float) -> Float64:

@@ -1,6 +1,5 @@
 """What must hold before a controller runs, and what its parts may not let pass."""
 
-from collections.abc import Collection
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,13 +7,12 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.audit import BallDistance
-from splatctrl_cli.control.preconditions import check_free, static_clearance, static_violations
+from splatctrl_cli.control.preconditions import check_free, static_violations
 from splatctrl_cli.control.replay import SceneChange
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.records import Float64, SphereSet
-from tests.control.fakes import Balls, PlanarArm
+from splatctrl_cli.records import Float64
+from tests.control.fakes import Balls, PlanarArm, ThinArm, scene_of
 
 Q = np.array([0.0, 0.0])
 
@@ -45,32 +43,9 @@ def test_the_deepest_sphere_is_named_and_a_free_start_passes() -> None:
 
 def test_only_spheres_that_no_joint_moves_are_static() -> None:
     arm, balls = PlanarArm(), Balls([[0.0, 0.1, 0.0]], [0.03])
-    found = static_clearance(arm, lambda points: balls.query(points)[0], Q)
-    assert found == {"base[0]": (pytest.approx(0.01), pytest.approx(0.01))}
     (violation,) = static_violations(arm, balls, Q, 0.02)
     assert (violation.sphere, violation.clearance) == ("base[0]", pytest.approx(0.01))
     assert static_violations(arm, balls, Q, 0.01 - 1e-9) == ()
-
-
-class ThinArm(PlanarArm):
-    """Its links' own surfaces are balls 2 cm smaller than its spheres."""
-
-    def surface_gaps(
-        self, positions: Float64, centers: Float64, radii: Float64, links: Collection[str] | None = None
-    ) -> dict[str, Float64]:
-        of = np.array(self.sphere_set.links)
-        away = np.linalg.norm(self.sphere_centers(positions[0])[:, None] - centers, axis=2)
-        gap = away - self.sphere_set.radii[:, None] + 0.02 - radii
-        return {link: np.array([gap[of == link].min()]) for link in links or dict.fromkeys(of.tolist())}
-
-
-def scene_of(centers: list[list[float]], radii: list[float]) -> BallDistance:
-    balls = Balls(centers, radii)
-
-    def of_points(points: Float64) -> Float64:
-        return balls.query(points)[0]
-
-    return BallDistance(of_points=of_points, centers=np.array(centers), radii=np.array(radii))
 
 
 def test_a_start_is_free_where_the_links_own_surface_is() -> None:
@@ -84,22 +59,6 @@ def test_a_start_is_free_where_the_links_own_surface_is() -> None:
             continue
         with pytest.raises(NotEvaluableError, match=r"sphere fore\[1\] 0\.0100 m deep"):
             check_free(ThinArm(), balls, Q, scene)
-
-
-def test_a_fixed_link_is_as_near_as_its_own_surface_to_what_is_nearest_to_each_of_its_spheres() -> None:
-    """The base with a second sphere: what stands at one says nothing of the other."""
-    arm, centers, radii = ThinArm(), [[0.0, 0.1, 0.0], [-0.3, 0.1, 0.0]], [0.03, 0.02]
-    spheres = arm.sphere_set
-    arm.sphere_set = SphereSet(
-        links=("base", *spheres.links),
-        centers=np.concatenate([[[-0.3, 0.0, 0.0]], spheres.centers]),
-        radii=np.append(0.06, spheres.radii),
-    )
-    arm.moving_spheres = np.append(False, arm.moving_spheres)
-    arm.sphere_centers = lambda q: np.concatenate([[[-0.3, 0.0, 0.0]], PlanarArm().sphere_centers(q)])  # type: ignore[method-assign]
-    found = static_clearance(arm, scene_of(centers, radii), Q)
-    assert [own for own, _ in found.values()] == pytest.approx([0.02, 0.01])
-    assert [part for _, part in found.values()] == pytest.approx([0.04, 0.03])
 
 
 @pytest.mark.parametrize(

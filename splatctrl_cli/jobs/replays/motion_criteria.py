@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, MOUNTED_CHANGE, SLIGHTLY_UNDER, STATIC_CHANGE
+from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
 from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
 from splatctrl_cli.jobs.replays.control_criteria import commanded, controller, goal, scene_hits
@@ -208,8 +208,7 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
     broken = {
         name: (first, least)
         for name, (first, least) in judged.replay.statics.items()
-        if least < judged.threshold
-        and least < first - (MOUNTED_CHANGE if first < 2 * judged.threshold else STATIC_CHANGE)
+        if least < min(judged.threshold, first)
     }
     if broken:
         name, (first, least) = min(broken.items(), key=lambda item: item[1][1])

@@ -11,10 +11,10 @@ from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import AuditTrace, Clearance, audited, moving_clearance, part_clearances
 from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
+from splatctrl_cli.control.fixed_parts import FixedParts
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
 from splatctrl_cli.control.limits import MotionLimits
 from splatctrl_cli.control.near_space import NearFigures, NearSpace, Seen
-from splatctrl_cli.control.preconditions import static_clearance
 from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.jobs.replays.hindsight import Hindsight, NewerDepth
@@ -39,8 +39,7 @@ class ReplayRecord:
     clearance [m] of the body at the state (`surface`), and that of the spheres to the splats alone (`represented`).
     near: what was known about the arm (the columns of `NearFigures`), NaN at states that were not looked at.
     hindsight: what later depth says of times without any; newer_depth: of states that a late map judged. strain:
-    velocity and acceleration as shares of their limits. statics: by sphere that no joint moves, its clearance [m]
-    when its surroundings were first seen and the least in any. closest: of pairs of links that keep less than the
+    velocity and acceleration as shares of their limits. closest: of pairs of links that keep less than the
     margin asked for, how near they came [m] and the stamp; nothing of those that stayed apart.
     """
 
@@ -64,10 +63,10 @@ class ReplayRecord:
         self._declared, self._first_state_ns = declared or Declarations(), first_state_ns
         self.audit, self.obstacles, self.ages = StoredAudit(), StoredObjects[str](), Figures()
         self.between, self.strain = Figures(), Figures()
-        self.statics: dict[str, tuple[float, float]] = {}
         self.events = EventFold()
         self._model, self._scene, self._max_map_age = model, scene, max_map_age
         self._margin, self._longest = config.control.margin, config.verdict.longest_interval
+        self._fixed = FixedParts(model, 2.0 * (self._margin - SLIGHTLY_UNDER))
         self._spheres = sphere_names(model.sphere_set)
         self._number = {name: number for number, name in enumerate(self._spheres)}
         self._surfaces, self._kept = surfaces, kept
@@ -225,22 +224,19 @@ class ReplayRecord:
         self.between.append(lower=lower, unbounded=unbounded, met=met, surface=surface)
 
     def _look_at_statics(self, part: AuditTrace) -> None:
-        """The clearance of spheres that no joint moves, once a scene. What is nearer now, where no camera had looked
-        before, was seen for the first time: it did not come.
-        """
+        """What comes near the links that no joint moves, once a scene."""
         stamp = int(part.stamp_ns[0])
         known = self._scene.at(stamp)
         if known is self._last_scene:
             return
         self._last_scene, before, self._seen_before = known, self._seen_before, self._scene.seen_at(stamp)
-        centers = self._model.sphere_centers(part.position[0])
-        found = static_clearance(self._model, known.distances["exact"], part.position[0])
-        for name, (own, value) in found.items():
-            first, least = self.statics.get(name, (own, value))
-            if value < first and before is not None:
-                (nearest,) = known.obstacles(centers[self._number[name]][None])
-                first = own if before.last_ns(np.array([nearest.position]))[0] < 0 else first
-            self.statics[name] = (first, min(least, value))
+        was_seen = None if before is None else lambda places: before.last_ns(places) >= 0
+        self._fixed.look(known.distances["exact"], part.position[0], was_seen)
+
+    @property
+    def statics(self) -> dict[str, tuple[float, float]]:
+        """As `FixedParts.found`."""
+        return self._fixed.found
 
     def _look_around(self, part: AuditTrace) -> None:
         """What was known of the space about the arm, at some of the states and on the way there."""

@@ -1,0 +1,73 @@
+"""What comes near the links that no joint moves, beside what stood there when their surroundings were first seen."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from splatctrl_cli.config.fixed import MOUNTED_CHANGE, STATIC_CHANGE, STATIC_REACH
+from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.control.audit import BallDistance, DistanceFunction
+from splatctrl_cli.records import Bool, Float64
+
+WasSeen = Callable[[Float64], Bool]
+"""points (Q, 3) [m], world -> whether (Q,) any camera had seen them before."""
+
+
+class FixedParts:
+    """By sphere that no joint moves, its clearance [m] when its surroundings were first seen, and the least of what
+    has come since (`found`).
+
+    In a scene of balls, one has come where it is nearer to the sphere than anything was, and none stood about it in
+    the first scene: by STATIC_CHANGE, or by MOUNTED_CHANGE beside a sphere that stands near its mount, whose map
+    grows; and where a camera had looked there before. It is as near as the sphere, or as the surface of the sphere's
+    link where that is farther.
+    """
+
+    def __init__(self, model: ArmModel, near: float) -> None:
+        """near [m]: a sphere whose first clearance is less stands near its mount."""
+        self._model, self._near = model, near
+        self._still = np.flatnonzero(~np.asarray(model.moving_spheres))
+        self._stood = np.zeros((0, 3))
+        names = sphere_names(model.sphere_set)
+        self._names = [names[s] for s in self._still]
+        self.found: dict[str, tuple[float, float]] = {}
+
+    def look(self, distance_to: DistanceFunction, q: Float64, was_seen: WasSeen | None) -> None:
+        """Take in the next scene, at joint positions q (J,). was_seen: None where nobody knows."""
+        if not len(self._still):
+            return
+        centers = np.ascontiguousarray(self._model.sphere_centers(q)[self._still])
+        own = distance_to(centers) - self._model.sphere_set.radii[self._still]
+        is_first = not self.found
+        if is_first:
+            self.found = {name: (float(mine), float(mine)) for name, mine in zip(self._names, own, strict=True)}
+        came = own
+        if isinstance(distance_to, BallDistance):
+            if is_first:
+                self._stood = np.asarray(distance_to.centers, np.float64)
+            came = self._came(distance_to, centers, q, was_seen)
+        for name, value in zip(self._names, came.tolist(), strict=True):
+            first, least = self.found[name]
+            self.found[name] = (first, min(least, value))
+
+    def _came(self, balls: BallDistance, centers: Float64, q: Float64, was_seen: WasSeen | None) -> Float64:
+        """How near (M,) [m] each sphere's part of its link is to what has come, infinite where nothing has."""
+        model, least = self._model, np.full(len(centers), np.inf)
+        radii = model.sphere_set.radii[self._still]
+        away = np.linalg.norm(centers[:, None] - balls.centers, axis=2) - radii[:, None] - balls.radii
+        near = np.flatnonzero(away.min(axis=0) < STATIC_REACH)
+        places = np.asarray(balls.centers[near], np.float64)
+        if was_seen is not None and len(near):
+            is_new_place = ~was_seen(places)
+            self._stood = np.concatenate([self._stood, places[is_new_place]])
+        moved = np.array([np.linalg.norm(self._stood - place, axis=1).min(initial=np.inf) for place in places])
+        owner = away[:, near].argmin(axis=0)
+        first = np.array([self.found[name][0] for name in self._names])
+        change = np.where(first < self._near, MOUNTED_CHANGE, STATIC_CHANGE)
+        for k in np.unique(owner[moved > change[owner]]).tolist():
+            chosen = near[(owner == k) & (moved > change[k])]
+            link = model.sphere_set.links[self._still[k]]
+            gaps = model.surface_gaps(q[None], balls.centers[chosen], balls.radii[chosen], {link})
+            value = max(away[k, chosen].min(), gaps[link][0] if link in gaps else -np.inf)
+            least[k] = value if value < first[k] - change[k] else np.inf
+        return least
