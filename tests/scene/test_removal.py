@@ -106,7 +106,8 @@ def test_beside_the_robot_only_what_is_no_robot_keeps_a_splat_that_a_pixel_looks
 def test_an_image_that_ends_without_depth_sees_through_nothing_there() -> None:
     seen = frame()
     seen.depth[:, :20] = 0.0
-    assert not seen_through(np.float32([[-0.45, 0.0, 0.3]]), [view(seen)], 0.015).any()
+    at_the_border = np.float32([[-39.0 / 80.0 * 0.7, 0.0, 0.3]])
+    assert not seen_through(at_the_border, [view(seen)], 0.015).any()
 
 
 def test_what_no_camera_looks_at_does_not_float() -> None:
