@@ -78,11 +78,11 @@ def test_a_sphere_sticks_out_of_what_depth_shows_by_the_sensors_error_at_most() 
     """On the floor, beneath it, at the rim of a block and within it, and where no camera looks."""
     view = make_view(frame(block=0.2), frame(block=0.2).depth > 0)
     centers = np.float32(
-        [[0.25, 0.2, 0.0], [0.25, 0.2, -0.015], [0.09, 0.0, 0.19], [0.0, 0.0, 0.15], [9.0, 0.0, 0.0]]
+        [[0.25, 0.2, 0.0], [0.25, 0.2, -0.015], [0.09, 0.0, 0.15], [0.0, 0.0, 0.15], [9.0, 0.0, 0.0]]
     )
     kept = kept_radii(centers, np.full(5, 0.03, np.float32), [view], 0.004, 0.005)
     assert kept[0] == np.float32(0.005)
     assert 0.015 < kept[1] < 0.02
-    assert 0.01 < kept[2] < 0.028  # the next pixel is 1 cm away
+    assert 0.01 < kept[2] < 0.028  # at its side, where the next pixel is 1 cm away
     assert kept[3] == kept[4] == np.float32(0.03)
     assert (kept_radii(centers, np.full(5, 0.003, np.float32), [view], 0.004, 0.005) == np.float32(0.003)).all()
