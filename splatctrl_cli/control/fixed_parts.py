@@ -1,4 +1,4 @@
-"""What comes near the links that no joint moves, beside what stood there when their surroundings were first seen."""
+"""Things that come near the links that no joint moves. What stood there in the first scene does not count."""
 
 from collections.abc import Callable
 
@@ -14,13 +14,11 @@ WasSeen = Callable[[Float64], Bool]
 
 
 class FixedParts:
-    """By sphere that no joint moves, its clearance [m] when its surroundings were first seen, and the least of what
-    has come since (`found`).
+    """`found`: for each fixed sphere its clearance [m] in the first scene, and the least to anything that came later.
 
-    In a scene of balls, one has come where it is nearer to the sphere than anything was, and none stood about it in
-    the first scene: by STATIC_CHANGE, or by MOUNTED_CHANGE beside a sphere that stands near its mount, whose map
-    grows; and where a camera had looked there before. It is as near as the sphere, or as the surface of the sphere's
-    link where that is farther.
+    A ball of the scene has come where none stood about its place before, by STATIC_CHANGE; beside a sphere at its
+    mount, whose map grows, by MOUNTED_CHANGE. It must be nearer by as much than the first clearance, and a camera
+    must have seen its place before. Where the link has triangles, its surface is what the ball is near to.
     """
 
     def __init__(self, model: ArmModel, near: float) -> None:
@@ -41,17 +39,23 @@ class FixedParts:
         is_first = not self.found
         if is_first:
             self.found = {name: (float(mine), float(mine)) for name, mine in zip(self._names, own, strict=True)}
+        first = np.array([self.found[name][0] for name in self._names])
+        change = np.where(first < self._near, MOUNTED_CHANGE, STATIC_CHANGE)
         came = own
         if isinstance(distance_to, BallDistance):
             if is_first:
                 self._stood = np.asarray(distance_to.centers, np.float64)
-            came = self._came(distance_to, centers, q, was_seen)
-        for name, value in zip(self._names, came.tolist(), strict=True):
-            first, least = self.found[name]
-            self.found[name] = (first, min(least, value))
+            came = self._came(distance_to, centers, q, was_seen, change)
+        for name, value in zip(self._names, np.where(came < first - change, came, np.inf).tolist(), strict=True):
+            before, least = self.found[name]
+            self.found[name] = (before, min(least, value))
 
-    def _came(self, balls: BallDistance, centers: Float64, q: Float64, was_seen: WasSeen | None) -> Float64:
-        """How near (M,) [m] each sphere's part of its link is to what has come, infinite where nothing has."""
+    def _came(
+        self, balls: BallDistance, centers: Float64, q: Float64, was_seen: WasSeen | None, change: Float64
+    ) -> Float64:
+        """Clearance (M,) [m] of each sphere, at centers (M, 3), from balls that stand farther than `change` (M,) [m]
+        from all that stood before; infinite without any.
+        """
         model, least = self._model, np.full(len(centers), np.inf)
         radii = model.sphere_set.radii[self._still]
         away = np.linalg.norm(centers[:, None] - balls.centers, axis=2) - radii[:, None] - balls.radii
@@ -62,12 +66,9 @@ class FixedParts:
             self._stood = np.concatenate([self._stood, places[is_new_place]])
         moved = np.array([np.linalg.norm(self._stood - place, axis=1).min(initial=np.inf) for place in places])
         owner = away[:, near].argmin(axis=0)
-        first = np.array([self.found[name][0] for name in self._names])
-        change = np.where(first < self._near, MOUNTED_CHANGE, STATIC_CHANGE)
         for k in np.unique(owner[moved > change[owner]]).tolist():
             chosen = near[(owner == k) & (moved > change[k])]
             link = model.sphere_set.links[self._still[k]]
             gaps = model.surface_gaps(q[None], balls.centers[chosen], balls.radii[chosen], {link})
-            value = max(away[k, chosen].min(), gaps[link][0] if link in gaps else -np.inf)
-            least[k] = value if value < first[k] - change[k] else np.inf
+            least[k] = max(away[k, chosen].min(), gaps[link][0] if link in gaps else -np.inf)
         return least

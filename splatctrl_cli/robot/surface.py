@@ -154,7 +154,7 @@ class RobotSurface:
 
     @property
     def is_drawn(self) -> bool:
-        """Whether all of it is what cameras see: nothing but the robot is within."""
+        """Whether visual meshes stand for every link. Then nothing but the robot is inside of it."""
         return bool(self.trees) and not self.notes and not self.vague
 
     def poses(self, T_world_link: Mapping[str, Float64]) -> Float64:

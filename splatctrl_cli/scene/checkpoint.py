@@ -16,7 +16,7 @@ from splatctrl_cli.scene.removal import REASONS
 from splatctrl_cli.scene.seeding import SeedDensity
 from splatctrl_cli.scene.self_mask import object_mask
 from splatctrl_cli.scene.time_steps import Refined
-from splatctrl_cli.voxels import LostEdges
+from splatctrl_cli.voxels import Balls, LostEdges
 
 Arrays = Mapping[str, NDArray[np.generic]]
 
@@ -54,6 +54,8 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
         for index, view in enumerate(views):
             arrays |= {f"{kind}/{index}/{name}": array for name, array in _frame_arrays(view.frame).items()}
     arrays |= {f"seen/{index}": mask.kinds for index, (_, mask) in enumerate(fitter.seen)}
+    balls = fitter.unrepresented
+    arrays |= {"unrepresented/centers": balls.centers, "unrepresented/labels": balls.labels}
     return arrays
 
 
@@ -94,6 +96,10 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
     fitter.window = Window(fitter.config)
     fitter.window.newest = [fitter.view(frame) for frame in _frames(arrays, "newest")]
     fitter.window.keyframes = [fitter.view(frame) for frame in _frames(arrays, "keyframe")]
+    centers, labels = (arrays[f"unrepresented/{name}"] for name in ("centers", "labels"))
+    fitter.unrepresented = Balls.of_voxels(
+        np.asarray(centers, np.float32), fitter.occupancy.config.voxel, np.asarray(labels, np.uint8)
+    )
     kinds = [arrays[f"seen/{index}"] for index in range(sum(name.startswith("seen/") for name in arrays))]
     frames = [view.frame for view in fitter.window.newest[len(fitter.window.newest) - len(kinds) :]]
     fitter.seen = [

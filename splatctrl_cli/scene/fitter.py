@@ -215,6 +215,10 @@ class SceneFitter:
             self._unrepresented = found
         return self._unrepresented
 
+    @unrepresented.setter
+    def unrepresented(self, balls: Balls) -> None:
+        self._unrepresented = balls
+
     def known_voxels(self) -> KnownVoxels:
         """What is known of space as it is now."""
         return self.occupancy.known(self.unrepresented)
@@ -386,8 +390,8 @@ class SceneFitter:
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _keep_to_surface(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> None:
-        """Let no object's splat near the robot stick out of what depth shows, down to half of `contact_radius`; nor
-        by more what no depth shows any longer.
+        """Shrink objects' splats near the robot until they stay within what depth shows, down to half of
+        `contact_radius`; splats that no pixel shows get that radius at once.
         """
         if robot is None:
             return

@@ -7,6 +7,7 @@ import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.records import Box, Label, SplatSet
+from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.unrepresented import (
@@ -80,6 +81,16 @@ def test_a_persons_voxels_are_balls_of_a_person() -> None:
     grid = occupied((3, 3, 3), (9, 9, 9))
     grid.entity[9, 9, 9] = Label.HUMAN
     assert unrepresented_voxels(grid, plain_splats([], 0.01), CONFIG).labels.tolist() == [Label.OBJECT, Label.HUMAN]
+
+
+def test_a_fitter_that_goes_on_has_the_balls_of_the_one_before() -> None:
+    """A robot's meshes tell which voxels are its own; they are no part of the state."""
+    before, after = (SceneFitter(SCENE, OCCUPANCY, WORKSPACE) for _ in range(2))
+    before.step([frame(0, block=0.2)])
+    center = np.float32([[0.1, 0.2, 0.3]])
+    before.unrepresented = Balls.of_voxels(center, OCCUPANCY.voxel, np.array([Label.OBJECT], np.uint8))
+    restore_fitter(after, fitter_state(before))
+    assert after.unrepresented.centers.tolist() == center.tolist()
 
 
 def test_a_ball_contains_its_voxel() -> None:

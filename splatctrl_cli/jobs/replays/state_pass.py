@@ -224,7 +224,7 @@ class ReplayRecord:
         self.between.append(lower=lower, unbounded=unbounded, met=met, surface=surface)
 
     def _look_at_statics(self, part: AuditTrace) -> None:
-        """What comes near the links that no joint moves, once a scene."""
+        """Look once at each scene for what comes near the fixed links."""
         stamp = int(part.stamp_ns[0])
         known = self._scene.at(stamp)
         if known is self._last_scene:
@@ -235,7 +235,7 @@ class ReplayRecord:
 
     @property
     def statics(self) -> dict[str, tuple[float, float]]:
-        """As `FixedParts.found`."""
+        """`FixedParts.found`."""
         return self._fixed.found
 
     def _look_around(self, part: AuditTrace) -> None:
