@@ -23,6 +23,7 @@ from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame, UInt8
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import camera_array
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask
+from splatctrl_cli.scene.stereo_shadow import shadowed
 from splatctrl_cli.voxels import LostEdges
 
 NOTHING, OBJECT, BLANK = 0, 1, 2  # what a pixel shows: nothing that counts, an object, or no depth
@@ -39,6 +40,9 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
+        return iter(())
+    is_blank &= ~shadowed(frame.depth, frame.intrinsics.fx)
+    if not is_blank.any():
         return iter(())
     behind = _nearest_depth(frame.depth)
     is_end = cv2.dilate(robot_depth, np.ones((5, 5), np.uint8)) > 0

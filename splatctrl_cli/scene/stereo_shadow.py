@@ -1,0 +1,62 @@
+"""Where a depth camera of two imagers has no depth as one of them alone sees the place: beside what is nearer."""
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.config.fixed import SHADOW_BASELINE, SHADOW_STEP
+from splatctrl_cli.records import Bool, Float32, Index
+
+
+def shadowed(depth: Float32, focal: float) -> Bool:
+    """Pixels (H, W) without depth that the shadow of a nearer thing in their row explains.
+
+    depth (H, W) [m], 0 = none; focal [px]. From the other imager, a baseline B away, a thing at depth z hides
+    B focal (1/z - 1/z_behind) pixels of what is behind it, always on the same side. Side and baseline are measured
+    from the image (`_baseline`); z_behind is the largest depth around the pixels without depth that are connected.
+    """
+    is_shadow = np.zeros(depth.shape, bool)
+    for turn in (1, -1):  # what is nearer is at the right of its shadow, then at the left
+        image = np.ascontiguousarray(depth[:, ::turn])
+        column = np.arange(image.shape[1], dtype=np.int32)
+        following = np.where(image > 0, column, np.int32(len(column)))  # the pixel with depth from here on
+        following = np.minimum.accumulate(following[:, ::-1], axis=1)[:, ::-1]
+        baseline = _baseline(image, following, focal)
+        if baseline:
+            rows, columns = np.nonzero((image <= 0) & (following < len(column)))
+            nearer = following[rows, columns]
+            inverse = 1.0 / image[rows, nearer] - 1.0 / _behind(image)[rows, columns]
+            is_beside = nearer - columns <= baseline * focal * inverse + 1.0
+            is_shadow[:, ::turn][rows[is_beside], columns[is_beside]] = True
+    return is_shadow
+
+
+def _baseline(depth: Float32, following: Index, focal: float) -> float:
+    """Baseline [m] of the shadows at the left of what is nearer, 0 where there are none: the median over the steps.
+
+    following (H, W): the column of the first depth from each pixel on, W = none. A step is a pixel and the next of
+    its row with depth, nearer by `SHADOW_STEP`; it counts by its height. Between them B focal (1/z - 1/z_behind)
+    pixels are lost, or fewer where the outline is fattened.
+    """
+    following = following[:, 1:]
+    before = depth[:, :-1]
+    after = np.take_along_axis(depth, np.minimum(following, depth.shape[1] - 1), axis=1)
+    is_step = (before > 0) & (after > 0) & (SHADOW_STEP * before * after <= focal * (before - after))
+    columns = np.nonzero(is_step)[1]
+    if not len(columns):
+        return 0.0
+    height = focal * (1.0 / after[is_step] - 1.0 / before[is_step])
+    baselines = (following[is_step] - 1 - columns) / height
+    order = np.argsort(baselines)
+    share = np.cumsum(height[order])
+    return float(min(baselines[order][np.searchsorted(share, 0.5 * share[-1])], SHADOW_BASELINE))
+
+
+def _behind(depth: Float32) -> Float32:
+    """Of each pixel (H, W) without depth the largest depth [m] around those that are connected to it; 0 elsewhere."""
+    is_blank = depth <= 0
+    num, group = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
+    around = np.where(is_blank, cv2.dilate(depth, np.ones((3, 3), np.uint8)), np.float32(0.0))
+    is_rim = around > 0
+    of_group = np.zeros(num, np.float32)
+    np.maximum.at(of_group, group[is_rim], around[is_rim])
+    return np.asarray(of_group[group])

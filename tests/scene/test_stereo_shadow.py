@@ -1,0 +1,72 @@
+"""What one of two imagers cannot see is no dark thing: a reference of two pinholes, and what must not pass for it."""
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.records import Bool, Float32
+from splatctrl_cli.scene.stereo_shadow import shadowed
+
+FOCAL, BASELINE = 400.0, 0.05  # [px], [m]
+WALL, PLATE = 2.0, 1.0  # [m]; the shadow is 10 px wide
+HEIGHT, WIDTH = 40, 160
+DARK = slice(15, 30)
+
+
+def plates(*columns: slice) -> Float32:
+    """Depth (H, W) [m] of plates before a wall."""
+    depth = np.full((HEIGHT, WIDTH), WALL, np.float32)
+    for column in columns:
+        depth[5:35, column] = PLATE
+    return depth
+
+
+def hidden_from_right(depth: Float32) -> Bool:
+    """Pixels (H, W) whose surface the right imager has something nearer before: pixel by pixel."""
+    found = np.zeros(depth.shape, bool)
+    for row, line in enumerate(depth):
+        for u, z in enumerate(line):
+            there = u - FOCAL * BASELINE / z
+            found[row, u] = any(
+                other < z and abs(k - FOCAL * BASELINE / other - there) < 0.5 for k, other in enumerate(line) if k > u
+            )
+    return found
+
+
+def as_stereo(depth: Float32) -> Float32:
+    return np.where(hidden_from_right(depth), np.float32(0.0), depth)
+
+
+@pytest.mark.parametrize("turn", [1, -1])  # the other imager is at the right, or at the left
+@pytest.mark.parametrize(
+    "columns", [(slice(60, 90),), (slice(60, 90), slice(94, 110)), (slice(30, 40), slice(140, 160))]
+)
+def test_all_that_a_pair_cannot_see_is_shadow(columns: tuple[slice, ...], turn: int) -> None:
+    seen = as_stereo(plates(*columns))[:, ::turn]
+    assert (seen == 0).sum() >= 300
+    assert (shadowed(seen, FOCAL) == (seen == 0)).all()
+
+
+def test_a_dark_thing_is_none_away_from_the_shadow() -> None:
+    seen = as_stereo(plates(slice(60, 90)))
+    seen[DARK, 90:110] = 0.0  # at the plate's other side
+    seen[DARK, 20:51] = 0.0  # goes on from the shadow, whose first column is 50
+    found = shadowed(seen, FOCAL)
+    assert not found[DARK, 90:109].any() and not found[DARK, 20:49].any()  # to the pixel
+    assert found[DARK, 50:60].all()
+
+
+def test_a_camera_without_shadows_has_none() -> None:
+    seen = plates(slice(60, 90))
+    seen[DARK, 45:60] = 0.0  # fewer than half of the plate's rows
+    assert not shadowed(seen, FOCAL).any()
+
+
+def test_a_baseline_is_that_of_a_camera() -> None:
+    seen = plates(slice(60, 90))
+    seen[5:35, 10:60] = 0.0  # as of a baseline of 25 cm
+    assert not shadowed(seen, FOCAL)[:, :34].any()
+
+
+@pytest.mark.parametrize("depth", [np.zeros((4, 6), np.float32), np.ones((4, 6), np.float32)])
+def test_an_image_without_steps_has_none(depth: Float32) -> None:
+    assert not shadowed(depth, FOCAL).any()
