@@ -171,6 +171,7 @@ NEAR_FRESH_SHARE = 0.75  # of the seen points; the arm itself hides up to a quar
 NEAR_BLIND = 0.9  # of the new points of a sphere's shell never seen: it comes to the unknown
 NEAR_DIRECTIONS = 200  # of a sphere, in which unseen space is looked for: 20 mm apart on a shell of 80 mm
 NEAR_LAYER = 0.03  # [m] between shells about a sphere, where the margin is so wide that there are several
+NEAR_STEPS = 6  # by which a point of a shell comes to a link's surface: to 1 mm where spheres stick out 3 cm
 NEAR_FEWEST = 5  # such points, at least
 NEAR_FEWEST_FINE = 20  # such points of those 200 directions, at least
 UNWATCHED_NS = 500_000_000  # [ns] without depth from about the arm: two frame sets of a slow recording

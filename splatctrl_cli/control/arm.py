@@ -1,6 +1,6 @@
 """What the controller asks of a robot: the one seam between control and kinematics."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +17,9 @@ class ArmModel(Protocol):
     surface of a sphere's body may be, NaN where nobody measured it. lever_arms (S, J): how far [m] a sphere goes, at
     most, per radian (or metre) of each joint. self_allowance (P,) [m]: how much less than the margin asked for each
     of `self_pairs` keeps. surface_gaps: by link with triangles, of all `links` or some, its clearance (T,) [m] at
-    postures (T, J). chain: its bodies and spheres as the kernels walk them, None where only its methods know.
+    postures (T, J). link_distances: by link with triangles, the signed distance (Q,) [m] of points (Q, 3) in its
+    frame to all of its geometry. chain: its bodies and spheres as the kernels walk them, None where only its methods
+    know.
     """
 
     @property
@@ -74,6 +76,9 @@ class ArmModel(Protocol):
         radii: NDArray[np.floating],
         links: Collection[str] | None = None,
     ) -> Mapping[str, Float64]: ...
+
+    @property
+    def link_distances(self) -> Mapping[str, Callable[[Float64], Float64]]: ...
 
     def reach(self) -> float: ...
 

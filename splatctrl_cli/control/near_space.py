@@ -2,7 +2,7 @@
 
 The space inside the arm is never seen, and that the arm was somewhere says nothing of what is beside it. So the
 question is put to points on shells: each moving sphere's radius and the margin away from its centre, outside of all
-other spheres of the arm.
+other spheres of the arm. Where its link has triangles, the shell is as near to the link's own surface instead.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,7 @@ from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config import fixed
 from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.records import Bool, Float64, Index
 
 
@@ -69,6 +70,13 @@ class NearSpace:
         self._first: Float64 | None = None  # centres (S, 3) of the first state
         self._next_ns = -(2**63)
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres when they were last looked about
+        self._surfaces, self._links = model.link_distances, np.array(model.sphere_set.links)
+        names = list(dict.fromkeys(self._links))
+        own = np.arange(len(names), len(names) + len(self._links))  # a sphere is a body where its link has no surface
+        self._body = np.where(
+            np.isin(self._links, list(self._surfaces)), [names.index(link) for link in self._links], own
+        )
+        self._reaches = dict[tuple[int, float], Float64]()  # of shells, by the number of directions and how far away
 
     def due(self, stamps: NDArray[np.int64], centers: Float64) -> dict[int, bool]:
         """Of states at stamps (T,) [ns] that do not go back, with their spheres' centres (T, S, 3), those to look at:
@@ -103,7 +111,7 @@ class NearSpace:
         centers = self._model.sphere_centers(q)
         if self._first is None:
             self._first = centers
-        points, owners = self._shell(centers, DIRECTIONS, self._margin)
+        points, owners = self._shell(q, centers, DIRECTIONS, self._margin)
         fewest = fixed.NEAR_LEAST_SHARE * len(self._moving) * len(DIRECTIONS)
         seen = known.last_ns(points)
         is_never = seen < 0
@@ -118,15 +126,14 @@ class NearSpace:
         if (~is_never).sum() >= fewest:
             ages = (stamp_ns - seen[~is_never]) * 1e-9
             age, ahead = float(np.quantile(ages, fixed.NEAR_FRESH_SHARE)), max(-float(ages.min()), 0.0)
-        unanswered, unanswered_place = self._nearest(
-            known.unanswered, centers, known.voxel / 2
-        )  # from its nearest face
-        edge, edge_place = self._nearest(known.edges[:, :3], centers, known.edges[:, 3])
+        voxels = known.unanswered
+        unanswered, unanswered_place = self._nearest(q, voxels, centers, known.voxel / 2)  # from its nearest face
+        edge, edge_place = self._nearest(q, known.edges[:, :3], centers, known.edges[:, 3])
         hidden, hidden_place = beyond, beyond_place = NOWHERE
         if distance is not None:
-            fine, owners = self._shell(centers, FINE, self._margin)
+            fine, owners = self._shell(q, centers, FINE, self._margin)
             is_never = known.last_ns(fine) < 0
-            within = [self._shell(centers, FINE, away)[0] for away in self._depths[1:]]
+            within = [self._shell(q, centers, FINE, away)[0] for away in self._depths[1:]]
             never = [fine[is_never], *(points[known.last_ns(points) < 0] for points in within)]
             hidden, hidden_place = _nearest_of(np.concatenate(never), distance)
             beyond, beyond_place = _nearest_of(fine[self._is_in_the_blind(fine, owners, is_never)], distance)
@@ -145,13 +152,35 @@ class NearSpace:
             edge_place=edge_place,
         )
 
-    def _shell(self, centers: Float64, directions: Float64, away: float) -> tuple[Float64, Index]:
-        """Points (Q, 3), so far [m] from moving spheres and outside of all others, and their spheres (Q,)."""
-        offsets = (self._radii[self._moving] + away)[:, None, None] * directions
+    def _shell(self, q: Float64, centers: Float64, directions: Float64, away: float) -> tuple[Float64, Index]:
+        """Points (Q, 3), so far [m] from moving spheres or their surfaces and outside of all others, and their
+        spheres (Q,).
+        """
+        turned = np.tile(directions, (len(self._moving), 1, 1))
+        for link in self._surfaces:
+            turned[self._links[self._moving] == link] = directions @ self._model.frame_pose(q, link)[:3, :3].T
+        offsets = self._reach(directions, away)[..., None] * turned
         points = (centers[self._moving][:, None] + offsets).reshape(-1, 3)
         owners = np.repeat(self._moving, len(directions))
-        is_outside = _is_outside(points, centers, self._radii + fixed.NEAR_APART, owners)
+        is_outside = _is_outside(points, centers, self._radii + fixed.NEAR_APART, self._body[owners], self._body)
         return points[is_outside], owners[is_outside]
+
+    def _reach(self, directions: Float64, away: float) -> Float64:
+        """How far (M, D) [m] from the moving spheres' centres their shells are, along directions (D, 3) in the frames
+        of links that have triangles; NaN where another part of the link is nearer.
+        """
+        key = len(directions), away
+        if key not in self._reaches:
+            reach = np.repeat((self._radii[self._moving] + away)[:, None], len(directions), axis=1)
+            for row, sphere in enumerate(self._moving):
+                if (distance := self._surfaces.get(self._links[sphere])) is not None:
+                    center = self._model.sphere_set.centers[sphere]
+                    for _ in range(fixed.NEAR_STEPS):
+                        gap = distance(center + reach[row][:, None] * directions)
+                        reach[row] -= np.clip(gap - away, 0.0, reach[row])
+                    reach[row][gap < away - fixed.NEAR_APART] = np.nan
+            self._reaches[key] = reach
+        return self._reaches[key]
 
     def _is_new(self, points: Float64) -> Bool:
         """Points (Q, 3) that the motion comes to: away from the arm of the first state."""
@@ -170,9 +199,11 @@ class NearSpace:
         is_blind = (num_new >= fixed.NEAR_FEWEST_FINE) & (num_unknown >= fixed.NEAR_BLIND * num_new)
         return np.asarray(is_unknown & is_blind[owners])
 
-    def _nearest(self, points: Float64, centers: Float64, reach: float | Float64) -> tuple[float, Float64]:
+    def _nearest(
+        self, q: Float64, points: Float64, centers: Float64, reach: float | Float64
+    ) -> tuple[float, Float64]:
         """The least distance [m] of balls about points (K, 3), `reach` (K,) [m] large, near the arm to its moving
-        spheres, at least 0, and that point (3,).
+        spheres, within the margin to the surfaces that these stand for, at least 0, and that point (3,).
         """
         moving, radii = centers[self._moving], self._radii[self._moving]
         around = radii.max() + max(fixed.NEAR_NEW, self._margin + np.max(reach, initial=0.0))
@@ -180,7 +211,13 @@ class NearSpace:
         if not is_near.any():
             return NOWHERE
         points, reach = points[is_near], np.broadcast_to(reach, len(is_near))[is_near]
-        away = (cdist(points, moving) - radii).min(axis=1) - reach
+        each = cdist(points, moving) - radii
+        is_within = each.min(axis=1) - reach <= self._margin
+        for link, distance in self._surfaces.items():
+            T_link_world = invert_transform(self._model.frame_pose(q, link))
+            gap = distance(transform_points(T_link_world, points[is_within]))
+            each[np.ix_(is_within, self._links[self._moving] == link)] = gap[:, None]
+        away = each.min(axis=1) - reach
         least = int(np.argmin(away))
         return max(float(away[least]), 0.0), points[least]
 
@@ -194,12 +231,14 @@ def _nearest_of(points: Float64, distance: Callable[[Float64], Float64]) -> tupl
     return float(away[least]), points[least]
 
 
-def _is_outside(points: Float64, centers: Float64, radii: Float64, owners: NDArray[np.integer] | None = None) -> Bool:
-    """Points (Q, 3) outside of all spheres (S, 3), (S,) [m] but their owner (Q,)."""
+def _is_outside(
+    points: Float64, centers: Float64, radii: Float64, owners: Index | None = None, bodies: Index | None = None
+) -> Bool:
+    """Points (Q, 3) outside of all spheres (S, 3), (S,) [m] but those of their owner (Q,), by bodies (S,)."""
     squared = np.sum(points**2, axis=1)[:, None] + np.sum(centers**2, axis=1) - 2.0 * points @ centers.T
     beyond = squared - radii**2
-    if owners is not None:
-        beyond[np.arange(len(points)), owners] = np.inf
+    if owners is not None and bodies is not None:
+        beyond[owners[:, None] == bodies] = np.inf
     return np.asarray(beyond.min(axis=1) > 0)
 
 

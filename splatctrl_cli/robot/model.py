@@ -3,7 +3,8 @@
 Only the kinematics of the URDF is built (Pinocchio), so meshes need not be there. S spheres, J joints, T postures.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -281,6 +282,12 @@ class RobotModel:
             for link in {surface.links[number]: None for number in surface.trees}
             if links is None or link in links
         }
+
+    @property
+    def link_distances(self) -> dict[str, Callable[[Float64], Float64]]:
+        """By link with triangles: points (Q, 3) in its frame -> signed distance (Q,) [m] to all of its geometry."""
+        links = {self.surface.links[number] for number in self.surface.trees}
+        return {link: partial(self.surface.distance_to, link) for link in sorted(links)}
 
     def frame_jacobian(self, q: Float64, frame: str) -> Float64:
         """Jacobian (6, J) of a link's origin, world axes: linear velocity rows [m] first, then angular."""

@@ -1,6 +1,7 @@
 """A planar two-link arm in plain NumPy and two distance fields, all with known answers."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -29,6 +30,7 @@ class PlanarArm:
         self.sphere_deficit: Float64 = np.full(5, np.nan)
         self.base_position: Float64 = np.zeros(3)
         self.middle: Float64 = np.zeros(2)
+        self.link_distances: Mapping[str, Callable[[Float64], Float64]] = {}
         self.pairs = np.array([[0, 3], [0, 4]])
 
     def sphere_centers(self, q: Float64) -> Float64:
@@ -119,7 +121,25 @@ def far_away() -> Balls:
 
 
 class ThinArm(PlanarArm):
-    """Its links' own surfaces are balls 2 cm smaller than its spheres."""
+    """Its moving links' own surfaces are balls 2 cm smaller than its spheres."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.link_distances = {link: partial(self._distance, link) for link in ("upper", "fore")}
+
+    def frame_pose(self, q: Float64, frame: str) -> Float64:
+        if frame not in self.link_distances:
+            return super().frame_pose(q, frame)
+        turn = _unit(q[0] if frame == "upper" else q.sum())
+        T = np.eye(4)
+        T[:3, :2] = np.stack([turn, _turned(turn)], axis=1)
+        T[:3, 3] = 0.0 if frame == "upper" else self.lengths[0] * _unit(q[0])
+        return T
+
+    def _distance(self, link: str, points: Float64) -> Float64:
+        own = np.array(self.sphere_set.links) == link
+        away = np.linalg.norm(points[:, None] - self.sphere_set.centers[own], axis=2)
+        return np.asarray((away - self.sphere_set.radii[own] + 0.02).min(axis=1))
 
     def surface_gaps(
         self, positions: Float64, centers: Float64, radii: Float64, links: Collection[str] | None = None

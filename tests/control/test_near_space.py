@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.config.fixed import NEAR_EVERY_NS, NEAR_MOVED
 from splatctrl_cli.control.near_space import NearSpace, Seen
 from splatctrl_cli.records import Float64
-from tests.control.fakes import PlanarArm
+from tests.control.fakes import PlanarArm, ThinArm
 from tests.reference.intervals import beyond, blind_share, hidden, near_figures
 
 SECOND = 1_000_000_000
@@ -66,6 +66,34 @@ def test_points_that_are_not_outside_of_the_arm_are_not_asked_for() -> None:
     (points,) = asked
     gap = np.linalg.norm(points[:, None] - arm.sphere_centers(LATER), axis=2) - arm.sphere_set.radii
     assert gap.min() > 0.01 and (gap.min(axis=1) < 0.03 + 1e-12).all()
+
+
+def test_the_shell_of_a_link_with_triangles_is_that_of_its_surface() -> None:
+    """Its spheres stick out by 2 cm: the margin counts from the surface, also inside of another of its spheres."""
+    asked: list[Float64] = []
+    arm = ThinArm()
+    arm.sphere_set.radii[:] = [0.06, 0.04, 0.04, 0.14, 0.14]  # the two of `fore` hold each other's surface
+
+    def remember(points: Float64) -> NDArray[np.int64]:
+        asked.append(points)
+        return np.zeros(len(points), np.int64)
+
+    NearSpace(arm, 0.03).look(0, LATER, Seen(last_ns=remember))
+    gaps = np.linalg.norm(asked[0][:, None] - arm.sphere_centers(LATER), axis=2) - arm.sphere_set.radii + 0.02
+    nearest = gaps[:, 1:].min(axis=1)
+    assert np.abs(nearest - 0.03).max() < 0.0105 and len(nearest) > 60  # 1 cm where another part is as near
+    assert (np.abs(nearest - 0.03) < 1e-3).mean() > 0.9
+
+
+def test_distances_are_those_of_the_surface_within_the_margin() -> None:
+    arm, thin = PlanarArm(), ThinArm()
+    out = np.array([0.0, 0.0, arm.sphere_set.radii[-1]])
+    near, far = (arm.sphere_centers(LATER)[-1] + out + [0.0, 0.0, up] for up in (0.005, 0.2))
+    for place, gap in ((near, 0.005), (far, np.inf)):
+        known = Seen(last_ns=half_seen, unanswered=place[None], edges=np.array([[*place, 0.001]]))
+        by_spheres, by_surface = (NearSpace(each, 0.03).look(0, LATER, known) for each in (arm, thin))
+        assert (by_spheres.unanswered, by_spheres.edge) == (pytest.approx(gap), pytest.approx(gap - 0.001))
+        assert (by_surface.unanswered, by_surface.edge) == (pytest.approx(gap + 0.02), pytest.approx(gap + 0.019))
 
 
 def test_states_are_thinned_by_time_across_blocks() -> None:
