@@ -8,46 +8,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatctrl_cli import __version__
+from splatctrl_cli.cli import recording_options, run_options, scene_options
 from splatctrl_cli.cli.options import (
-    POSE,
-    add_common,
-    add_gates,
-    add_junit,
-    add_lock,
-    add_output,
-    add_packages,
-    add_seed,
-    add_settings,
-    add_source,
-    add_threads,
-    pose,
+    BASE,
+    COMMON,
+    GATES,
+    JUNIT,
+    LOCK,
+    PACKAGES,
+    SOURCE,
+    THREADS,
+    output,
+    seed,
+    settings,
 )
-from splatctrl_cli.cli.parser import Options, Parser, real, whole
-from splatctrl_cli.cli.recording_options import (
-    calibrate_options,
-    capture_pack_options,
-    capture_unpack_options,
-    check_options,
-    info_options,
-    ingest_options,
-    simulate_options,
-)
-from splatctrl_cli.cli.replay_options import replay_options
-from splatctrl_cli.cli.run_options import (
-    batch_options,
-    compare_options,
-    report_options,
-    study_options,
-    sweep_options,
-    view_options,
-)
-from splatctrl_cli.cli.scene_options import (
-    export_options,
-    query_options,
-    reconstruct_options,
-    score_options,
-    sdf_bake_options,
-)
+from splatctrl_cli.cli.parser import Adds, Parser, add_all, either, group, option, real, whole
+from splatctrl_cli.cli.replay_options import REPLAY
 
 EXIT_CODES = """\
 exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 3 done, but part of the input was
@@ -59,14 +35,14 @@ LOG, ROBOT = "sample_data/tabletop/log.mcap", "--urdf arm.urdf --spheres arm.yam
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """A subcommand, or an action of one: `run` names MODULE:FUNCTION of this room, `options` adds its options; with
+    """A subcommand, or an action of one: `run` names MODULE:FUNCTION of this room, `options` are its own; with
     `actions` it has no more than these. judges: it ends in a verdict, of which it can tell CI.
     """
 
     summary: str
     examples: Sequence[str] = ()
     run: str = ""
-    options: Callable[[Options, Parser], None] | None = None
+    options: Sequence[Adds] = ()
     actions: "dict[str, Command] | None" = None
     judges: bool = False
 
@@ -92,11 +68,8 @@ def _add_commands(parser: Parser, commands: dict[str, Command], *, dest: str, on
             continue
         if command.actions is not None:
             _add_commands(one, command.actions, dest="action")
-        if command.options is not None:
-            command.options(Options(one), one)
-            add_common(one)
-            if command.judges:
-                add_junit(one)
+        if command.options:
+            add_all(one, (*command.options, *COMMON, *(JUNIT if command.judges else ())))
             one.set_defaults(run=command.run)
 
 
@@ -114,78 +87,71 @@ def function_of(run: str) -> Callable[..., int]:
     return function
 
 
-def _config(add: Options, parser: Parser) -> None:
-    add("FILE", "a TOML file as --config takes it; one with a wrong key or value is refused", Path, nargs="?")
-    add_settings(add)
-    add("--template", "print a file to begin with: every default, commented out, with its meaning and range")
-    add("--schema", "print the JSON Schema of what every command prints with --json")
+_CONFIG = (
+    option("FILE", "a TOML file as --config takes it; one with a wrong key or value is refused", Path, nargs="?"),
+    *settings(),
+    option("--template", "print a file to begin with: every default, commented out, with its meaning and range"),
+    option("--schema", "print the JSON Schema of what every command prints with --json"),
+)
+_COMPLETION = (option("SHELL", "whose script", SHELLS),)
+_DEMO = (
+    option("--data DIR", "what 'splatctrl simulate' wrote (default: sample_data; without it, simulated first)", Path),
+    *output("folder for everything the demo makes", default="demo_output"),
+    THREADS,
+)
 
 
-def _completion(add: Options, parser: Parser) -> None:
-    add("SHELL", "whose script", SHELLS)
+def _robot(spheres: str) -> tuple[Adds, ...]:
+    """``--urdf``, ``--packages``, and ``--spheres`` with its default."""
+    return (
+        *_URDF,
+        option("--spheres FILE", f"YAML (also cuRobo's) or URDF with the spheres (default: {spheres})", Path),
+    )
 
 
-def _demo(add: Options, parser: Parser) -> None:
-    add("--data DIR", "what 'splatctrl simulate' wrote (default: sample_data; without it, simulated first)", Path)
-    add_output(add, "folder for everything the demo makes", default="demo_output")
-    add_threads(parser)
-
-
-def _robot(add: Options, parser: Parser, spheres: str = "those of the URDF itself") -> None:
-    """``--urdf``, ``--packages``, and ``--spheres`` unless they are fitted."""
-    add("--urdf FILE", "the robot's URDF (expanded, no xacro)", Path, required=True)
-    add_packages(add)
-    if spheres:
-        add("--spheres FILE", f"YAML (also cuRobo's) or URDF with the spheres (default: {spheres})", Path)
-
-
-def _robot_spheres(add: Options, parser: Parser) -> None:
-    _robot(add, parser, spheres="")
-    add_output(add, "YAML file of the spheres", default="spheres.yaml")
-    number = add.either()
-    most = "spheres over all links, sticking out as little as that allows (default: 64)"
-    number("--max-spheres N", most, whole(1, 100_000))
-    number("--max-protrusion M", "or: the fewest found that stick out no more [m]", real(1e-6, 10, "m"))
-    outside = "how far surface points may stay outside all spheres [m]; at 0 all are covered"
-    add("--max-deficit M", outside, real(0, 10, "m"), 0.0)
-    add_seed(add, "the greedy covers")
-    _robot_judged(add)
-
-
-def _robot_check(add: Options, parser: Parser) -> None:
-    _robot(add, parser)
-    _robot_judged(add)
-
-
-def _robot_judged(add: Options) -> None:
-    add("--picture FILE.png", "draw the spheres over the collision shapes", Path)
-    add_gates(add)
-
-
-def _robot_pairs(add: Options, parser: Parser) -> None:
-    _robot(add, parser)
-    add_lock(add)
-    add("--srdf FILE", "leave out what its disable_collisions name", Path)
-    add("--postures N", "without --srdf: joint configurations sampled", whole(1, 10_000_000), 2000)
-    add("--drop-never", "leave out what never comes near in the sample (a guess, no proof)")
-    add_seed(add, "the sampling")
-
-
-def _robot_learn(add: Options, parser: Parser) -> None:
-    add("LOG", "a log or capture with joint states, in which the arm moves in view of the cameras", Path)
-    _robot(add, parser)
-    add_output(add, "self-model, which --self-model of reconstruct and replay takes", default="self.npz")
-    outside = "how far outside of a link's visual surface its parts are looked for"
-    add("--reach M", outside, real(0.01, 0.5, "m"), 0.06)
-    more = add.group("robot")
-    more(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)
-    add_lock(more)
-    add_source(add)
-
-
-def _robot_info(add: Options, parser: Parser) -> None:
-    _robot(add, parser, spheres="none, or those of the URDF")
-    add_lock(add)
+_URDF = (option("--urdf FILE", "the robot's URDF (expanded, no xacro)", Path, required=True), PACKAGES)
+_ROBOT = _robot("those of the URDF itself")
+_ROBOT_JUDGED = (option("--picture FILE.png", "draw the spheres over the collision shapes", Path), GATES)
+_ROBOT_SPHERES = (
+    *_URDF,
+    *output("YAML file of the spheres", default="spheres.yaml"),
+    either(
+        option(
+            "--max-spheres N",
+            "spheres over all links, sticking out as little as that allows (default: 64)",
+            whole(1, 100_000),
+        ),
+        option("--max-protrusion M", "or: the fewest found that stick out no more [m]", real(1e-6, 10, "m")),
+    ),
+    option(
+        "--max-deficit M",
+        "how far surface points may stay outside all spheres [m]; at 0 all are covered",
+        real(0, 10, "m"),
+        0.0,
+    ),
+    seed("the greedy covers"),
+    *_ROBOT_JUDGED,
+)
+_ROBOT_CHECK = (*_ROBOT, *_ROBOT_JUDGED)
+_ROBOT_PAIRS = (
+    *_ROBOT,
+    LOCK,
+    option("--srdf FILE", "leave out what its disable_collisions name", Path),
+    option("--postures N", "without --srdf: joint configurations sampled", whole(1, 10_000_000), 2000),
+    option("--drop-never", "leave out what never comes near in the sample (a guess, no proof)"),
+    seed("the sampling"),
+)
+_ROBOT_LEARN = (
+    option("LOG", "a log or capture with joint states, in which the arm moves in view of the cameras", Path),
+    *_ROBOT,
+    *output("self-model, which --self-model of reconstruct and replay takes", default="self.npz"),
+    option(
+        "--reach M", "how far outside of a link's visual surface its parts are looked for", real(0.01, 0.5, "m"), 0.06
+    ),
+    group("robot", BASE, LOCK),
+    *SOURCE,
+)
+_ROBOT_INFO = (*_robot("none, or those of the URDF"), LOCK)
 
 
 COMMANDS = {
@@ -193,32 +159,32 @@ COMMANDS = {
         summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth",
         examples=("simulate -o out/log", "simulate --urdf fr3.urdf --packages franka_description -o out/fr3"),
         run="demo:run_simulate",
-        options=simulate_options,
+        options=recording_options.SIMULATE,
     ),
     "ingest": Command(
         summary="turn a log or image folder into a capture folder",
         examples=(f"ingest {LOG} -o out/x.capture", "ingest run1.bag run2.bag --cameras front,wrist"),
         run="recordings:run_ingest",
-        options=ingest_options,
+        options=recording_options.INGEST,
     ),
     "info": Command(
         summary="describe a log, capture, scene, grid, robot or other file",
         examples=(f"info {LOG}", "info out/scene --json"),
         run="check:run_info",
-        options=info_options,
+        options=recording_options.INFO,
     ),
     "check": Command(
         summary="say what is wrong with a log, capture or image folder",
         examples=(f"check {LOG} {ROBOT}", "check run.bag --quick --fail-on warning"),
         run="check:run",
         judges=True,
-        options=check_options,
+        options=recording_options.CHECK,
     ),
     "calibrate": Command(
         summary="place cameras against each other and the robot, from what they recorded",
         examples=(f"calibrate {LOG} {ROBOT}", "calibrate two_cameras.toml --hold front -o rig.toml"),
         run="calibrate:run",
-        options=calibrate_options,
+        options=recording_options.CALIBRATE,
     ),
     "reconstruct": Command(
         summary="fit splats to a log, a capture or a DTU scan",
@@ -228,7 +194,7 @@ COMMANDS = {
         ),
         run="reconstruct:run",
         judges=True,
-        options=reconstruct_options,
+        options=scene_options.RECONSTRUCT,
     ),
     "export": Command(
         summary="write splats as a file that viewers open, and check what reads back",
@@ -237,7 +203,7 @@ COMMANDS = {
             "export out/audit --mcap",
         ),
         run="export:run",
-        options=export_options,
+        options=scene_options.EXPORT,
     ),
     "sdf-bake": Command(
         summary="bake a scene's splats into a distance grid with gradient",
@@ -247,7 +213,7 @@ COMMANDS = {
         ),
         run="sdf_bake:run",
         judges=True,
-        options=sdf_bake_options,
+        options=scene_options.SDF_BAKE,
     ),
     "query": Command(
         summary="answer a table of points: distance, gradient, bound, what is nearest",
@@ -256,7 +222,7 @@ COMMANDS = {
             "query out/field points.csv --scene out/scene",
         ),
         run="query:run",
-        options=query_options,
+        options=scene_options.QUERY,
     ),
     "score": Command(
         summary="compare renders of a scene with recorded views: PSNR, SSIM, depth error; or fit scans first (--fit)",
@@ -266,7 +232,7 @@ COMMANDS = {
         ),
         run="score:run",
         judges=True,
-        options=score_options,
+        options=scene_options.SCORE,
     ),
     "replay": Command(
         summary="audit logged joint states, ask the controller at each, or drive the arm in closed loop",
@@ -276,13 +242,13 @@ COMMANDS = {
         ),
         run="replay:run",
         judges=True,
-        options=replay_options,
+        options=REPLAY,
     ),
     "batch": Command(
         summary="run many recordings through many commands, with one verdict",
         examples=("batch nightly.toml --shard 2/4", "batch nightly.toml --failed"),
         run="batch:run",
-        options=batch_options,
+        options=run_options.BATCH,
         judges=True,
     ),
     "sweep": Command(
@@ -292,7 +258,7 @@ COMMANDS = {
             "sweep out/audit --over latency=0:1 --over depth-noise=0:0.02 -o out/both",
         ),
         run="sweep:run",
-        options=sweep_options,
+        options=run_options.SWEEP,
     ),
     "study": Command(
         summary="repeat an experiment of the paper, trial by trial",
@@ -301,7 +267,7 @@ COMMANDS = {
             "study table2 --problem cubby-0007 -o out/one",
         ),
         run="study:run",
-        options=study_options,
+        options=run_options.STUDY,
         judges=True,
     ),
     "compare": Command(
@@ -309,19 +275,19 @@ COMMANDS = {
         examples=("compare out/old out/new", "compare out/new --against baseline.toml"),
         run="compare:run",
         judges=True,
-        options=compare_options,
+        options=run_options.COMPARE,
     ),
     "report": Command(
         summary="write one HTML file on a run or a batch, with scenes in 3-D",
         examples=("report out/audit", "report out/batch --against baseline.toml -o report.html"),
         run="report:run",
-        options=report_options,
+        options=run_options.REPORT,
     ),
     "view": Command(
         summary="show a replay, scene, field or splats in 3-D in a browser",
         examples=("view out/audit", "view out/scene --no-open -o scene.html"),
         run="report:run_view",
-        options=view_options,
+        options=run_options.VIEW,
     ),
     "robot": Command(
         summary="fit and measure a robot's spheres, list its pairs, learn its own surface",
@@ -331,28 +297,28 @@ COMMANDS = {
                 summary="fit spheres that cover all of each link's collision geometry",
                 run="robot:run_spheres",
                 judges=True,
-                options=_robot_spheres,
+                options=_ROBOT_SPHERES,
             ),
             "check": Command(
                 summary="measure how much of the collision surface a set of spheres covers",
                 run="robot:run_check",
                 judges=True,
-                options=_robot_check,
+                options=_ROBOT_CHECK,
             ),
             "pairs": Command(
                 summary="list which links may collide with each other, and why others may not",
                 run="robot:run_pairs",
-                options=_robot_pairs,
+                options=_ROBOT_PAIRS,
             ),
             "learn": Command(
                 summary="learn from a recording what is fixed to the links beside the URDF's geometry",
                 run="robot:run_learn",
-                options=_robot_learn,
+                options=_ROBOT_LEARN,
             ),
             "info": Command(
                 summary="show joints with limits, links, shapes and spheres",
                 run="robot:run_info",
-                options=_robot_info,
+                options=_ROBOT_INFO,
             ),
         },
     ),
@@ -360,32 +326,34 @@ COMMANDS = {
         summary="print every setting and where it comes from, check a file, begin one",
         examples=("config my.toml --set scene.max_splats=3000", "config --template"),
         run="config:run",
-        options=_config,
+        options=_CONFIG,
     ),
     "completion": Command(
         summary="print a script by which a shell completes commands, options and files",
         examples=("completion bash", "completion zsh"),
         run="completion:run",
-        options=_completion,
+        options=_COMPLETION,
     ),
     "demo": Command(
         summary="run the main job on a sample recording, with pictures",
         examples=("demo", "demo --data out/log -o out/demo"),
         run="demo:run",
         judges=True,
-        options=_demo,
+        options=_DEMO,
     ),
     "capture": Command(
         summary="pack a capture into one MCAP that viewers open, and unpack it",
         examples=("capture pack out/x.capture -o x.mcap", "capture unpack x.mcap -o back.capture"),
         actions={
             "pack": Command(
-                summary="write a capture as one MCAP", run="recordings:run_pack", options=capture_pack_options
+                summary="write a capture as one MCAP",
+                run="recordings:run_pack",
+                options=recording_options.CAPTURE_PACK,
             ),
             "unpack": Command(
                 summary="write the capture that `pack` made an MCAP of",
                 run="recordings:run_unpack",
-                options=capture_unpack_options,
+                options=recording_options.CAPTURE_UNPACK,
             ),
         },
     ),

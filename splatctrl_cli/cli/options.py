@@ -5,10 +5,11 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from splatctrl_cli.cli.parser import Options, Parser, real, several, whole
+from splatctrl_cli.cli.parser import Adds, group, of_run, option, real, several, whole
 from splatctrl_cli.config import PRESETS
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, shown
@@ -21,135 +22,6 @@ T = TypeVar("T")
 POSE = "X,Y,Z,QX,QY,QZ,QW"
 BOX = "X0,Y0,Z0,X1,Y1,Z1"
 SEVERAL_LOGS = "several logs of one session are read as one"
-
-
-def add_output(add: Options, what: str, *, default: str) -> None:
-    """``-o/--out`` and ``--force``."""
-    add("-o/--out PATH", f"{what} (default: {default})", Path)
-    add("--force", "replace the output if it exists")
-
-
-def add_common(parser: Parser) -> None:
-    """``--json``, ``-v``, ``-q``, which every command has."""
-    Options(parser)("--json", "print one JSON object instead of a table")
-    add = Options(parser.run_group)
-    add("-v/--verbose", "say more; show tracebacks", action="count", default=0)
-    add("-q/--quiet", "no progress, no log lines")
-
-
-def add_junit(parser: Parser) -> None:
-    """``--junit``, which every command that judges has."""
-    meaning = "write the verdict as JUnit XML, a case for each criterion and gate (docs/ci.md)"
-    Options(parser.run_group)("--junit FILE", meaning, Path)
-
-
-def add_config(add: Options, parser: Parser) -> None:
-    """`add_settings`, and among the options of a run ``--seed``, ``--threads``."""
-    add("--config FILE.toml", "configuration, see docs/config.md", Path)
-    add_settings(add)
-    add_seed(Options(parser.run_group), "everything random")
-    add_threads(parser)
-
-
-def add_settings(add: Options, example: str = "") -> None:
-    """``--set`` and ``--preset``, which is the first of the settings."""
-    add("--set SECTION.KEY=VALUE ...", f"one setting{example}")
-    add(
-        "--preset NAME",
-        "paper: as printed, where docs/paper.md departs from it",
-        _preset,
-        dest="set",
-        action="append",
-    )
-
-
-def _preset(text: str) -> str:
-    if text not in PRESETS:
-        raise argparse.ArgumentTypeError(f"expected {' or '.join(PRESETS)}, got {shown(text)}")
-    return f"preset={text}"
-
-
-def add_seed(add: Options, what: str) -> None:
-    add("--seed SEED", f"seed of {what}", whole(0, MAX_SEED), 0)
-
-
-def add_threads(parser: Parser) -> None:
-    threads = "threads, at most 16 or one per core (default: one per core)"
-    Options(parser.run_group)("--threads THREADS", threads, whole(0, 1024))
-
-
-def add_device(parser: Parser) -> None:
-    where = "auto, cpu, cuda or cuda:N; auto takes a card that is worth its start (docs/gpu.md)"
-    Options(parser.run_group)("--device NAME", f"where to compute: {where}", _device, "auto")
-
-
-def add_gates(add: Options) -> None:
-    add("--require METRIC>=VALUE ...", "fail (exit 1) unless it holds", gate)
-
-
-def add_source(add: Options) -> None:
-    """``--cameras``, and the other options of a source in a group of their own."""
-    add("--cameras A,B", "only these cameras", _Listed("--cameras"))
-    add = add.group("input")
-    add("--camera NAME=COLOR,DEPTH[,INFO] ...", "topics of a camera, instead of those found")
-    add(
-        f"--camera-pose NAME={POSE} ...",
-        "pose of a fixed camera in the world; or NAME=identity; or NAME=TOPIC[@FRAME], a topic of its poses, or of"
-        " FRAME's",
-    )
-    add("--intrinsics NAME=FX,FY,CX,CY ...", "of a camera [px], without distortion, instead of the recorded ones")
-    add("--human-topic NAME=TOPIC ...", "mono8 masks of a camera's colour images, not 0 where they show a person")
-    add("--world-frame FRAME", "tf frame of poses (default: root of the tf tree)")
-    add("--depth-scale M", "metres per count of depth (default: 0.001)", real(1e-9, 1e3, "m"))
-    add("--pairing-tolerance S", "colour to depth, seconds", real(0, 3600, "s"), 0.02)
-    add("--calibration FILE.toml", "what calibrate wrote: poses, depths and clock of this recording", Path)
-    errors = "read frames with errors: depth-noise (m at 1 m), pose-error (m), pose-turn (degrees); seed of these"
-    add("--perturb NAME=VALUE ...", errors)
-    add("--stamps", "a log's times: those of the headers, or of logging", ("header", "log"), "header")
-    add("--joint-topic TOPIC", "JointState topic (default: /joint_states)")
-    add("--root DIR", "folder of the images that a .toml describes", Path)
-    add("--holdout 0,6", "frames of an image folder that become camera 'holdout'", _Listed("--holdout"))
-
-
-def add_scan(add: Options) -> None:
-    """``--scan``, ``--protocol``, ``--depths`` and ``--downscale``: the options of a DTU scan."""
-    add("--scan NAME", "which scan of --dtu (default: the only one)")
-    add(
-        "--protocol NAME",
-        "which views train and which are scored: dtu-train, dtu-holdout8, regnerf-3, regnerf-6, regnerf-9, mvsnerf,"
-        " holdout:everyN, holdout:everyN+FIRST or holdout:2,5 (docs/score.md)",
-    )
-    add("--depths DIR", "depth_map_0000.pfm and so on of a scan in IDR's layout", Path)
-    add(
-        "--downscale N",
-        "make images of --dtu N times smaller (default: as the protocol has them, if N is whole)",
-        whole(1, 64),
-    )
-
-
-def add_disagreement(add: Options) -> None:
-    """``--max-pose-jump`` and ``--allow-disagreement``: by how much a log may contradict itself."""
-    jump = "how far a camera may move between frames less than a second apart"
-    add("--max-pose-jump M", jump, real(1e-3, MAX_PLACE, "m"), POSE_JUMP)
-    add("--allow-disagreement", "continue although cameras disagree about surfaces")
-
-
-def add_declare(add: Options) -> None:
-    add("--declare FILE.toml", "what the robot carries, and contact that is meant (docs/declare.md)", Path)
-
-
-def add_packages(add: Options) -> None:
-    packages = "where package:// paths of the URDF are found (default: the folders above it)"
-    add("--packages DIR ...", packages, Path)
-
-
-def add_self_model(add: Options) -> None:
-    add("--self-model FILE.npz", "what robot learn found of its surface beside the URDF's", Path)
-
-
-def add_lock(add: Options) -> None:
-    held = "hold a joint, and what mimics it, at a value [rad or m]"
-    add("--lock JOINT=VALUE ...", held)
 
 
 def request_of(kind: type[T], args: argparse.Namespace, **given: Any) -> T:
@@ -225,17 +97,12 @@ def numbers(text: str) -> tuple[float, ...]:
     return values
 
 
-class _Listed:
+def _listed(name: str, text: str) -> str:
     """A list for argparse, without spaces around its names. Raises UsageError for one that names nothing."""
-
-    def __init__(self, option: str) -> None:
-        self.option = option
-
-    def __call__(self, text: str) -> str:
-        names = _names(text)
-        if not names:
-            raise UsageError(f"{self.option} {text!r}: expected names, got none", remedy="leave the option out")
-        return ",".join(names)
+    names = _names(text)
+    if not names:
+        raise UsageError(f"{name} {text!r}: expected names, got none", remedy="leave the option out")
+    return ",".join(names)
 
 
 def _names(text: str | None) -> tuple[str, ...] | None:
@@ -285,3 +152,123 @@ def _intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
     if not name or len(values) != 4 or not min(values[:2]) > 0:
         raise UsageError(f"--intrinsics {text}: expected NAME=FX,FY,CX,CY in pixels")
     return name, values
+
+
+def _preset(text: str) -> str:
+    if text not in PRESETS:
+        raise argparse.ArgumentTypeError(f"expected {' or '.join(PRESETS)}, got {shown(text)}")
+    return f"preset={text}"
+
+
+def output(what: str, *, default: str) -> tuple[Adds, ...]:
+    """``-o/--out`` and ``--force``."""
+    return (
+        option("-o/--out PATH", f"{what} (default: {default})", Path),
+        option("--force", "replace the output if it exists"),
+    )
+
+
+def settings(example: str = "") -> tuple[Adds, ...]:
+    """``--set`` and ``--preset``, which is the first of the settings."""
+    paper = "paper: as printed, where docs/paper.md departs from it"
+    return (
+        option("--set SECTION.KEY=VALUE ...", f"one setting{example}"),
+        option("--preset NAME", paper, _preset, dest="set", action="append"),
+    )
+
+
+def seed(what: str) -> Adds:
+    return option("--seed SEED", f"seed of {what}", whole(0, MAX_SEED), 0)
+
+
+COMMON = (  # which every command has
+    option("--json", "print one JSON object instead of a table"),
+    of_run(
+        option("-v/--verbose", "say more; show tracebacks", action="count", default=0),
+        option("-q/--quiet", "no progress, no log lines"),
+    ),
+)
+JUNIT = (  # which every command that judges has
+    of_run(
+        option(
+            "--junit FILE", "write the verdict as JUnit XML, a case for each criterion and gate (docs/ci.md)", Path
+        )
+    ),
+)
+THREADS = of_run(
+    option("--threads THREADS", "threads, at most 16 or one per core (default: one per core)", whole(0, 1024))
+)
+CONFIG_FILE = option("--config FILE.toml", "configuration, see docs/config.md", Path)
+CONFIG = (CONFIG_FILE, *settings(), of_run(seed("everything random")), THREADS)
+DEVICE = of_run(
+    option(
+        "--device NAME",
+        "where to compute: auto, cpu, cuda or cuda:N; auto takes a card that is worth its start (docs/gpu.md)",
+        _device,
+        "auto",
+    )
+)
+GATES = option("--require METRIC>=VALUE ...", "fail (exit 1) unless it holds", gate)
+SOURCE = (  # the options of a source, all but --cameras in a group of their own
+    option("--cameras A,B", "only these cameras", partial(_listed, "--cameras")),
+    group(
+        "input",
+        option("--camera NAME=COLOR,DEPTH[,INFO] ...", "topics of a camera, instead of those found"),
+        option(
+            f"--camera-pose NAME={POSE} ...",
+            "pose of a fixed camera in the world; or NAME=identity; or NAME=TOPIC[@FRAME], a topic of its poses, or"
+            " of FRAME's",
+        ),
+        option(
+            "--intrinsics NAME=FX,FY,CX,CY ...",
+            "of a camera [px], without distortion, instead of the recorded ones",
+        ),
+        option(
+            "--human-topic NAME=TOPIC ...", "mono8 masks of a camera's colour images, not 0 where they show a person"
+        ),
+        option("--world-frame FRAME", "tf frame of poses (default: root of the tf tree)"),
+        option("--depth-scale M", "metres per count of depth (default: 0.001)", real(1e-9, 1e3, "m")),
+        option("--pairing-tolerance S", "colour to depth, seconds", real(0, 3600, "s"), 0.02),
+        option("--calibration FILE.toml", "what calibrate wrote: poses, depths and clock of this recording", Path),
+        option(
+            "--perturb NAME=VALUE ...",
+            "read frames with errors: depth-noise (m at 1 m), pose-error (m), pose-turn (degrees); seed of these",
+        ),
+        option("--stamps", "a log's times: those of the headers, or of logging", ("header", "log"), "header"),
+        option("--joint-topic TOPIC", "JointState topic (default: /joint_states)"),
+        option("--root DIR", "folder of the images that a .toml describes", Path),
+        option(
+            "--holdout 0,6", "frames of an image folder that become camera 'holdout'", partial(_listed, "--holdout")
+        ),
+    ),
+)
+SCAN = (  # the options of a DTU scan
+    option("--scan NAME", "which scan of --dtu (default: the only one)"),
+    option(
+        "--protocol NAME",
+        "which views train and which are scored: dtu-train, dtu-holdout8, regnerf-3, regnerf-6, regnerf-9, mvsnerf,"
+        " holdout:everyN, holdout:everyN+FIRST or holdout:2,5 (docs/score.md)",
+    ),
+    option("--depths DIR", "depth_map_0000.pfm and so on of a scan in IDR's layout", Path),
+    option(
+        "--downscale N",
+        "make images of --dtu N times smaller (default: as the protocol has them, if N is whole)",
+        whole(1, 64),
+    ),
+)
+DISAGREEMENT = (  # by how much a log may contradict itself
+    option(
+        "--max-pose-jump M",
+        "how far a camera may move between frames less than a second apart",
+        real(1e-3, MAX_PLACE, "m"),
+        POSE_JUMP,
+    ),
+    option("--allow-disagreement", "continue although cameras disagree about surfaces"),
+)
+DECLARE = option("--declare FILE.toml", "what the robot carries, and contact that is meant (docs/declare.md)", Path)
+PACKAGES = option(
+    "--packages DIR ...", "where package:// paths of the URDF are found (default: the folders above it)", Path
+)
+SELF_MODEL = option("--self-model FILE.npz", "what robot learn found of its surface beside the URDF's", Path)
+LOCK = option("--lock JOINT=VALUE ...", "hold a joint, and what mimics it, at a value [rad or m]")
+BASE = option(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)

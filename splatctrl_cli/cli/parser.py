@@ -30,10 +30,9 @@ class Parser(argparse.ArgumentParser):
         super().__init__(**kwargs)
         self.run_group = argparse._ArgumentGroup(self, "run")  # the last of the groups, which every command has
         self.examples = examples
-        add = Options(self)
-        add("-h/--help", "show this help and exit", action="help")
+        option("-h/--help", "show this help and exit", action="help")(self)
         if self.prog != "splatctrl":
-            add("--help-all", "show every option", action=_HelpAll, nargs=0)
+            option("--help-all", "show every option", action=_HelpAll, nargs=0)(self)
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> tuple[Any, list[str]]:  # type: ignore[override]
         """As in argparse, but what is left over is refused here, by the parser that knows the options."""
@@ -116,52 +115,62 @@ class Parser(argparse.ArgumentParser):
         return f"{self.format_usage()}\n{formatter.format_help()}"
 
 
-class Options:
-    """Adds options, declared a line each, to a parser or to a group of one."""
+Adds = Callable[[Any], None]
+"""An option, or a group of them, which a parser or a group of one is given to be added to."""
 
-    def __init__(self, container: argparse._ActionsContainer) -> None:
-        self._container = container
 
-    def __call__(
-        self,
-        name: str,
-        meaning: str,
-        kind: Callable[[str], Any] | Sequence[str] | None = None,
-        default: Any = None,
-        **more: Any,
-    ) -> None:
-        """Add ``-o/--out PATH``, ``--flag``, ``--repeatable NAME ...`` or a ``PLACE``.
+def option(
+    name: str,
+    meaning: str,
+    kind: Callable[[str], Any] | Sequence[str] | None = None,
+    default: Any = None,
+    **more: Any,
+) -> Adds:
+    """``-o/--out PATH``, ``--flag``, ``--repeatable NAME ...`` or a ``PLACE``, declared a line each.
 
-        kind: what makes the value of the text, or the words to choose from. default: of an option that is not given;
-        the help says it where it is a number or a word. more: as in argparse.
-        """
-        flags, _, metavar = name.partition(" ")
-        is_place, repeats = not flags.startswith("-"), metavar.endswith(" ...")
-        if isinstance(kind, tuple):
-            more["choices"] = kind
-        elif kind is not None:
-            more["type"] = kind
-        if is_place or metavar:
-            more["metavar"] = flags if is_place else metavar.removesuffix(" ...")
-        elif not isinstance(kind, tuple):
-            more.setdefault("action", "store_true")
-        if repeats:
-            more |= {"action": "append", "default": []}
-            meaning += " (repeatable)"
-        elif default is not None:
-            more["default"] = default
-        if default is not None and default != [] and more.get("action") != "count":
-            meaning += f" (default: {default:g})" if isinstance(default, int | float) else f" (default: {default})"
-        names = [flags.lower()] if is_place else flags.split("/")
-        self._container.add_argument(*names, help=meaning.replace("%", "%%"), **more)
+    kind: what makes the value of the text, or the words to choose from. default: of an option that is not given;
+    the help says it where it is a number or a word. more: as in argparse.
+    """
+    flags, _, metavar = name.partition(" ")
+    is_place, repeats = not flags.startswith("-"), metavar.endswith(" ...")
+    if isinstance(kind, tuple):
+        more["choices"] = kind
+    elif kind is not None:
+        more["type"] = kind
+    if is_place or metavar:
+        more["metavar"] = flags if is_place else metavar.removesuffix(" ...")
+    elif not isinstance(kind, tuple):
+        more.setdefault("action", "store_true")
+    if repeats:
+        more |= {"action": "append", "default": []}
+        meaning += " (repeatable)"
+    elif default is not None:
+        more["default"] = default
+    if default is not None and default != [] and more.get("action") != "count":
+        meaning += f" (default: {default:g})" if isinstance(default, int | float) else f" (default: {default})"
+    names = [flags.lower()] if is_place else flags.split("/")
+    return lambda container: container.add_argument(*names, help=meaning.replace("%", "%%"), **more)
 
-    def group(self, title: str) -> "Options":
-        """Options that ``--help-all`` alone shows."""
-        return Options(self._container.add_argument_group(title))
 
-    def either(self, *, required: bool = False) -> "Options":
-        """Options of which one may be given, or has to be."""
-        return Options(self._container.add_mutually_exclusive_group(required=required))
+def group(title: str, *options: Adds) -> Adds:
+    """Options that ``--help-all`` alone shows."""
+    return lambda container: add_all(container.add_argument_group(title), options)
+
+
+def either(*options: Adds, required: bool = False) -> Adds:
+    """Options of which one may be given, or has to be."""
+    return lambda container: add_all(container.add_mutually_exclusive_group(required=required), options)
+
+
+def of_run(*options: Adds) -> Adds:
+    """Options of the last group, which every command has."""
+    return lambda parser: add_all(parser.run_group, options)
+
+
+def add_all(container: Any, options: Iterable[Adds]) -> None:
+    """Add them to a parser, or to a group of one."""
+    for add in options:
+        add(container)
 
 
 class _HelpAll(argparse.Action):

@@ -3,108 +3,12 @@
 import argparse
 from pathlib import Path
 
-from splatctrl_cli.cli.options import (
-    POSE,
-    SEVERAL_LOGS,
-    add_lock,
-    add_output,
-    add_packages,
-    add_seed,
-    add_source,
-    numbers,
-    pose,
-)
-from splatctrl_cli.cli.parser import Options, Parser, real, whole
+from splatctrl_cli.cli.options import BASE, LOCK, PACKAGES, SEVERAL_LOGS, SOURCE, numbers, output, seed
+from splatctrl_cli.cli.parser import group, option, real, whole
 
 QUICK = 30  # images of a topic
-
-
-def simulate_options(add: Options, parser: Parser) -> None:
-    files = "folder for log.mcap, truth.json, robot.urdf, robot_spheres.yaml"
-    add_output(add, files, default="simulated")
-    add("--urdf FILE", "another arm with collision geometry, its base on the table; spheres are fitted to it", Path)
-    add_packages(add)
-    add_seed(add, "the noise, of --environment and of --human-arm")
-    add(
-        "--duration S",
-        "length in seconds (default: 7; with --environment 12, with --human-arm 24)",
-        real(0.5, 600, "s"),
-    )
-    add("--free", "free space: floor and walls, no table and nothing on it")
-    add("--person", "a walking person with masks, instead of the standing cylinder")
-    cylinder = "where the standing cylinder is, and its radius [m] (default: 0.42,0.08,0.06)"
-    add("--visitor X,Y,RADIUS", cylinder, numbers)
-    shared = "a table shared with a person's arm, with masks, that works beside the arm's pickup or its goal"
-    add("--human-arm", shared, ("near-pickup", "near-goal"))
-    drawn = "things on tables, or a shelf, drawn by the seed, and a way through"
-    add("--environment", drawn, ("tabletop", "cubby", "merged-cubby"))
-    add(
-        "--dtu",
-        "write PATH/dtu and PATH/idr too: a DTU scan of a static scene, in MVSNet's layout and in IDR's, with masks"
-        " of its things",
-    )
-    add("--width PX", "image width", whole(16, 4096, "px"), 320)
-    add("--height PX", "image height", whole(16, 4096, "px"), 240)
-    add("--noise", "depth noise; stereo fattens edges", ("none", "realsense", "stereo"), "realsense")
-    more = add.group("arm and cameras")
-    inside = "draw the arm by visual shapes that lie 3 mm (median) to 27 mm (95 %) inside of its collision shapes"
-    more("--slim", inside)
-    parts = "parts of the arm that images and truth.json have and robot.urdf has not: tool,cable,bracket, or some"
-    more("--unmodelled PARTS", parts)
-    more("--num-cameras N", "with --environment: 2 to 6 about the arm", whole(2, 6), 4)
-    more("--fps HZ", "frames a second", real(0.1, 60, "Hz"), 5.0)
-
-
-def ingest_options(add: Options, parser: Parser) -> None:
-    kinds = ".mcap, .bag, .db3, ROS 2 bag folder, folder of a dataset, or .toml of an image folder"
-    add("SOURCE", f"{kinds}; {SEVERAL_LOGS}", Path, nargs="+")
-    add_output(add, "capture folder", default="NAME.capture in this folder, NAME that of SOURCE")
-    add("--resume", "continue an interrupted run, if there is one, to the same bytes")
-    add_source(add)
-
-
-def info_options(add: Options, parser: Parser) -> None:
-    add("PATH", "file or folder", Path)
-    add_source(add)
-
-
-def check_options(add: Options, parser: Parser) -> None:
-    kinds = ".mcap, .bag, .db3, ROS 2 bag folder, capture, folder of a dataset, or .toml of an image folder"
-    add("SOURCE", f"{kinds}; {SEVERAL_LOGS}", Path, nargs="+")
-    fatal = "exit with 1 where a finding is as bad as this"
-    add("--fail-on", fatal, ("error", "warning", "never"), "error")
-    add(
-        "--quick N",
-        f"read the first N images of a topic only (default of N: {QUICK})",
-        _num_images,
-        nargs="?",
-        const=QUICK,
-    )
-    add("--urdf FILE", "compare joint states and depth with this robot (with --spheres: the log's own)", Path)
-    add("--spheres FILE", "its spheres (default: those of the URDF)", Path)
-    more = add.group("robot")
-    more(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)
-    add_lock(more)
-    add_source(add)
-
-
-def calibrate_options(add: Options, parser: Parser) -> None:
-    kinds = ".mcap, .bag, .db3, ROS 2 bag folder, capture, folder of a dataset, or .toml of an image folder"
-    add("SOURCE", f"the recording to calibrate: {kinds}; {SEVERAL_LOGS}", Path, nargs="+")
-    add_output(add, "TOML file that commands take as --calibration", default="calibration.toml")
-    add("--urdf FILE", "place the cameras by this robot's surface, where its joint states have it", Path)
-    add("--hold CAMERA", "what stays as recorded (default: the robot's base, without --urdf the first camera)")
-    add(
-        "--board COLUMNSxROWS:M",
-        "begin where a board of so many inner corners (chessboard or ChArUco), squares of M metres, has the cameras",
-    )
-    add("--allow-unobserved", "write what the recording says, although not all can be told from it")
-    more = add.group("robot")
-    more("--spheres FILE", "its spheres (default: those of the URDF), for links without geometry", Path)
-    more(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)
-    add_packages(more)
-    add_lock(more)
-    add_source(add)
+FILES = ".mcap, .bag, .db3, ROS 2 bag folder"
+OTHERS = "folder of a dataset, or .toml of an image folder"
 
 
 def _num_images(text: str) -> int:
@@ -115,11 +19,101 @@ def _num_images(text: str) -> int:
         raise argparse.ArgumentTypeError(f"expected a number of images, got {text!r}: {hint}") from None
 
 
-def capture_pack_options(add: Options, parser: Parser) -> None:
-    add("CAPTURE", "capture folder", Path)
-    add_output(add, "MCAP file", default="CAPTURE.mcap")
-
-
-def capture_unpack_options(add: Options, parser: Parser) -> None:
-    add("PACKED", "MCAP file", Path)
-    add_output(add, "capture folder", default="PACKED.capture")
+SIMULATE = (
+    *output("folder for log.mcap, truth.json, robot.urdf, robot_spheres.yaml", default="simulated"),
+    option(
+        "--urdf FILE", "another arm with collision geometry, its base on the table; spheres are fitted to it", Path
+    ),
+    PACKAGES,
+    seed("the noise, of --environment and of --human-arm"),
+    option(
+        "--duration S",
+        "length in seconds (default: 7; with --environment 12, with --human-arm 24)",
+        real(0.5, 600, "s"),
+    ),
+    option("--free", "free space: floor and walls, no table and nothing on it"),
+    option("--person", "a walking person with masks, instead of the standing cylinder"),
+    option(
+        "--visitor X,Y,RADIUS",
+        "where the standing cylinder is, and its radius [m] (default: 0.42,0.08,0.06)",
+        numbers,
+    ),
+    option(
+        "--human-arm",
+        "a table shared with a person's arm, with masks, that works beside the arm's pickup or its goal",
+        ("near-pickup", "near-goal"),
+    ),
+    option(
+        "--environment",
+        "things on tables, or a shelf, drawn by the seed, and a way through",
+        ("tabletop", "cubby", "merged-cubby"),
+    ),
+    option(
+        "--dtu",
+        "write PATH/dtu and PATH/idr too: a DTU scan of a static scene, in MVSNet's layout and in IDR's, with masks"
+        " of its things",
+    ),
+    option("--width PX", "image width", whole(16, 4096, "px"), 320),
+    option("--height PX", "image height", whole(16, 4096, "px"), 240),
+    option("--noise", "depth noise; stereo fattens edges", ("none", "realsense", "stereo"), "realsense"),
+    group(
+        "arm and cameras",
+        option(
+            "--slim",
+            "draw the arm by visual shapes that lie 3 mm (median) to 27 mm (95 %) inside of its collision shapes",
+        ),
+        option(
+            "--unmodelled PARTS",
+            "parts of the arm that images and truth.json have and robot.urdf has not: tool,cable,bracket, or some",
+        ),
+        option("--num-cameras N", "with --environment: 2 to 6 about the arm", whole(2, 6), 4),
+        option("--fps HZ", "frames a second", real(0.1, 60, "Hz"), 5.0),
+    ),
+)
+INGEST = (
+    option("SOURCE", f"{FILES}, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+"),
+    *output("capture folder", default="NAME.capture in this folder, NAME that of SOURCE"),
+    option("--resume", "continue an interrupted run, if there is one, to the same bytes"),
+    *SOURCE,
+)
+INFO = (option("PATH", "file or folder", Path), *SOURCE)
+CHECK = (
+    option("SOURCE", f"{FILES}, capture, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+"),
+    option("--fail-on", "exit with 1 where a finding is as bad as this", ("error", "warning", "never"), "error"),
+    option(
+        "--quick N",
+        f"read the first N images of a topic only (default of N: {QUICK})",
+        _num_images,
+        nargs="?",
+        const=QUICK,
+    ),
+    option("--urdf FILE", "compare joint states and depth with this robot (with --spheres: the log's own)", Path),
+    option("--spheres FILE", "its spheres (default: those of the URDF)", Path),
+    group(
+        "robot",
+        BASE,
+        LOCK,
+    ),
+    *SOURCE,
+)
+CALIBRATE = (
+    option("SOURCE", f"the recording to calibrate: {FILES}, capture, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+"),
+    *output("TOML file that commands take as --calibration", default="calibration.toml"),
+    option("--urdf FILE", "place the cameras by this robot's surface, where its joint states have it", Path),
+    option("--hold CAMERA", "what stays as recorded (default: the robot's base, without --urdf the first camera)"),
+    option(
+        "--board COLUMNSxROWS:M",
+        "begin where a board of so many inner corners (chessboard or ChArUco), squares of M metres, has the cameras",
+    ),
+    option("--allow-unobserved", "write what the recording says, although not all can be told from it"),
+    group(
+        "robot",
+        option("--spheres FILE", "its spheres (default: those of the URDF), for links without geometry", Path),
+        BASE,
+        PACKAGES,
+        LOCK,
+    ),
+    *SOURCE,
+)
+CAPTURE_PACK = (option("CAPTURE", "capture folder", Path), *output("MCAP file", default="CAPTURE.mcap"))
+CAPTURE_UNPACK = (option("PACKED", "MCAP file", Path), *output("capture folder", default="PACKED.capture"))
