@@ -59,8 +59,9 @@ def run(args: argparse.Namespace) -> int:
         rows = [(node.name, state, ", ".join(node.needs) or "-") for node, state in planned_nodes]
         found = [{"id": n.name, "state": s, "needs": n.needs, "words": n.words} for n, s in planned_nodes]
         lines = [*table(("node", "state", "needs"), rows), ""]
-        console.result({"nodes": found}, [*lines, *(f"splatctrl {shlex.join(n.words)}" for n, _ in planned_nodes)])
-        return 0
+        return console.result(
+            {"nodes": found}, [*lines, *(f"splatctrl {shlex.join(n.words)}" for n, _ in planned_nodes)]
+        )
     result = batch(request, command_line, console)
     printed = {
         "out": str(result.out),
@@ -219,5 +220,4 @@ def _listed(console: Console, args: argparse.Namespace, request: BatchRequest, c
         console.log(f"wrote {write_csv(args.csv, runs)} runs to {args.csv}")
     rows = [(run.node, run.state, told(run), f"{run.peak_mb:.0f}", run.log) for run in runs]
     lines = table(("node", "state", "outcome", "MB", "log"), rows) if rows else ["no such runs"]
-    console.result({"nodes": [node_document(run) for run in runs]}, lines)
-    return 0
+    return console.result({"nodes": [node_document(run) for run in runs]}, lines)

@@ -22,8 +22,7 @@ def run(args: argparse.Namespace) -> int:
         board=None if args.board is None else board_of(args.board),
     )
     result = calibrate(request, console)
-    console.result({"out": str(result.out), **result.metrics}, _lines(result))
-    return 0
+    return console.result({"out": str(result.out), **result.metrics}, _lines(result))
 
 
 def _lines(result: CalibrateResult) -> Iterator[str]:

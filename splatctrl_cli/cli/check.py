@@ -85,8 +85,7 @@ def run_info(args: argparse.Namespace) -> int:
 def show_described(console: Console, summary: Summary) -> int:
     """Facts and tables, and what a reconstruction lacks."""
     code = DAMAGED if summary.damaged else 0
-    console.result(summary.as_dict(), _described(summary), code=code)
-    return code
+    return console.result(summary.as_dict(), _described(summary), code=code)
 
 
 def _described(summary: Summary) -> Iterator[str]:

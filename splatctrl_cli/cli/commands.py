@@ -331,7 +331,7 @@ COMMANDS = {
     "completion": Command(
         summary="print a script by which a shell completes commands, options and files",
         examples=("completion bash", "completion zsh"),
-        run="completion:run",
+        run="config:run_completion",
         options=_COMPLETION,
     ),
     "demo": Command(

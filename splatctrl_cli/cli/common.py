@@ -7,9 +7,8 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from splatctrl_cli.cli.envelope import enveloped
 from splatctrl_cli.cli.options import names_of
-from splatctrl_cli.cli.reports import reports_of
+from splatctrl_cli.cli.reports import enveloped, reports_of
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import plain
 from splatctrl_cli.records import Label
@@ -33,8 +32,10 @@ class Console:
         if not self.is_quiet:
             print(line, file=sys.stderr, flush=True)
 
-    def result(self, result: Mapping[str, Any], lines: Iterable[str], *, code: int = 0) -> None:
-        """The command's result, which ends with exit code `code`: `result` as JSON with --json, else `lines`."""
+    def result(self, result: Mapping[str, Any], lines: Iterable[str], *, code: int = 0) -> int:
+        """The command's result, which ends with the exit code `code`, as returned: `result` as JSON with --json, else
+        `lines`.
+        """
         if self.is_json:
             text = json.dumps(enveloped(result, code), indent=2, allow_nan=False, default=plain)
             self._args.is_printed = True
@@ -42,6 +43,7 @@ class Console:
         else:
             for line in lines:
                 print(line)
+        return code
 
     def concluded(
         self,

@@ -1,10 +1,17 @@
-"""``splatctrl config``: what a run would use and where each setting comes from; a template; the schema of --json."""
+"""``splatctrl config``: what a run would use and where each setting comes from; a template; the schema of --json;
+and ``completion``: a script by which a shell completes commands, options, their choices and files.
+"""
 
 import argparse
 import json
+from pathlib import Path
 
+import shtab
+
+from splatctrl_cli.cli.commands import build_parser
 from splatctrl_cli.cli.common import Console
-from splatctrl_cli.cli.envelope import SCHEMA_FILE
+from splatctrl_cli.cli.parser import Parser
+from splatctrl_cli.cli.reports import SCHEMA_FILE
 from splatctrl_cli.jobs.settings import resolved_settings, template_of, toml_of
 
 
@@ -12,9 +19,23 @@ def run(args: argparse.Namespace) -> int:
     console = Console(args)
     if args.schema:
         text = SCHEMA_FILE.read_text(encoding="utf-8")
-        console.result({"json_schema": json.loads(text)}, text.splitlines())
-        return 0
+        return console.result({"json_schema": json.loads(text)}, text.splitlines())
     settings = resolved_settings(args.file, args.set)
     lines = template_of(settings) if args.template else toml_of(settings)
-    console.result({"settings": {setting.name: setting.as_dict() for setting in settings}}, lines)
-    return 0
+    return console.result({"settings": {setting.name: setting.as_dict() for setting in settings}}, lines)
+
+
+def run_completion(args: argparse.Namespace) -> int:
+    parser = build_parser()
+    _complete_files(parser)
+    script = shtab.complete(parser, shell=args.shell).rstrip("\n")
+    return Console(args).result({"shell": args.shell, "script": script}, [script])
+
+
+def _complete_files(parser: Parser) -> None:
+    """Names of files and folders for what is a path."""
+    for action in parser._actions:
+        if action.type is Path:
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
+    for below in parser.actions.choices.values() if parser.actions is not None else ():
+        _complete_files(below)

@@ -84,8 +84,7 @@ def run_simulate(args: argparse.Namespace) -> int:
 
 
 def show_simulated(console: Console, result: SimulateResult) -> int:
-    console.result({"out": str(result.out), "bytes": result.sizes, **result.metrics}, _simulated(result))
-    return 0
+    return console.result({"out": str(result.out), "bytes": result.sizes, **result.metrics}, _simulated(result))
 
 
 def _simulated(result: SimulateResult) -> list[str]:

@@ -34,14 +34,14 @@ def _run_mcap(console: Console, args: argparse.Namespace) -> int:
     request = request_of(ExportRunRequest, args, path=args.scene, roots=tuple(args.root))
     result = export_run(request)
     rows = [(topic, count) for topic, count in result.messages.items()]
-    console.result(result.as_dict(), [f"{result.file}: {result.bytes} bytes", *table(("topic", "messages"), rows)])
-    return 0
+    return console.result(
+        result.as_dict(), [f"{result.file}: {result.bytes} bytes", *table(("topic", "messages"), rows)]
+    )
 
 
 def show_exported(console: Console, result: ExportResult) -> int:
     """What was written, and what it keeps of its source."""
-    console.result(result.as_dict(), _lines(result))
-    return 0
+    return console.result(result.as_dict(), _lines(result))
 
 
 def _labels(names: str | None) -> list[Label] | None:

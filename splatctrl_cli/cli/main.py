@@ -15,8 +15,7 @@ from functools import cache
 from pathlib import Path
 
 from splatctrl_cli.cli.commands import build_parser, function_of, judges
-from splatctrl_cli.cli.envelope import enveloped
-from splatctrl_cli.cli.reports import tell_of_failure
+from splatctrl_cli.cli.reports import enveloped, tell_of_failure
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
 from splatctrl_cli.report.suites import check_replaceable

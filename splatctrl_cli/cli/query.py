@@ -41,8 +41,9 @@ def run(args: argparse.Namespace) -> int:
 def show_answered(console: Console, result: QueryResult) -> int:
     """The figures and notes."""
     out = None if result.out is None else str(result.out)
-    console.result({"out": out, "source": result.kind, **result.metrics, "notes": result.notes}, _lines(result))
-    return 0
+    return console.result(
+        {"out": out, "source": result.kind, **result.metrics, "notes": result.notes}, _lines(result)
+    )
 
 
 def _lines(result: QueryResult) -> Iterator[str]:

@@ -21,21 +21,18 @@ def show_ingested(console: Console, result: IngestResult) -> int:
     lines += [f"{name.replace('_', ' ')}: {value}" for name, value in lost.items() if value and name != "notes"]
     lines += [f"note: {note}" for note in lost["notes"]]
     lines += [f"joint states: {result.summary.num_joint_states}", f"wrote {result.capture}"]
-    console.result({"capture": str(result.capture), **result.metrics}, lines, code=result.exit_code)
-    return result.exit_code
+    return console.result({"capture": str(result.capture), **result.metrics}, lines, code=result.exit_code)
 
 
 def run_pack(args: argparse.Namespace) -> int:
     console = Console(args)
     result = pack(request_of(PackRequest, args, source=args.capture), console)
     found = {"mcap": str(result.out), "frames": result.num_frames, "bytes": result.bytes}
-    console.result(found, [f"frames: {result.num_frames}", f"wrote {result.out}"])
-    return 0
+    return console.result(found, [f"frames: {result.num_frames}", f"wrote {result.out}"])
 
 
 def run_unpack(args: argparse.Namespace) -> int:
     """Write the capture that an MCAP was made of, and return the exit code."""
     result = unpack(request_of(PackRequest, args, source=args.packed))
     found = {"capture": str(result.out), "frames": result.num_frames}
-    Console(args).result(found, [f"frames: {result.num_frames}", f"wrote {result.out}"])
-    return 0
+    return Console(args).result(found, [f"frames: {result.num_frames}", f"wrote {result.out}"])

@@ -20,8 +20,7 @@ def run(args: argparse.Namespace) -> int:
     lines = [f"{result.file}: {result.num_runs} runs, {result.num_scenes} in 3-D, {result.bytes} bytes"]
     lines += result.notes[:MOST_NOTES]
     more = len(result.notes) - MOST_NOTES
-    console.result(result.as_dict(), [*lines, *([f"and {more} more not in 3-D"] if more > 0 else [])])
-    return 0
+    return console.result(result.as_dict(), [*lines, *([f"and {more} more not in 3-D"] if more > 0 else [])])
 
 
 def run_view(args: argparse.Namespace) -> int:

@@ -1,4 +1,6 @@
-"""Where a command that judges tells CI what it found: ``--junit FILE``, and on GitHub annotations and a summary."""
+"""What a command tells other programs: how every object of ``--json`` begins, as its published JSON Schema says; and
+where one that judges tells CI what it found: ``--junit FILE``, and on GitHub annotations and a summary.
+"""
 
 import argparse
 import sys
@@ -15,6 +17,14 @@ from splatctrl_cli.report.suites import Case, Suite, cases_of, error_case, notes
 
 RECORDINGS = ("log", "source", "reference", "dtu", "scene", "data", "output", "urdf")  # logs before maps
 JUNIT = "--junit"
+SCHEMA = "splatctrl-output 1"
+SCHEMA_FILE = Path(__file__).parent.parent / "report" / "output.schema.json"
+
+
+def enveloped(result: Mapping[str, Any], code: int) -> dict[str, Any]:
+    """The schema's name and the exit code, then the result."""
+    first = {"schema": SCHEMA, "exit_code": code}
+    return {**first, **result, **first}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -62,14 +62,12 @@ def run_pairs(args: argparse.Namespace) -> int:
     if result.num_foreign:
         lines.append(f"{result.num_foreign} pairs of {args.srdf.name} name links that {args.urdf.name} does not have")
     found = {"urdf": str(args.urdf), "seed": args.seed, "num_foreign_pairs": result.num_foreign, **result.as_dict()}
-    Console(args).result({**found, "doubts": list(result.doubts)}, [*lines, *result.doubts])
-    return 0
+    return Console(args).result({**found, "doubts": list(result.doubts)}, [*lines, *result.doubts])
 
 
 def run_info(args: argparse.Namespace) -> int:
     result = describe_robot(request_of(RobotRequest, args, locked=locked_joints(args)))
-    Console(args).result(result.as_dict(), _robot_lines(result))
-    return 0
+    return Console(args).result(result.as_dict(), _robot_lines(result))
 
 
 def run_learn(args: argparse.Namespace) -> int:
@@ -95,8 +93,7 @@ def run_learn(args: argparse.Namespace) -> int:
         | {"link": part.link, "place": [*map(finite, part.place)]}
         for part in model.learned
     ]
-    console.result({"out": str(request.out), "links": found, "unknown": dict(model.unknown)}, lines)
-    return 0
+    return console.result({"out": str(request.out), "links": found, "unknown": dict(model.unknown)}, lines)
 
 
 def _learned_row(part: LearnedLink) -> tuple[object, ...]:

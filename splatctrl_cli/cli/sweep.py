@@ -16,8 +16,7 @@ def run(args: argparse.Namespace) -> int:
     console, workers = Console(args), args.workers or os.cpu_count() or 1
     request = request_of(SweepRequest, args, out=args.out or Path("sweep"), workers=workers)
     result = sweep(request, OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1)), console)
-    console.result({"out": str(result.out), **result.as_dict()}, _lines(result, is_long=args.verbose > 0))
-    return 0
+    return console.result({"out": str(result.out), **result.as_dict()}, _lines(result, is_long=args.verbose > 0))
 
 
 def _lines(result: SweepResult, *, is_long: bool) -> Iterator[str]:

@@ -12,8 +12,8 @@ from typing import IO, Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from splatctrl_cli.cli.envelope import SCHEMA_FILE
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.cli.reports import SCHEMA_FILE
 
 OUTPUT = Draft202012Validator(json.loads(SCHEMA_FILE.read_text(encoding="utf-8")))
 
