@@ -9,8 +9,8 @@ from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.jobs.studies.experiments import STUDIES
-from splatctrl_cli.jobs.studies.problem_run import ProblemRequest, run_problem
-from splatctrl_cli.jobs.studies.rows import TRIALS
+from splatctrl_cli.jobs.studies.problem_run import TRIALS, run_problem
+from splatctrl_cli.jobs.studies.problems import ProblemRequest
 from splatctrl_cli.jobs.studies.study import StudyRequest, StudyResult, merged_study, run_study
 
 

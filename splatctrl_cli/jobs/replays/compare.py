@@ -177,7 +177,7 @@ def _planned(
 ) -> tuple[dict[str, PlannedPath], dict[str, Motion]]:
     """One plan for both ways to follow it, and how each went."""
     scene, control, planner = inputs.scene, config.control, config.planner
-    known = _Certified(distance=certified_distance(scene.at(task.stamp_ns)))
+    known = Certified(distance=certified_distance(scene.at(task.stamp_ns)))
     plan = planned_path(inputs.model, known, task, planner, control)
     console.log(f"replay: planned in {plan.seconds:.2f} s: {plan.outcome}")
     plans, motions = {}, {}
@@ -204,8 +204,8 @@ def _planned(
 def planned_ways_out(inputs: ReplayInputs, task: ReplayTask, config: Config) -> PlanDetour | None:
     """What plans the closed loop's ways out of local minima; None where it may take none."""
 
-    def scene_at(stamp_ns: int) -> _Certified:
-        return _Certified(distance=certified_distance(inputs.scene.at(stamp_ns)))
+    def scene_at(stamp_ns: int) -> Certified:
+        return Certified(distance=certified_distance(inputs.scene.at(stamp_ns)))
 
     if config.control.max_detours == 0:
         return None
@@ -213,7 +213,7 @@ def planned_ways_out(inputs: ReplayInputs, task: ReplayTask, config: Config) -> 
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Certified:
+class Certified:
     """A scene to plan in: a lower bound of the exact distance to the splats."""
 
     distance: DistanceFunction

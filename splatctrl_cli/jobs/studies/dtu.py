@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from splatctrl_cli.config import load_config
+from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.datasets.dtu import scan_folders
 from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.errors import InputError, SplatCtrlError
@@ -22,7 +22,7 @@ from splatctrl_cli.jobs.scores.fit import METHODS as COMPARED
 from splatctrl_cli.jobs.scores.fit import PROTOCOL
 from splatctrl_cli.jobs.scores.score import ScoreRequest, score
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
-from splatctrl_cli.jobs.studies.problems import named
+from splatctrl_cli.jobs.studies.problems import ProblemRequest, named
 from splatctrl_cli.simulate.recording import RecordingOptions
 
 GIVEN, SIMULATED = "dtu", "simulated"  # scans of a tree, and the scan that `simulate` makes, fitted by several seeds
@@ -94,13 +94,11 @@ def problems(trials: int | None, root: Path | None) -> list[tuple[str, int]]:
     return [(GIVEN, n) for n in wanted[:trials]]
 
 
-def fits(
-    problem: str, root: Path | None, methods: Sequence[str], *, threads: int, stopwatch: Stopwatch
-) -> Iterator[Fit]:
+def fits(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[Fit]:
     """A scan through the methods. Raises InputError for a name that is none, or not in the tree."""
-    environment, number = named(problem, (GIVEN, SIMULATED), "environment")
+    root, (environment, number) = request.problems, named(request.problem, (GIVEN, SIMULATED), "environment")
     if environment == GIVEN and root is None:
-        raise InputError(f"--problem {problem}: is of a DTU tree", remedy="give its folder with --problems")
+        raise InputError(f"--problem {request.problem}: is of a DTU tree", remedy="give its folder with --problems")
     with TemporaryDirectory() as name:
         folder = Path(name)
         if root is None or environment == SIMULATED:
@@ -112,11 +110,11 @@ def fits(
             if not there:
                 raise InputError(f"{root}: has no scan {number}", remedy="give the tree that the study began with")
             scan = RecordingRequest(path=root, is_dtu=True, scan=there[0], protocol=PROTOCOL)
-        for method in methods:
+        for method in request.methods:
             row = Fit(environment=environment, number=number, method=method)
             with stopwatch.stage(method):
                 try:
-                    yield _fit(row, scan, folder / method, threads)
+                    yield _fit(row, scan, folder / method, request.threads)
                 except SplatCtrlError as error:
                     yield replace(row, error=str(error))
 

@@ -40,16 +40,6 @@ class Failure:
     things: tuple[Float32, Float32] | None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Place:
-    """A posture (J,) of the arm, which of its spheres is meant there, and where (3,) [m]; when: in words."""
-
-    q: Float64
-    sphere: int
-    point: Float64
-    when: str
-
-
 def draw(failure: Failure, path: Path) -> None:
     """Write two views of it, one from afar and one close to the place, from where that is seen."""
     at, eyes = _place(failure), np.array([frame.T_world_camera[:3, 3] for frame in failure.views.steps[0]])
@@ -61,7 +51,7 @@ def draw(failure: Failure, path: Path) -> None:
     drawn.trial_picture(path, _scene(failure, at, eyes), views, _caption(failure, at))
 
 
-def _scene(failure: Failure, at: Place, eyes: Float64) -> drawn.TrialScene:
+def _scene(failure: Failure, at: judge.Contact, eyes: Float64) -> drawn.TrialScene:
     """Things, the arm at the place and the tip's way; the map, the start and the goal shine through."""
     problem, model = failure.problem, failure.problem.model
     centers, radii = model.sphere_centers(at.q), model.sphere_set.radii
@@ -104,14 +94,13 @@ def _balls(link: str, centers: Float32 | Float64, radii: Float32 | Float64) -> l
     return made
 
 
-def _place(failure: Failure) -> Place:
+def _place(failure: Failure) -> judge.Contact:
     """The deepest contact with the truth; else, of where the arm ended or what was blocked, the sphere that the map
     is nearest to.
     """
     problem = failure.problem
     if failure.position is not None and failure.cause in (judge.HIT_SEEN, judge.HIT_UNSEEN, judge.HIT_SELF):
-        contact = judge.deepest_contact(problem, failure.position)
-        return Place(q=contact.q, sphere=contact.sphere, point=contact.point, when=contact.when)
+        return judge.deepest_contact(problem, failure.position)
     when, q = "at the goal", problem.goal
     if failure.position is not None:
         when, q = "where it ended", failure.position[-1]
@@ -121,10 +110,10 @@ def _place(failure: Failure) -> Place:
     moving = np.flatnonzero(problem.model.moving_spheres)
     away = (failure.scene or problem.solids).distance(centers[moving]) - problem.model.sphere_set.radii[moving]
     sphere = int(moving[np.argmin(away)])
-    return Place(q=q, sphere=sphere, point=centers[sphere], when=when)
+    return judge.Contact(q=q, sphere=sphere, point=centers[sphere], when=when)
 
 
-def _free_direction(failure: Failure, at: Place, length: float) -> Float64:
+def _free_direction(failure: Failure, at: judge.Contact, length: float) -> Float64:
     """(3,) from which the place is seen best: past things and the arm, and across the way that the contact faces."""
     number = np.arange(DIRECTIONS) + 0.5
     height, turn = 1 - 1.3 * number / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * number  # not from below
@@ -146,7 +135,7 @@ def _free_direction(failure: Failure, at: Place, length: float) -> Float64:
     return np.asarray(directions[np.argmax(is_open - 0.05 * np.abs(directions @ facing))])
 
 
-def _caption(failure: Failure, at: Place) -> str:
+def _caption(failure: Failure, at: judge.Contact) -> str:
     """Which trial, cause, verdict, and how far the sphere is from things by the truth and by the map."""
     problem, model = failure.problem, failure.problem.model
     center, radius = model.sphere_centers(at.q)[[at.sphere]], float(model.sphere_set.radii[at.sphere])

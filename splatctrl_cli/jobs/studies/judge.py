@@ -70,7 +70,9 @@ def against_truth(problem: Problem, position: Float64, views: Views) -> Executio
     cause = GOAL_MISSED if moved > GOAL_POSITION or turned > GOAL_ROTATION else ""
     is_free = check_edges(room, position[:-1], position[1:], contact=TOUCH).is_free
     if not is_free.all():
-        cause = _what_is_hit(problem, position, views)
+        contact = deepest_contact(problem, position)
+        surface = HIT_SEEN if views.has_seen(contact.point[None])[0] else HIT_UNSEEN
+        cause = HIT_SELF if contact.is_own else surface
     alone = Clearance.of(problem.model.with_self_pairs(NO_PAIRS), problem.solids)
     clearance = least_clearance(alone, position, tolerance=5e-4)
     return Execution(
@@ -83,15 +85,15 @@ def against_truth(problem: Problem, position: Float64, views: Views) -> Executio
 
 @dataclass(frozen=True, kw_only=True)
 class Contact:
-    """The deepest of a motion: the posture q (J,), which sphere of the arm, the point (3,) [m], world, that it came
-    to, whether that is its own, and when, in words.
+    """A place of a motion, such as the deepest contact: the posture q (J,), which sphere of the arm, the point (3,)
+    [m], world, that it came to, when, in words, and whether the point is the arm's own.
     """
 
     q: Float64
     sphere: int
     point: Float64
-    is_own: bool
     when: str
+    is_own: bool = False
 
 
 def deepest_contact(problem: Problem, position: Float64) -> Contact:
@@ -109,15 +111,7 @@ def deepest_contact(problem: Problem, position: Float64) -> Contact:
         return Contact(q=q, sphere=int(first), point=middle, is_own=True, when=when)
     sphere = int(room.moving[row])
     _, surface = closest_of(problem.primitives, centers[sphere][None], 0)
-    return Contact(q=q, sphere=sphere, point=surface[0], is_own=False, when=when)
-
-
-def _what_is_hit(problem: Problem, position: Float64, views: Views) -> str:
-    """Whether the deepest contact is with something seen."""
-    contact = deepest_contact(problem, position)
-    if contact.is_own:
-        return HIT_SELF
-    return HIT_SEEN if views.has_seen(contact.point[None])[0] else HIT_UNSEEN
+    return Contact(q=q, sphere=sphere, point=surface[0], when=when)
 
 
 @dataclass(frozen=True, kw_only=True)

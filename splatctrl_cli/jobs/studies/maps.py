@@ -17,12 +17,11 @@ from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.field.grid_cells import GridLayout
 from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
-from splatctrl_cli.jobs.replays.compare import ROUNDING
+from splatctrl_cli.jobs.replays.compare import ROUNDING, Certified
 from splatctrl_cli.jobs.replays.known_scene import KnownScene, known_space, seen_of, splat_fields
 from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.jobs.studies.views import Step, Views
 from splatctrl_cli.jobs.studies.ways import (
-    Asked,
     Surroundings,
     Ways,
     beside_the_start,
@@ -113,7 +112,7 @@ def splat_map(problem: Problem, made: Fitted, config: Config, threads: int) -> M
         threads=threads,
     )
     return Map(
-        scene=Asked(distance=_less_rounding(SphereField(centers, radii, threads=threads))),
+        scene=Certified(distance=_less_rounding(SphereField(centers, radii, threads=threads))),
         ways=surroundings.ways,
         known=known,
         barrier=lambda: barrier_of(problem, spheres, config, threads),
@@ -159,7 +158,7 @@ def occupancy_map(made: Fitted, config: Config, threads: int) -> Map:
     balls = Balls.of_voxels(centers.astype(np.float32), grid.voxel, np.zeros(len(centers), np.uint8))
     radii = np.full(len(balls), balls.radius, np.float32)
     field = SphereField(balls.centers, radii, threads=threads)
-    scene = Asked(distance=_less_rounding(field))
+    scene = Certified(distance=_less_rounding(field))
     return Map(scene=scene, num_parts=len(balls), things=(balls.centers, radii))
 
 
@@ -176,7 +175,7 @@ def gaussian_map(problem: Problem, views: Views, config: Config, threads: int) -
     if not len(radii):
         raise NotEvaluableError("3D-GS: no Gaussian is left")
     field = SphereField(centers, radii, threads=threads)
-    return Map(scene=Asked(distance=_less_rounding(field)), num_parts=len(splats), things=(centers, radii))
+    return Map(scene=Certified(distance=_less_rounding(field)), num_parts=len(splats), things=(centers, radii))
 
 
 def tsdf_map(problem: Problem, views: Views, config: Config) -> Map:
@@ -213,7 +212,7 @@ def tsdf_map(problem: Problem, views: Views, config: Config) -> Map:
 
     corners = mesh.vertex.positions.numpy()
     radii = np.full(len(corners), 0.5 * TSDF_VOXEL, np.float32)
-    return Map(scene=Asked(distance=distance), num_parts=num_triangles, things=(corners, radii))
+    return Map(scene=Certified(distance=distance), num_parts=num_triangles, things=(corners, radii))
 
 
 def without_robot(problem: Problem, views: Views, config: Config) -> list[RgbdFrame]:

@@ -37,6 +37,22 @@ Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True, kw_only=True)
+class ProblemRequest:
+    """Run the problem of a name into the folder `out`; problems: MotionBenchMaker's folder, for one of its own;
+    methods: of the study; width [px] of the images.
+    """
+
+    problem: str
+    out: Path
+    study: str = "table2"
+    problems: Path | None = None
+    methods: tuple[str, ...] = ()
+    width: int = 320
+    force: bool = False
+    threads: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Problem:
     """From a posture to another (J,) [rad] among things, world frame; number: the seed of a drawn one."""
 

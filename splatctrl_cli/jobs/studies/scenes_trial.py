@@ -18,7 +18,7 @@ from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.simulated_task import solids_of
 from splatctrl_cli.jobs.studies import judge
 from splatctrl_cli.jobs.studies.maps import Fitted, Map, splat_map, workspace_of
-from splatctrl_cli.jobs.studies.problems import Problem, room
+from splatctrl_cli.jobs.studies.problems import Problem, ProblemRequest, room
 from splatctrl_cli.jobs.studies.scenes import HAND, Scene, read_scene
 from splatctrl_cli.jobs.studies.trial import Attempt, Drive, Rig, by_controller, by_planner
 from splatctrl_cli.jobs.studies.views import Views, recorded, solids_at
@@ -122,16 +122,14 @@ class Way:
     effector_path_deg: float
 
 
-def transports_of(
-    name: str, methods: Sequence[str], config: Config, *, width: int, threads: int, stopwatch: Stopwatch
-) -> Iterator[Transport]:
+def transports_of(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[Transport]:
     """Every run of the scene with a name. Raises InputError for one that is none."""
     with stopwatch.stage("scene"):
-        scene = read_scene(name)
+        scene = read_scene(request.problem)
+    width, threads = request.width, request.threads
     for run in range(RUNS):
         trial = Trial(scene=scene, run=run, config=config, width=width, threads=threads, stopwatch=stopwatch)
-        for method in methods:
-            yield trial.by(method)
+        yield from map(trial.by, request.methods)
 
 
 class Trial:

@@ -18,9 +18,16 @@ from splatctrl_cli.jobs.batches.suite import Job, Recording, Suite
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.report import WriteReportRequest, write_report
 from splatctrl_cli.jobs.studies.experiments import STUDIES
-from splatctrl_cli.jobs.studies.problem_run import Section, Study
+from splatctrl_cli.jobs.studies.problem_run import (
+    TRIALS,
+    Row,
+    Section,
+    Study,
+    read_trials,
+    verdict_on_trials,
+    write_trials,
+)
 from splatctrl_cli.jobs.studies.problems import name_of
-from splatctrl_cli.jobs.studies.rows import TRIALS, Row, read_trials, verdict_on_trials, write_trials
 
 FILE, FORMAT = "study.json", "splatctrl-study"
 DRAWN, ARCHIVED = "drawn", "archive"  # jobs: of environments by their seed, of MotionBenchMaker

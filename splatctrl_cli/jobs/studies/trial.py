@@ -25,7 +25,7 @@ from splatctrl_cli.jobs.studies.maps import (
     splat_map,
     tsdf_map,
 )
-from splatctrl_cli.jobs.studies.problems import Problem
+from splatctrl_cli.jobs.studies.problems import Problem, ProblemRequest, read_problem
 from splatctrl_cli.jobs.studies.views import Views, views_of
 from splatctrl_cli.jobs.studies.ways import Way, plain_ways
 from splatctrl_cli.planner.configuration_clearance import HasDistance
@@ -142,40 +142,29 @@ class Rig:
 Drive = Callable[[Rig, Map], Attempt]
 
 
-def trials_of(
-    problem: Problem,
-    config: Config,
-    methods: Sequence[str],
-    *,
-    width: int,
-    threads: int,
-    stopwatch: Stopwatch,
-    out: Path | None = None,
-) -> Iterator[Trial]:
-    """Every method that the problem goes through, with every number of cameras; out: as of a `Rig`."""
-    chosen = [name for name in methods if name in FULL or is_in_subset(problem.environment, problem.number)]
+def trials_of(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[Trial]:
+    """Every method that a problem goes through, with every number of cameras."""
+    with stopwatch.stage("problem"):
+        problem = read_problem(request.problem, request.problems)
+    has_all = problem.environment in ENVIRONMENTS and problem.number < SUBSET
+    chosen = [name for name in request.methods if name in FULL or has_all]
     with stopwatch.stage("views"):
-        views = views_of(problem, max(CAMERAS), width=width, num_steps=NUM_STEPS)
+        views = views_of(problem, max(CAMERAS), width=request.width, num_steps=NUM_STEPS)
     robot = judge.measured(problem.model, config)
     for num_cameras in CAMERAS:
         rig = Rig(
             problem=problem,
-            views=views.of_first(num_cameras),
+            views=Views(steps=tuple(step[:num_cameras] for step in views.steps)),
             config=config,
-            threads=threads,
+            threads=request.threads,
             stopwatch=stopwatch,
-            out=out,
+            out=request.out,
         )
         for name in chosen:
             if name != TRUTH:
                 yield trial_of(rig, name, num_cameras, robot)
     if TRUTH in chosen:
         yield trial_of(rig, TRUTH, 0, robot)
-
-
-def is_in_subset(environment: str, number: int) -> bool:
-    """Whether a problem goes through every method."""
-    return environment in ENVIRONMENTS and number < SUBSET
 
 
 def trial_of(rig: Rig, method: str, num_cameras: int, robot: MeasuredRobot) -> Trial:

@@ -32,10 +32,6 @@ class Views:
 
     steps: tuple[Step, ...]
 
-    def of_first(self, num_cameras: int) -> "Views":
-        """Those of the first cameras alone."""
-        return Views(steps=tuple(step[:num_cameras] for step in self.steps))
-
     @property
     def frames(self) -> list[RgbdFrame]:
         """All of them, by time."""

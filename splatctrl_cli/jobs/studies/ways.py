@@ -21,7 +21,7 @@ from splatctrl_cli.field.baker import Planes
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL
 from splatctrl_cli.field.grid_field import GridField
-from splatctrl_cli.jobs.replays.compare import ROUNDING
+from splatctrl_cli.jobs.replays.compare import ROUNDING, Certified
 from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.planner.configuration_clearance import HasDistance
 from splatctrl_cli.planner.path import resampled
@@ -36,13 +36,6 @@ THIN = 0.008  # [m] radius of balls where nothing else leaves a way: surface is 
 LEAST_SHARE = 0.15  # of the margin, at the very last
 SAMPLES = 0.05  # [rad] between postures at which the space is counted that a motion comes to
 ENDS_ROOM = 2 * START_ROOM + 1e-4  # [m] more than the margin, which a start or a goal has to keep
-
-
-@dataclass(frozen=True, kw_only=True)
-class Asked:
-    """A distance as a scene to plan in."""
-
-    distance: DistanceFunction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,13 +79,13 @@ class Surroundings:
         for unseen, is_known in ((self.unseen, True), (self.unseen_behind, False)):
             if unseen is not None:
                 for share, thing in zip(SHARES, things, strict=True):
-                    scene = Asked(distance=_least_of(thing, unseen))
+                    scene = Certified(distance=_least_of(thing, unseen))
                     yield self._way(scene, share * margin, is_known)
         for share, is_thin in ((SHARES[0], False), (SHARES[1], False), (SHARES[1], True), (LEAST_SHARE, True)):
-            scene = Asked(distance=self.things(share * margin, is_thin=is_thin))
+            scene = Certified(distance=self.things(share * margin, is_thin=is_thin))
             yield self._way(scene, share * margin, self.unseen is None)
 
-    def _way(self, scene: Asked, margin: float, is_known: bool) -> Way:
+    def _way(self, scene: Certified, margin: float, is_known: bool) -> Way:
         unseen_on = None if is_known else self.unseen_on
         return Way(scene=scene, margin=margin, in_known_space=is_known, unseen_on=unseen_on)
 

@@ -188,12 +188,6 @@ def driven(
     )
 
 
-def watched(config: Config, recording: Recording, seed: int) -> Drive:
-    """The task in closed loop, on the map that the cameras make of it."""
-    live = LiveMap(recording, config, seed)
-    return driven(recording.robot, config, live.see, live)
-
-
 def held(model: RobotModel, config: Config, alone: Drive, people: Sequence[Primitive], zone: StopZone) -> Drive:
     """The path that the controller takes with nobody there, held by a zone that knows the truth about people."""
     period = config.control.period

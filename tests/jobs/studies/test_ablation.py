@@ -1,6 +1,8 @@
 """What each mechanism is worth: a recording with it off, and the table of what that changes."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -8,14 +10,29 @@ from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.studies import ablation
-from splatctrl_cli.jobs.studies.ablation import ALL, OF_MOTION, OFF, SCAN, TABLE, Measured, measured, problems
-from splatctrl_cli.jobs.studies.ablation_table import notes, sections
+from splatctrl_cli.jobs.studies.ablation import (
+    ALL,
+    OF_MOTION,
+    OFF,
+    SCAN,
+    TABLE,
+    Measured,
+    measured,
+    notes,
+    problems,
+    sections,
+)
+from splatctrl_cli.jobs.studies.problems import ProblemRequest
 
 GOOD = Measured(
     environment=TABLE, number=0, method=ALL, psnr=25.0, depth=0.005, in_front=0.05, splats=4900, fit_s=6.0,
     audit="safe", map_clearance=0.046, true_clearance=0.043, loop="safe", reached=True, loop_clearance=0.022,
     loop_s=4.0, margin=0.02,
 )  # fmt: skip
+
+
+def asked(problem: str, methods: Sequence[str], width: int) -> ProblemRequest:
+    return ProblemRequest(problem=problem, out=Path(), methods=tuple(methods), width=width, threads=1)
 
 
 FAST = (
@@ -47,7 +64,7 @@ def test_without_a_mechanism_the_settings_differ(method: str) -> None:
 @pytest.mark.parametrize("name", ["table-99x", "foo-0001", "table", "table-", "-3"])
 def test_a_name_that_is_none_is_refused(name: str) -> None:
     with pytest.raises(InputError, match=f"--problem {name}: expected ENVIRONMENT-NUMBER"):
-        list(measured(name, [ALL], width=48, threads=1, stopwatch=Stopwatch()))
+        list(measured(asked(name, [ALL], 48), Config(), Stopwatch()))
 
 
 def test_the_problems_are_drawn_and_still() -> None:
@@ -57,7 +74,7 @@ def test_the_problems_are_drawn_and_still() -> None:
 
 @pytest.mark.usefixtures("fast", "without_plots")
 def test_a_recording_goes_through_the_mechanisms_that_it_can_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = list(measured("scan-0001", [ALL, "scale", "second-look"], width=48, threads=1, stopwatch=Stopwatch()))
+    rows = list(measured(asked("scan-0001", [ALL, "scale", "second-look"], 48), Config(), Stopwatch()))
     assert [row.method for row in rows] == [ALL, "scale"] and all(row.number == 1 for row in rows)
     assert all(row.psnr is not None and row.psnr > 8 and row.audit == "" for row in rows)
     assert rows[0].psnr != rows[1].psnr
@@ -66,14 +83,14 @@ def test_a_recording_goes_through_the_mechanisms_that_it_can_show(monkeypatch: p
         raise InputError("no depth")
 
     monkeypatch.setattr(ablation, "_run", refused)
-    (row,) = measured("scan-0001", [ALL], width=48, threads=1, stopwatch=Stopwatch())
+    (row,) = measured(asked("scan-0001", [ALL], 48), Config(), Stopwatch())
     assert row.error == "no depth" and not row.success and row.cause == "no depth"
 
 
 @pytest.mark.usefixtures("fast", "without_plots", "coverage_once")
 def test_a_map_serves_all_that_changes_the_motion_alone() -> None:
     methods = [ALL, "distance-rate"]
-    whole, without = measured("table-0003", methods, width=64, threads=1, stopwatch=Stopwatch())
+    whole, without = measured(asked("table-0003", methods, 64), Config(), Stopwatch())
     assert (whole.method, without.method) == (ALL, "distance-rate") and "distance-rate" in OF_MOTION
     assert whole.psnr is not None and without.psnr is None
     assert without.map_clearance == whole.map_clearance and without.true_clearance == whole.true_clearance

@@ -77,7 +77,7 @@ def test_a_sphere_is_named_whether_a_joint_moves_it_or_not(problem: Problem, vie
     )
     named = sphere_names(problem.model.sphere_set)
     for sphere in (0, len(named) - 1):
-        at = failures.Place(q=HOME, sphere=sphere, point=np.zeros(3), when="")
+        at = judge.Contact(q=HOME, sphere=sphere, point=np.zeros(3), when="")
         assert f"sphere {named[sphere]} at" in failures._caption(failure, at)
 
 

@@ -7,12 +7,13 @@ import pytest
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.jobs.replays.compare import Certified
 from splatctrl_cli.jobs.studies import judge, maps, trial
 from splatctrl_cli.jobs.studies.maps import Map
 from splatctrl_cli.jobs.studies.problems import Problem, read_problem
 from splatctrl_cli.jobs.studies.trial import Rig
 from splatctrl_cli.jobs.studies.views import Views, views_of
-from splatctrl_cli.jobs.studies.ways import Asked, Way, Ways
+from splatctrl_cli.jobs.studies.ways import Way, Ways
 from splatctrl_cli.records import SplatSet
 from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.scene.self_mask import self_mask
@@ -37,7 +38,7 @@ def ways_of(*clear: float) -> Ways:
     """Ways in which everything is so far [m] from everything; the first is in known space."""
     known = (True, False)
     return lambda: (
-        Way(scene=Asked(distance=lambda points, d=d: np.full(len(points), d)), margin=0.02, in_known_space=k)
+        Way(scene=Certified(distance=lambda points, d=d: np.full(len(points), d)), margin=0.02, in_known_space=k)
         for d, k in zip(clear, known, strict=True)
     )
 

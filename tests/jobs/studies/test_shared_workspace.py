@@ -12,8 +12,8 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.verdict import Outcome
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.studies.judge import measured
-from splatctrl_cli.jobs.studies.problems import simulated_arm
-from splatctrl_cli.jobs.studies.rows import TRIALS, read_trials
+from splatctrl_cli.jobs.studies.problem_run import TRIALS, read_trials
+from splatctrl_cli.jobs.studies.problems import ProblemRequest, simulated_arm
 from splatctrl_cli.jobs.studies.study import StudyRequest, run_study
 from splatctrl_cli.jobs.studies.workspace_drives import (
     LABEL_ERROR,
@@ -23,15 +23,19 @@ from splatctrl_cli.jobs.studies.workspace_drives import (
     TruthField,
     held,
 )
-from splatctrl_cli.jobs.studies.workspace_table import NAMES, PAPER, notes, problems, sections
 from splatctrl_cli.jobs.studies.workspace_trial import (
     CONTROLLER,
     METHODS,
+    NAMES,
+    PAPER,
     PERSON_TOUCHED,
     STANDSTILL,
     Setting,
     Visit,
     judged,
+    notes,
+    problems,
+    sections,
     visits_of,
 )
 from splatctrl_cli.records import Intrinsics, RgbdFrame
@@ -180,4 +184,8 @@ def test_a_study_leaves_its_figure_and_its_visits_as_rows(tmp_path: Path) -> Non
 
 def test_a_name_that_is_none_is_refused() -> None:
     with pytest.raises(InputError, match="expected PLACE-NUMBER"):
-        list(visits_of("kitchen-0000", METHODS, Config(), width=32, stopwatch=Stopwatch()))
+        list(
+            visits_of(
+                ProblemRequest(problem="kitchen-0000", out=Path(), methods=METHODS, width=32), Config(), Stopwatch()
+            )
+        )

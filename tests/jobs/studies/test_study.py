@@ -10,8 +10,8 @@ import pytest
 from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome
+from splatctrl_cli.jobs.studies.problem_run import TRIALS, read_trials
 from splatctrl_cli.jobs.studies.problems import archive_of
-from splatctrl_cli.jobs.studies.rows import TRIALS, read_trials
 from splatctrl_cli.jobs.studies.study import FILE, StudyRequest, StudyResult, merged_study, run_study
 from splatctrl_cli.jobs.studies.trial import CAMERAS, OURS, TRUTH, Trial
 from splatctrl_cli.simulate.environments import ENVIRONMENTS

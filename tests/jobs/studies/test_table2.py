@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.jobs.studies.rows import read_trials, write_trials
+from splatctrl_cli.jobs.studies.problem_run import read_trials, write_trials
 from splatctrl_cli.jobs.studies.table2 import NUM_PROBLEMS, PAPER, notes, problems, sections
 from splatctrl_cli.jobs.studies.trial import CAMERAS, OURS, TRUTH, Trial
 from splatctrl_cli.simulate.environments import ENVIRONMENTS
