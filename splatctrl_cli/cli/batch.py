@@ -86,7 +86,8 @@ class OfThisProgram:
         """Words for options by their long names, and the files among them. Raises UsageError for what is none."""
         parser, places, words = _parser_of(command), list[str](), [command]
         given = {"threads": self._threads, **options}
-        actions = {name: _action(parser, command, name) for name in given if name not in OWN or _has(parser, name)}
+        known = [name for name in given if name not in OWN or f"--{name}" in parser._option_string_actions]
+        actions = {name: _action(parser, command, name) for name in known}
         for name, action in actions.items():
             made = _words_of(name, action, given[name], folder)
             places += made if not action.option_strings else []
@@ -135,10 +136,6 @@ def _parser_of(command: str) -> Parser:
     actions = build_parser(command).actions
     assert actions is not None
     return actions.choices[command]
-
-
-def _has(parser: Parser, name: str) -> bool:
-    return f"--{name}" in parser._option_string_actions
 
 
 def _action(parser: Parser, command: str, name: str) -> argparse.Action:
@@ -217,7 +214,8 @@ def _listed(console: Console, args: argparse.Namespace, request: BatchRequest, c
     if not request.suite.is_dir():
         runs = sorted((run for run in runs if run.node in order), key=lambda run: order[run.node])
     if args.csv is not None:
-        console.log(f"wrote {write_csv(args.csv, runs)} runs to {args.csv}")
+        write_csv(args.csv, runs)
+        console.log(f"wrote {len(runs)} runs to {args.csv}")
     rows = [(run.node, run.state, told(run), f"{run.peak_mb:.0f}", run.log) for run in runs]
     lines = table(("node", "state", "outcome", "MB", "log"), rows) if rows else ["no such runs"]
     return console.result({"nodes": [node_document(run) for run in runs]}, lines)

@@ -14,16 +14,17 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.files.output import MARKERS, write_durably, write_json
 from splatctrl_cli.jobs.batches.graph import COMMANDS, CommandLine, Node, nodes_of, of_shard
-from splatctrl_cli.jobs.batches.keys import keys_of
-from splatctrl_cli.jobs.batches.ledger import Ledger, Run
+from splatctrl_cli.jobs.batches.ledger import Ledger, Run, keys_of
 from splatctrl_cli.jobs.batches.run import (
     DONE,
     ERROR,
     FAILED,
     SKIPPED,
+    TO_DO,
+    UNRUN,
     Scheduler,
     local_executor,
-    to_do,
+    not_run,
     told,
     verdict_in,
 )
@@ -159,16 +160,15 @@ def suites_of(result: BatchResult) -> list[Suite]:
     for recording in dict.fromkeys(run.recording for run in result.runs):
         runs = [run for run in result.runs if run.recording == recording]
         began = datetime.fromtimestamp(min(run.started for run in runs), UTC).isoformat(timespec="seconds")
-        cases = [case for run in runs for case in _timed(_cases_of(run, result.out), run.seconds)]
+        cases = [
+            replace(case, seconds=0.0 if number else run.seconds)  # the first case of a node has its time
+            for run in runs
+            for number, case in enumerate(_cases_of(run, result.out))
+        ]
         properties = {} if suites else {"splatctrl": __version__, "batch": result.suite}  # once: readers join suites
         seconds = sum(run.seconds for run in runs)
         suites.append(Suite(name=recording, cases=cases, properties=properties, started=began, seconds=seconds))
     return suites
-
-
-def _timed(cases: Sequence[Case], seconds: float) -> list[Case]:
-    """Cases of a node, of which the first has its time."""
-    return [replace(case, seconds=0.0 if number else seconds) for number, case in enumerate(cases)]
 
 
 def _cases_of(run: Run, out: Path) -> list[Case]:
@@ -197,7 +197,7 @@ def write_batch(
     for node in nodes:
         run = latest.get(node.name)
         if node.name in keys and (run is None or run.key != keys[node.name]):
-            run = to_do(node, out)
+            run = not_run(node, "", out, state=TO_DO, cause=UNRUN)
         found += [] if run is None else [run]
     document = {
         "format": FORMAT,

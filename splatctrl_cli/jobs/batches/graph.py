@@ -183,8 +183,7 @@ def _nodes_of(
                 continue
             for picked in itertools.product(*job.matrix.values()):
                 chosen = dict(zip(job.matrix, picked, strict=True))
-                own = {f"{job.name}.{option}": value for option, value in chosen.items()}
-                variant = {**inherited, **own}
+                variant = {**inherited, **{f"{job.name}.{option}": value for option, value in chosen.items()}}
                 node = _node(recording, job, variant, _suffix(variant, (each for each, _ in jobs)), before, out)
                 values: dict[str, Any] = {each.job: str(each.out) for each in before}
                 values |= {RECORDING: [str(path) for path in recording.paths], NAME: recording.name}
@@ -195,8 +194,9 @@ def _nodes_of(
                 except UsageError as error:
                     where = f"[jobs.{job.name}] of {recording.name}"
                     raise UsageError(f"{where}: {error.message}", remedy=error.remedy) from None
-                node = replace(node, words=parsed.words, inputs=_outside(parsed.inputs, before))
-                made[job.name].append(node)
+                outs = [each.out for each in before if each.out is not None]
+                inputs = (path for path in parsed.inputs if not any(out in (path, *path.parents) for out in outs))
+                made[job.name].append(replace(node, words=parsed.words, inputs=tuple(inputs)))
     nodes = [node for each in made.values() for node in each]
     _check_names(nodes)
     return nodes
@@ -254,12 +254,6 @@ def _node(recording: Recording, job: Job, variant: Variant, suffix: str, before:
         expect=job.expect,
         limits=job.limits,
     )
-
-
-def _outside(inputs: Sequence[Path], before: Sequence[Node]) -> tuple[Path, ...]:
-    """Inputs that no node before makes."""
-    made = [node.out for node in before if node.out is not None]
-    return tuple(path for path in inputs if not any(path == out or out in path.parents for out in made))
 
 
 def _joined(variants: Sequence[Variant]) -> Variant | None:

@@ -1,27 +1,38 @@
-"""What ran in a folder, by node and key, in one SQLite file; who runs what now; and digests of inputs."""
+"""What ran in a folder, by node and key, in one SQLite file; who runs what now; digests of inputs; and what a node's
+result depends on, as one key: its words, the content of its inputs, and the code.
+"""
 
 import csv
 import fcntl
 import hashlib
+import json
 import os
 import re
 import socket
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
+from functools import cache
+from importlib import metadata
 from pathlib import Path
-from typing import Any, Self, TextIO
+from typing import Any, TextIO
 from uuid import uuid4
 
+import splatctrl_cli
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.files.output import sha256, write_durably
+from splatctrl_cli.files.output import PACKAGES, sha256, write_durably
+from splatctrl_cli.jobs.batches.graph import Node
 
 NAME, OWNERS = "ledger.sqlite", ".owners"
 VERSION = 1  # of the tables
 BUSY_S, WAIT_S = 30.0, 0.02  # to wait for another process that writes, and before it is asked again
 _COMPARISON = re.compile(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)")
+WITHOUT_EFFECT = ("--force", "--resume", "--quiet", "-q", "--json")
+THREADS = "--threads"  # changes no byte
+_CODE = {".py", ".so", ".toml", ".json"}
+_MESH = re.compile(r'filename\s*=\s*"([^"]+)"')
 _PATTERN = {"=": "GLOB", "==": "GLOB", "!=": "NOT GLOB"}  # of texts with a *
 
 
@@ -67,7 +78,7 @@ CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, stamp TEXT, digest TE
 """
 
 
-class Ledger:
+class Ledger(AbstractContextManager["Ledger"]):
     """The ledger of the batches that write into one folder; several processes may have it open."""
 
     def __init__(self, folder: Path) -> None:
@@ -102,7 +113,7 @@ class Ledger:
         base.execute(f"PRAGMA user_version = {VERSION}")
         return base
 
-    def close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Give up what is claimed."""
         if self._lock is not None:
             with suppress(sqlite3.Error):
@@ -110,12 +121,6 @@ class Ledger:
             Path(self._lock.name).unlink(missing_ok=True)
             self._lock.close()
         self._base.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def claim(self, node: str) -> bool:
         """Whether this process may run a node: nobody alive does."""
@@ -181,7 +186,8 @@ class Ledger:
         row = self._base.execute("SELECT stamp, digest FROM digests WHERE path = ?", (key,)).fetchone()
         if row is not None and row["stamp"] == stamp:
             return str(row["digest"])
-        digest = _digest_of(path)
+        listing = "\n".join(f"{place.relative_to(path)} {sha256(place)}" for place in _files(path))
+        digest = hashlib.sha256(listing.encode()).hexdigest() if path.is_dir() else sha256(path)
         self._base.execute("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", (key, stamp, digest))
         return digest
 
@@ -216,21 +222,16 @@ class Ledger:
         return False
 
 
-def write_csv(path: Path, runs: Iterable[Run]) -> int:
-    """Runs as a table with a header; how many."""
-    count = 0
+def write_csv(path: Path, runs: Iterable[Run]) -> None:
+    """Runs as a table with a header."""
 
     def write(place: Path) -> None:
-        nonlocal count
         with place.open("w", encoding="utf-8", newline="") as stream:
             writer = csv.writer(stream, lineterminator="\n")
             writer.writerow(COLUMNS)
-            for run in runs:
-                writer.writerow(asdict(run).values())
-                count += 1
+            writer.writerows(asdict(run).values() for run in runs)
 
     write_durably(path, write)
-    return count
 
 
 def _run_of(row: sqlite3.Row) -> Run:
@@ -256,11 +257,73 @@ def _stamp_of(path: Path) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def _digest_of(path: Path) -> str:
-    if not path.is_dir():
-        return sha256(path)
-    return hashlib.sha256("\n".join(f"{p.relative_to(path)} {sha256(p)}" for p in _files(path)).encode()).hexdigest()
-
-
 def _files(folder: Path) -> list[Path]:
+    """None where it is a file."""
     return sorted(place for place in folder.rglob("*") if place.is_file())
+
+
+def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]:
+    """A key for each node, of nodes after those that they need. Raises InputError for an input that is not there."""
+    code, digests = code_version(), dict[Path, str]()
+    keys: dict[str, str] = {}
+    outs = {node.name: str(node.out) for node in nodes}
+    for node in nodes:
+        digests |= {path: _digest(path, ledger) for path in node.inputs if path not in digests}
+        named = {str(path): digests[path] for path in node.inputs}
+        named |= {outs[need]: keys[need] for need in node.needs} | {str(node.out): "out"}
+        inputs = [digests[path] for path in node.inputs] + [keys[need] for need in node.needs]
+        said = [entry, code, node.command, *inputs, *_said(node.words, named)]
+        keys[node.name] = hashlib.sha256(json.dumps(said).encode()).hexdigest()
+    return keys
+
+
+@cache
+def code_version() -> str:
+    """A digest of the package's files, and the versions of the libraries that decide figures."""
+    folder, found = Path(splatctrl_cli.__file__).parent, hashlib.sha256()
+    for place in sorted(place for place in folder.rglob("*") if place.suffix in _CODE):
+        found.update(f"{place.relative_to(folder)}\0".encode() + place.read_bytes())
+    for name in PACKAGES:
+        found.update(f"{name} {metadata.version(name)}\0".encode())
+    return found.hexdigest()
+
+
+def _said(words: Sequence[str], named: Mapping[str, str]) -> Iterator[str]:
+    """Words without those that change no result, paths replaced by what they hold."""
+    longest_first = sorted(named, key=len, reverse=True)
+    skip = False
+    for word in words:
+        if skip or word in WITHOUT_EFFECT:
+            skip = False
+            continue
+        if word.startswith(THREADS):
+            skip = word == THREADS
+            continue
+        said = word
+        for path in longest_first:
+            said = said.replace(path, f"<{named[path]}>")
+        yield said
+
+
+def _digest(path: Path, ledger: Ledger) -> str:
+    """Of an input and what it names: the folder of an image folder's description, the meshes of a URDF."""
+    try:
+        digest = ledger.digest(path.parent if path.suffix == ".toml" and path.parent != Path() else path)
+        if path.suffix != ".urdf":
+            return digest
+        meshes = [place for place in _meshes(path) if place.is_file()]
+        return " ".join([digest, *(ledger.digest(place) for place in meshes)])
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="check the suite's paths") from None
+
+
+def _meshes(urdf: Path) -> Iterator[Path]:
+    """Where the meshes that a URDF names may be: beside it, or below one of the folders above."""
+    for name in dict.fromkeys(_MESH.findall(urdf.read_text(encoding="utf-8", errors="replace"))):
+        if "://" not in name:
+            yield urdf.parent / name
+            continue
+        parts = Path(name.split("://", 1)[1]).parts
+        for folder in urdf.absolute().parents:
+            yield folder.joinpath(*parts)
+            yield folder.joinpath(*parts[1:])

@@ -16,8 +16,7 @@ from typing import Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.jobs.batches.graph import Node
-from splatctrl_cli.jobs.batches.keys import keys_of
-from splatctrl_cli.jobs.batches.ledger import Ledger, Run
+from splatctrl_cli.jobs.batches.ledger import Ledger, Run, keys_of
 from splatctrl_cli.jobs.batches.task import End, Task, last_lines, read_end, run_task, stamp_of, stop_runners
 from splatctrl_cli.jobs.progress import Progress, duration
 
@@ -27,6 +26,7 @@ AGAIN_S = 0.5  # between looks at what another batch runs
 STILL_S = 60.0  # without an end, after which it is said what is waited for
 MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes, when nothing here asked for it
 DISK_FULL = 6
+UNRUN = "has not run since the suite, its inputs or the program changed"
 PRINTED = "printed"  # stands for the stamp of an output that there is none of
 
 
@@ -77,7 +77,9 @@ class Scheduler:
             ended, _ = wait(futures, timeout=AGAIN_S if is_busy else STILL_S, return_when=FIRST_COMPLETED)
             now = time.monotonic()
             if not ended and now - last >= STILL_S:
-                self._tell_of([*futures.values()])
+                names = [node.name for node in futures.values()] or ["what another batch runs"]
+                more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+                self.progress.log(f"batch: still waits for {names[0]}{more}{self.hint()}")
             last = now if ended or now - last >= STILL_S else last
             if is_busy and not futures:
                 time.sleep(AGAIN_S)
@@ -85,7 +87,8 @@ class Scheduler:
             for future in ended:
                 node, end = futures.pop(future), _end_of(future)
                 tries[node.name] += 1
-                if tries[node.name] <= node.limits.retries and _may_pass(end):
+                may_pass = end.exit_code == DISK_FULL or end.cause.startswith(MAY_PASS)
+                if tries[node.name] <= node.limits.retries and may_pass:
                     self.progress.log(f"batch: {node.name}: {end.cause or 'disk full'}, once more")
                     waiting[node.name] = node
                     continue
@@ -98,13 +101,16 @@ class Scheduler:
         """The run that stands: that of before, one that ended unrecorded, or none, for want of what it needs."""
         lacking = [need for need in node.needs if not self.runs[need].stamp]
         if lacking:
-            run = _skipped(node, key, lacking[0], self.ledger.folder)
+            cause = f"needs {lacking[0]}, which left nothing"
+            run = not_run(node, key, self.ledger.folder, state=SKIPPED, cause=cause)
             if before is None or (before.state, before.key) != (SKIPPED, key):
                 self.ledger.record(run)
             return run
         if self.again:
             return None
-        if before is not None and before.key == key and before.state in (DONE, FAILED) and _stands(node, before):
+        is_same = before is not None and before.key == key and before.state in (DONE, FAILED)
+        # neither stamp is there where an error was expected
+        if before is not None and is_same and (node.out is None or before.stamp == stamp_of(node.out)):
             self.num_kept += 1
             judged = _judged_again(before, node)
             if judged != before:
@@ -124,12 +130,6 @@ class Scheduler:
         line = clock.passed(run)
         if run.started >= clock.started or run.state == SKIPPED:
             self.progress.log(f"{line} {node.name}: {told(run)}{clock.left()}")
-
-    def _tell_of(self, nodes: Sequence[Node]) -> None:
-        """What is waited for."""
-        names = [node.name for node in nodes] or ["what another batch runs"]
-        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-        self.progress.log(f"batch: still waits for {names[0]}{more}{self.hint()}")
 
     def _task(self, node: Node, key: str) -> Task:
         return Task(
@@ -258,14 +258,6 @@ def _end_of(future: "Future[End]") -> End:
         return End.without_one("", f"lost: {type(error).__name__}: {error}"[:200])
 
 
-def _may_pass(end: End) -> bool:
-    return end.exit_code == DISK_FULL or end.cause.startswith(MAY_PASS)
-
-
-def _stands(node: Node, run: Run) -> bool:
-    return node.out is None or run.stamp == stamp_of(node.out)  # neither is there where an error was expected
-
-
 def verdict_in(result: Path) -> dict[str, Any]:
     """The verdict in a command's JSON, empty where it has none."""
     with suppress(OSError, ValueError):
@@ -275,12 +267,6 @@ def verdict_in(result: Path) -> dict[str, Any]:
     return {}
 
 
-def _skipped(node: Node, key: str, need: str, folder: Path) -> Run:
-    end = End.without_one(key, f"needs {need}, which left nothing")
-    return replace(run_of(node, key, end, folder), state=SKIPPED)
-
-
-def to_do(node: Node, folder: Path) -> Run:
-    """Of a node that has not run as it is now."""
-    end = End.without_one("", "has not run since the suite, its inputs or the program changed")
-    return replace(run_of(node, "", end, folder), state=TO_DO)
+def not_run(node: Node, key: str, folder: Path, *, state: str, cause: str) -> Run:
+    """Of a node that has not run, and why."""
+    return replace(run_of(node, key, End.without_one(key, cause), folder), state=state)

@@ -181,12 +181,17 @@ def _checked(request: FitRequest) -> FitRequest:
     return replace(request, recording=recording, iterations=iterations)
 
 
+def known_scans(root: Path) -> list[str]:
+    """The names of the scans in a DTU tree, in MVSNet's layout or in IDR's."""
+    found = idr_scans(root) if not (root / "Rectified").is_dir() else {}
+    return list(found or scan_folders(root))
+
+
 def _scans(recording: RecordingRequest) -> list[str]:
     root = recording.path
     if not recording.is_dtu:
         return [root.stem]
-    found = idr_scans(root) if not (root / "Rectified").is_dir() else {}
-    known = list(found or scan_folders(root))
+    known = known_scans(root)
     wanted = chosen(known, recording.scan, root, "scan")
     if not wanted:
         raise InputError(f"{root}: no scan", remedy=f"scans: {', '.join(known) or 'none is there'}")

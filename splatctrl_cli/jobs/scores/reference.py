@@ -1,6 +1,6 @@
 """What `score` compares with: the recording, which of its views are scored by which protocol, and their masks."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -106,21 +106,19 @@ def _dtu_reference(recording: RecordingRequest, progress: Progress) -> Reference
     )
 
 
-def missing_views(source: DtuSource, protocol: ScoreProtocol | None) -> list[str]:
+def missing_views(source: DtuSource, protocol: ScoreProtocol | None) -> Iterator[str]:
     """In words, which views of the scan are not there, where that changes which are scored, or that lack depth."""
     numbers = sorted({*source.split.training, *source.split.scored, *source.split.left_out})
     missing = sorted(set(range(numbers[-1] + 1)) - set(numbers))
-    lines = []
     if missing and protocol is not None and protocol.every:
         listed = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
-        lines.append(
+        yield (
             f"{source.name}: views {listed} are not there: '{protocol.name}' counts those that are, and scores others"
             " than of a whole scan; add the views, or name those to score as holdout:0,8"
         )
     if source.has_depth and source.loss.notes:
         more = len(source.loss.notes) - 1
-        lines.append(source.loss.notes[0] + (f" (and {more} more)" if more else ""))
-    return lines
+        yield source.loss.notes[0] + (f" (and {more} more)" if more else "")
 
 
 def _mask_of(source: DtuSource, wanted: str) -> tuple[Mask | None, str]:

@@ -35,7 +35,7 @@ from splatctrl_cli.jobs.scores.reference import (
     open_reference,
     recording_check,
 )
-from splatctrl_cli.jobs.scores.views import CloudSettings, Ranked, Scorer, Scores, cloud_figures
+from splatctrl_cli.jobs.scores.views import CloudSettings, Scorer, Scores, cloud_figures
 from splatctrl_cli.records import Label
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, view_picture
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, run_value
@@ -177,7 +177,9 @@ def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) 
     if folder:
         _write_table(folder / "views.csv", report["views"])
         with stopwatch.stage("pictures"):
-            _draw_extremes(folder, {} if request.images == "none" else scores.extremes)
+            for (_, best), (_, worst) in scores.extremes.values() if request.images != "none" else ():
+                comparison = [best] if worst.title == best.title else [best, worst]
+                comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
         config = {"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol}
         made = request.scene if request.scene.is_file() else request.scene / "splats.ply"
         inputs = {**digests, f"scene/{made.name}": sha256(made)}
@@ -211,12 +213,6 @@ def _report(
             {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in views
         ],
     }
-
-
-def _draw_extremes(folder: Path, extremes: Mapping[str, tuple[Ranked, Ranked]]) -> None:
-    for (_, best), (_, worst) in extremes.values():
-        comparison = [best] if worst.title == best.title else [best, worst]
-        comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
 
 
 def _protocol(reference: Reference, scene: SceneFolder, scores: Scores, lpips: str | None) -> dict[str, Any]:

@@ -266,8 +266,7 @@ def _surface(scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int, spac
     `spacing` [m] apart."""
     splats = final_splats(scene)
     splats = splats.select(splats.labels != Label.ROBOT)
-    parts = []
-    for frame in frames:
-        depth = rendered(splats, frame.intrinsics, frame.T_world_camera, threads).normalised_depth()
-        parts.append(thinned(surface_points(replace(frame, depth=depth))[0], spacing / 2))
+    shown = (rendered(splats, frame.intrinsics, frame.T_world_camera, threads) for frame in frames)
+    seen = (replace(f, depth=image.normalised_depth()) for f, image in zip(frames, shown, strict=True))
+    parts = [thinned(surface_points(frame)[0], spacing / 2) for frame in seen]
     return spaced(np.concatenate(parts), spacing) if parts else np.empty((0, 3))

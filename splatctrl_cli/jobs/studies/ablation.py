@@ -240,7 +240,11 @@ def sections(trials: Sequence[Measured]) -> Iterator[tuple[str, Sequence[str], R
         if of:
             count = len({trial.number for trial in of})
             header = (*HEADER, *(OF_TABLE if environment == TABLE else ()))
-            yield f"{title} ({count} of {NUM_PROBLEMS[environment]}); differences to all of it", header, _rows(of)
+            yield (
+                f"{title} ({count} of {NUM_PROBLEMS[environment]}); differences to all of it",
+                header,
+                list(_rows(of)),
+            )
 
 
 def notes(trials: Sequence[Measured]) -> Iterator[str]:
@@ -255,14 +259,12 @@ def notes(trials: Sequence[Measured]) -> Iterator[str]:
     yield from (f"{trial.label}: {trial.error}" for trial in failed[:5])
 
 
-def _rows(trials: Sequence[Measured]) -> Rows:
+def _rows(trials: Sequence[Measured]) -> Iterator[Sequence[str]]:
     by_method = {m: {t.number: t for t in trials if t.method == m} for m in OFF}
     everything = by_method.pop(ALL)
-    rows = [_row(ALL, list(everything.values()), None)] if everything else []
-    for method, found in by_method.items():
-        if found:
-            rows.append(_row(method, list(found.values()), everything))
-    return rows
+    if everything:
+        yield _row(ALL, list(everything.values()), None)
+    yield from (_row(method, list(found.values()), everything) for method, found in by_method.items() if found)
 
 
 def _row(method: str, found: Sequence[Measured], beside: Mapping[int, Measured] | None) -> Sequence[str]:

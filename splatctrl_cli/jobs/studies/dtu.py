@@ -8,8 +8,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from splatctrl_cli.config import Config, load_config
-from splatctrl_cli.datasets.dtu import scan_folders
-from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.errors import InputError, SplatCtrlError
 from splatctrl_cli.evaluate.proportions import mean_between
 from splatctrl_cli.evaluate.protocols import SURFACE_SCANS
@@ -18,8 +16,7 @@ from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.reconstructions.gaussians import reconstruct_gaussians
 from splatctrl_cli.jobs.reconstructions.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.scores.fit import METHODS as COMPARED
-from splatctrl_cli.jobs.scores.fit import PROTOCOL
+from splatctrl_cli.jobs.scores import fit
 from splatctrl_cli.jobs.scores.score import ScoreRequest, score
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
 from splatctrl_cli.jobs.studies.problems import ProblemRequest, named
@@ -87,7 +84,7 @@ def problems(trials: int | None, root: Path | None) -> list[tuple[str, int]]:
     """
     if root is None:
         return [(SIMULATED, n) for n in range(min(NUM_SIMULATED, trials or NUM_SIMULATED))]
-    found = {_number(name) for name in _names(root)}
+    found = {_number(name) for name in fit.known_scans(root)}
     if not found:
         raise InputError(f"{root}: no scan", remedy="give the root of a DTU tree, in MVSNet's layout or in IDR's")
     wanted = [n for n in SURFACE_SCANS if n in found] or sorted(found)
@@ -106,10 +103,10 @@ def fits(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Itera
                 simulate(SimulateRequest(out=folder / "scan", options=RecordingOptions(duration_s=0.6), dtu=True))
             scan = RecordingRequest(path=folder / "scan" / "dtu", is_dtu=True, protocol=HELD_OUT)
         else:
-            there = [each for each in _names(root) if _number(each) == number]
+            there = [each for each in fit.known_scans(root) if _number(each) == number]
             if not there:
                 raise InputError(f"{root}: has no scan {number}", remedy="give the tree that the study began with")
-            scan = RecordingRequest(path=root, is_dtu=True, scan=there[0], protocol=PROTOCOL)
+            scan = RecordingRequest(path=root, is_dtu=True, scan=there[0], protocol=fit.PROTOCOL)
         for method in request.methods:
             row = Fit(environment=environment, number=number, method=method)
             with stopwatch.stage(method):
@@ -142,14 +139,8 @@ def _fit(row: Fit, scan: RecordingRequest, out: Path, threads: int) -> Fit:
     )
 
 
-def _names(root: Path) -> list[str]:
-    found = idr_scans(root) if not (root / "Rectified").is_dir() else {}
-    return list(found or scan_folders(root))
-
-
 def _number(scan: str) -> int:
-    digits = "".join(c for c in scan if c.isdigit())
-    return int(digits or 0)
+    return int("".join(c for c in scan if c.isdigit()) or 0)
 
 
 HEADER = ("", "scans", "PSNR [dB]", "95 %", "seen [dB]", "SSIM", "depth error [mm]", "splats", "fit [s]")
@@ -159,7 +150,7 @@ def sections(trials: Sequence[Fit]) -> Iterator[tuple[str, Sequence[str], Sequen
     """Title, header and rows: the means over scans, the paper's beside them, and each budget less the baseline."""
     rows: list[Sequence[str]] = [
         (f"{about.name} (the paper)", "", f"{about.psnr:.2f}", "", "", "", "", about.splats, "")
-        for about in COMPARED.values()
+        for about in fit.METHODS.values()
     ]
     for method in METHODS:
         found = [trial for trial in trials if trial.method == method and not trial.error]
@@ -183,14 +174,14 @@ def _kind(trials: Sequence[Fit]) -> str:
 
 
 def _means(found: Sequence[Fit]) -> Sequence[str]:
-    mean, low, high = mean_between([fit.psnr for fit in found if fit.psnr is not None])
+    mean, low, high = mean_between([row.psnr for row in found if row.psnr is not None])
     cells = [f"{mean:.2f}", _between(low, high, ".2f")]
     for values, form, factor in (
-        ([fit.psnr_seen for fit in found], ".2f", 1.0),
-        ([fit.ssim for fit in found], ".3f", 1.0),
-        ([fit.depth for fit in found], ".1f", 1e3),
-        ([fit.splats for fit in found], ",.0f", 1.0),
-        ([fit.seconds for fit in found], ".1f", 1.0),
+        ([row.psnr_seen for row in found], ".2f", 1.0),
+        ([row.ssim for row in found], ".3f", 1.0),
+        ([row.depth for row in found], ".1f", 1e3),
+        ([row.splats for row in found], ",.0f", 1.0),
+        ([row.seconds for row in found], ".1f", 1.0),
     ):
         there = [factor * value for value in values if value is not None]
         cells.append(f"{np.mean(there):{form}}" if there else "-")

@@ -7,9 +7,9 @@ from textwrap import shorten
 import numpy as np
 
 from splatctrl_cli.control.arm import sphere_names
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.studies import judge
-from splatctrl_cli.jobs.studies.problems import Problem
-from splatctrl_cli.jobs.studies.views import Views
+from splatctrl_cli.jobs.studies.problems import Problem, Views
 from splatctrl_cli.planner.configuration_clearance import HasDistance
 from splatctrl_cli.records import Float32, Float64
 from splatctrl_cli.report import trial_picture as drawn
@@ -86,12 +86,10 @@ def _shown(problem: Problem, centers: Float32, radii: Float32) -> tuple[Float32,
 
 
 def _balls(link: str, centers: Float32 | Float64, radii: Float32 | Float64) -> list[Shape]:
-    made = []
-    for center, radius in zip(centers, radii, strict=True):
-        T = np.eye(4)
-        T[:3, 3] = center
-        made.append(Shape(link=link, kind="sphere", size=(float(radius),), T_link_shape=T))
-    return made
+    return [
+        Shape(link=link, kind="sphere", size=(float(radius),), T_link_shape=pose_at(center))
+        for center, radius in zip(centers, radii, strict=True)
+    ]
 
 
 def _place(failure: Failure) -> judge.Contact:

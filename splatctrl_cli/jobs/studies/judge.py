@@ -20,8 +20,7 @@ from splatctrl_cli.jobs.replays.metrics import metrics_of
 from splatctrl_cli.jobs.replays.modes import replayed
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.verdict import replay_verdict
-from splatctrl_cli.jobs.studies.problems import Problem
-from splatctrl_cli.jobs.studies.views import Views
+from splatctrl_cli.jobs.studies.problems import Problem, Views
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges

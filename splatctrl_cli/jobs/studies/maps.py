@@ -19,8 +19,7 @@ from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
 from splatctrl_cli.jobs.replays.compare import ROUNDING, Certified
 from splatctrl_cli.jobs.replays.known_scene import KnownScene, known_space, seen_of, splat_fields
-from splatctrl_cli.jobs.studies.problems import Problem
-from splatctrl_cli.jobs.studies.views import Step, Views
+from splatctrl_cli.jobs.studies.problems import Problem, Step, Views
 from splatctrl_cli.jobs.studies.ways import (
     Surroundings,
     Ways,

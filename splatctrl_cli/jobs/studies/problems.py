@@ -1,4 +1,6 @@
-"""The problems of a study: drawn environments by their seed, and those of MotionBenchMaker from their archive."""
+"""The problems of a study: drawn environments by their seed, and those of MotionBenchMaker from their archive; and
+what its cameras see of one: an arm at rest, through depth cameras that stand nearly where they say.
+"""
 
 import os
 import tarfile
@@ -10,16 +12,22 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.geometry import back_project, pose_at, transform_from, transform_points
 from splatctrl_cli.jobs.simulated_task import solids_of, task_of
 from splatctrl_cli.planner.solid_scene import Solids
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
-from splatctrl_cli.simulate.environments import ENVIRONMENTS, drawn_texture
+from splatctrl_cli.simulate.depth_camera import DepthNoise
+from splatctrl_cli.simulate.environments import ENVIRONMENTS, drawn_texture, ring_of_cameras
 from splatctrl_cli.simulate.primitives import Primitive
+from splatctrl_cli.simulate.recording import START_NS
+from splatctrl_cli.simulate.render import Camera, Renderer
+from splatctrl_cli.simulate.tabletop import arm_solids
+from splatctrl_cli.sources.calibrated import Perturbation
 
 ARCHIVE, ROBOT = "problems.tar.bz2", "panda_spherized.urdf"  # of MotionBenchMaker, in one folder
 DATA = "SPLATCTRL_REAL_DATA"  # the folder that may hold vamp_panda
@@ -33,6 +41,11 @@ ROOM = {  # size and middle [m] of floor and walls: what stands behind everythin
     "wall_left": ((4.8, 0.05, 4.0), (0.1, 2.00, 0.20)),
     "wall_right": ((4.8, 0.05, 4.0), (0.1, -2.00, 0.20)),
 }
+D435 = DepthNoise(baseline=0.05, max_range=6.0)
+POSE_ERROR, POSE_TURN = 0.001, 0.05  # [m], [degrees] of each camera: somewhat more than `calibrate` leaves
+STEP_NS = 200_000_000  # [ns] between time steps
+SEEN_WITHIN = 0.02  # [m] of a measured point: a voxel
+Step = tuple[RgbdFrame, ...]
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -131,13 +144,16 @@ def read_problem(name: str, archive: Path | None) -> Problem:
 
 def room() -> list[Primitive]:
     """Floor and walls: without them a camera that looks past the things gets no depth, and nothing is known there."""
-    made = []
-    for number, (name, (size, middle)) in enumerate(ROOM.items()):
-        T = np.eye(4)
-        T[:3, 3] = middle
-        drawn = drawn_texture(np.random.default_rng(number))
-        made.append(Primitive(name=name, kind="box", size=size, T_world_shape=T, texture=drawn))
-    return made
+    return [
+        Primitive(
+            name=name,
+            kind="box",
+            size=size,
+            T_world_shape=pose_at(middle),
+            texture=drawn_texture(np.random.default_rng(number)),
+        )
+        for number, (name, (size, middle)) in enumerate(ROOM.items())
+    ]
 
 
 def simulated_arm() -> RobotModel:
@@ -232,3 +248,69 @@ def _posture(by_name: Mapping[str, float], model: RobotModel, where: str) -> Flo
             remedy=f"give the folder with the robot of these problems as {ROBOT}",
         )
     return np.array([by_name[name] for name in model.joint_names], dtype=np.float64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Views:
+    """Time steps of frames, one of each camera, with the arm at rest at the problem's start."""
+
+    steps: tuple[Step, ...]
+
+    @property
+    def frames(self) -> list[RgbdFrame]:
+        """All of them, by time."""
+        return [frame for step in self.steps for frame in step]
+
+    def has_seen(self, points_world: Float64) -> list[bool]:
+        """Whether a camera measured something within `SEEN_WITHIN` of points (Q, 3)."""
+        measured = np.concatenate([_points(frame) for frame in self.steps[0]])
+        away = cKDTree(measured).query(points_world)[0] if len(measured) else np.full(len(points_world), np.inf)
+        return [bool(each <= SEEN_WITHIN) for each in np.asarray(away)]
+
+
+def views_of(problem: Problem, num_cameras: int, *, width: int, num_steps: int) -> Views:
+    """What the first cameras of the ring see, with noise, and poses as a calibration has them."""
+    cameras = ring_of_cameras(num_cameras, width, 3 * width // 4)
+    arm = solids_at(problem.model, problem.start)
+    return recorded(cameras, problem.primitives, arm, seed=problem.number, num_steps=num_steps)
+
+
+def solids_at(model: RobotModel, q: Float64) -> list[Primitive]:
+    """An arm's shapes as solids at joint positions q (J,)."""
+    return arm_solids(model.urdf.shapes, {link: model.frame_pose(q, link) for link in model.urdf.links})
+
+
+def recorded(
+    cameras: Sequence[Camera],
+    primitives: Sequence[Primitive],
+    arm: Sequence[Primitive],
+    *,
+    seed: int,
+    num_steps: int,
+    first: int = 0,
+) -> Views:
+    """Time steps of frames from the step `first` on, with the noise and the errors of the poses that a seed draws."""
+    images = [Renderer(camera, primitives, color_rays=0).image(arm) for camera in cameras]
+    calibrated = Perturbation(pose_error=POSE_ERROR, pose_turn=POSE_TURN, seed=seed)
+    poses = [calibrated.pose(camera.name, camera.T_world_camera) for camera in cameras]
+
+    def frame(step: int, number: int) -> RgbdFrame:
+        camera, (color, depth) = cameras[number], images[number]
+        rng = np.random.default_rng([seed, number, step])
+        return RgbdFrame(
+            stamp_ns=START_NS + STEP_NS * step,
+            camera=camera.name,
+            color=color,
+            depth=D435.applied(depth, rng, focal=camera.intrinsics.fx),
+            intrinsics=camera.intrinsics,
+            T_world_camera=poses[number],
+        )
+
+    steps = range(first, first + num_steps)
+    return Views(steps=tuple(tuple(frame(step, n) for n in range(len(cameras))) for step in steps))
+
+
+def _points(frame: RgbdFrame) -> Float64:
+    """(Q, 3) [m], world, that a frame measured."""
+    points = back_project(frame.intrinsics, frame.depth)[frame.depth > 0]
+    return np.asarray(transform_points(frame.T_world_camera, points))

@@ -49,11 +49,12 @@ Rows = Sequence[Sequence[str]]
 def sections(trials: Sequence[Transport]) -> Iterator[tuple[str, Sequence[str], Rows]]:
     """Title, header and rows: success, the panels of Fig. 7, verdicts, failures by cause, tests in pairs."""
     num = len({(trial.layout, trial.number) for trial in trials})
-    yield f"The cube over the bowl ({num} scenes, {RUNS} runs each)", SUCCESS, _successes(trials)
-    yield "Of the successful runs: mean and its 95 % interval", ("method", *(n for n, _ in PANELS)), _panels(trials)
-    yield "Judged by the map alone, at 2 cm", JUDGED, _judged(trials)
+    yield f"The cube over the bowl ({num} scenes, {RUNS} runs each)", SUCCESS, list(_successes(trials))
+    panels = ("method", *(name for name, _ in PANELS))
+    yield "Of the successful runs: mean and its 95 % interval", panels, list(_panels(trials))
+    yield "Judged by the map alone, at 2 cm", JUDGED, list(_judged(trials))
     yield "Failures by cause", ("method", "runs", "cause"), _causes(trials)
-    yield f"The same runs: {NAMES[QP_IK]}, less another", PAIRED, _pairs(trials)
+    yield f"The same runs: {NAMES[QP_IK]}, less another", PAIRED, list(_pairs(trials))
 
 
 def notes(trials: Sequence[Transport]) -> Iterator[str]:
@@ -79,8 +80,7 @@ def _there(trials: Sequence[Transport]) -> list[str]:
     return [method for method in METHODS if any(trial.method == method for trial in trials)]
 
 
-def _successes(trials: Sequence[Transport]) -> Rows:
-    rows = []
+def _successes(trials: Sequence[Transport]) -> Iterator[Sequence[str]]:
     for method in _there(trials):
         of = [trial for trial in trials if trial.method == method]
         share = share_of(sum(trial.success for trial in of), len(of))
@@ -90,39 +90,29 @@ def _successes(trials: Sequence[Transport]) -> Rows:
             near, least = sum(value < EPSILON for value in known), min(known, default=np.nan)
             cells.append((f"{near}/{len(known)}", f"{100 * least:.1f}"))
         succeeded, words = PAPER.get(method, (None, ""))
-        rows.append(
-            (
-                NAMES[method],
-                f"{share.num_successes}/{share.num}",
-                f"{100 * share.low:.0f} to {100 * share.high:.0f} %",
-                *(near for near, _ in cells),
-                *(least for _, least in cells),
-                "" if succeeded is None else f"{succeeded}/{NUM_PAPER}; {words}",
-            )
+        yield (
+            NAMES[method],
+            f"{share.num_successes}/{share.num}",
+            f"{100 * share.low:.0f} to {100 * share.high:.0f} %",
+            *(near for near, _ in cells),
+            *(least for _, least in cells),
+            "" if succeeded is None else f"{succeeded}/{NUM_PAPER}; {words}",
         )
-    return rows
 
 
-def _panels(trials: Sequence[Transport]) -> Rows:
-    rows = []
+def _panels(trials: Sequence[Transport]) -> Iterator[Sequence[str]]:
     for method in _there(trials):
         of = [trial for trial in trials if trial.method == method and trial.success]
-        cells = []
-        for _, value in PANELS:
-            mean, low, high = mean_between([v for v in map(value, of) if v is not None])
-            cells.append(f"{mean:.2f} [{low:.2f}, {high:.2f}]")
-        rows.append((NAMES[method], *cells))
-    return rows
+        known = ([v for v in map(value, of) if v is not None] for _, value in PANELS)
+        yield NAMES[method], *("{:.2f} [{:.2f}, {:.2f}]".format(*mean_between(values)) for values in known)
 
 
-def _judged(trials: Sequence[Transport]) -> Rows:
-    rows = []
+def _judged(trials: Sequence[Transport]) -> Iterator[Sequence[str]]:
     for method in _there(trials):
         of = [trial for trial in trials if trial.method == method and trial.verdict]
         false, counts = sum(trial.is_false_green for trial in of), Counter(trial.verdict for trial in of)
         safe, unknown = counts["safe"], counts["not evaluable"]
-        rows.append((NAMES[method], *map(str, (len(of), safe, false, unknown, len(of) - safe - unknown))))
-    return rows
+        yield NAMES[method], *map(str, (len(of), safe, false, unknown, len(of) - safe - unknown))
 
 
 def _causes(trials: Sequence[Transport]) -> Rows:
@@ -130,9 +120,9 @@ def _causes(trials: Sequence[Transport]) -> Rows:
     return [(NAMES[method], str(counts[method, cause]), cause) for method, cause in sorted(counts)]
 
 
-def _pairs(trials: Sequence[Transport]) -> Rows:
+def _pairs(trials: Sequence[Transport]) -> Iterator[Sequence[str]]:
     """Of runs in which both methods succeeded; of success of all."""
-    rows, by = list[Sequence[str]](), {(t.layout, t.number, t.run, t.method): t for t in trials}
+    by = {(t.layout, t.number, t.run, t.method): t for t in trials}
     for method in _there(trials):
         pairs = [
             (by[l, n, r, QP_IK], by[l, n, r, method]) for l, n, r, m in by if m == method and (l, n, r, QP_IK) in by
@@ -141,13 +131,12 @@ def _pairs(trials: Sequence[Transport]) -> Rows:
             continue
         test = paired([(a.success, b.success) for a, b in pairs])
         alone = f"{test.only_first} and {test.only_second} alone"
-        rows.append((NAMES[method], "succeeded", str(test.num), alone, "", "", f"{test.p_value:.2g} (McNemar)"))
+        yield NAMES[method], "succeeded", str(test.num), alone, "", "", f"{test.p_value:.2g} (McNemar)"
         both = [(a, b) for a, b in pairs if a.success and b.success]
         for name, value in PANELS:
             differences = [x - y for a, b in both if (x := value(a)) is not None and (y := value(b)) is not None]
             if np.any(differences):
-                rows.append((NAMES[method], name, str(len(differences)), *signed_rank(differences)))
-    return rows
+                yield NAMES[method], name, str(len(differences)), *signed_rank(differences)
 
 
 def _cm(metres: float | None) -> float | None:

@@ -12,16 +12,15 @@ import numpy as np
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.replay import ReplayTask
 from splatctrl_cli.errors import SplatCtrlError
-from splatctrl_cli.evaluate.verdict import Outcome as Judgement
-from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.evaluate.verdict import Outcome, Verdict
 from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.simulated_task import solids_of
 from splatctrl_cli.jobs.studies import judge
 from splatctrl_cli.jobs.studies.maps import Fitted, Map, splat_map, workspace_of
-from splatctrl_cli.jobs.studies.problems import Problem, ProblemRequest, room
+from splatctrl_cli.jobs.studies.problems import Problem, ProblemRequest, Views, recorded, room, solids_at
 from splatctrl_cli.jobs.studies.scenes import HAND, Scene, read_scene
 from splatctrl_cli.jobs.studies.trial import Attempt, Drive, Rig, by_controller, by_planner
-from splatctrl_cli.jobs.studies.views import Views, recorded, solids_at
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
 from splatctrl_cli.planner.path import effector_length, joint_length, least_clearance
@@ -47,7 +46,7 @@ RUNS = 2  # of each method in each scene, with other noise, errors of the camera
 MARGIN = 0.036  # [m] that the methods keep from the map: 2 cm, and what it errs by
 NUM_STEPS = 5  # of each camera, with the arm at home and once the cube is lifted
 NO_GRASP, HIT_GRASPING = "no posture about the cube", "collision while the cube is taken"
-RANKS = {Judgement.PASSED: 0, Judgement.NOT_EVALUABLE: 1, Judgement.FAILED: 2}
+RANKS = {Outcome.PASSED: 0, Outcome.NOT_EVALUABLE: 1, Outcome.FAILED: 2}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,16 +244,15 @@ class Trial:
         self, fitter: SceneFitter, views: Views, q: Float64, carried: Sequence[tuple[str, Box]] = ()
     ) -> list[AuditRow]:
         """Take in views with the arm at q (J,), and boxes that it carries, which count as its own."""
-        model, rows = self._scene.model, list[AuditRow]()
-        for step in views.steps:
-            rows.append(fitter.step(step, posture_of(model, q, {frame.stamp_ns: q for frame in step}, carried)))
-        return rows
+        return [
+            fitter.step(step, posture_of(self._scene.model, q, {frame.stamp_ns: q for frame in step}, carried))
+            for step in views.steps
+        ]
 
 
 def _held_cube(scene: Scene, q: Float64) -> Primitive:
     """The cube in the hand at q (J,)."""
-    T_hand_cube = np.eye(4)
-    T_hand_cube[:3, 3] = (HELD.lower + HELD.upper) / 2
+    T_hand_cube = pose_at((HELD.lower + HELD.upper) / 2)
     return replace(scene.drawn.cube, T_world_shape=scene.model.frame_pose(q, HAND) @ T_hand_cube)
 
 
@@ -272,7 +270,7 @@ def _with_ways(row: Transport, ways: Sequence[Way], period: float) -> Transport:
     return replace(
         row,
         verdict=worst.label,
-        is_false_green=any(way.verdict.outcome is Judgement.PASSED and way.execution.has_collided for way in ways),
+        is_false_green=any(way.verdict.outcome is Outcome.PASSED and way.execution.has_collided for way in ways),
         outcome=row.outcome or ways[-1].outcome,
         reason=row.reason or (str(worst.decisive[0]) if worst.decisive else ""),
         true_clearance=min(way.execution.clearance for way in ways),

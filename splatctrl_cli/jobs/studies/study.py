@@ -10,9 +10,8 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.files.output import check_can_be_written, write_durably, write_json
 from splatctrl_cli.jobs.batches.batch import check_same_asked, scheduling, write_batch
-from splatctrl_cli.jobs.batches.graph import CommandLine, Node, nodes_of, of_shard
-from splatctrl_cli.jobs.batches.keys import keys_of
-from splatctrl_cli.jobs.batches.ledger import Ledger, Run
+from splatctrl_cli.jobs.batches.graph import CommandLine, nodes_of, of_shard
+from splatctrl_cli.jobs.batches.ledger import Ledger, Run, keys_of
 from splatctrl_cli.jobs.batches.run import DONE, FAILED
 from splatctrl_cli.jobs.batches.suite import Job, Recording, Suite
 from splatctrl_cli.jobs.progress import SILENT, Progress
@@ -102,7 +101,8 @@ def run_study(request: StudyRequest, command_line: CommandLine, progress: Progre
                 write_batch(out, suite, nodes, ledger.latest(), scheduler.keys)
         latest, keys = ledger.latest(), keys_of(nodes, ledger, command_line.entry)
     lacking = [node.name for node in nodes if not _is_done(latest.get(node.name), keys[node.name])]
-    trials = [] if lacking else [trial for node in nodes for trial in _trials_in(node, study)]
+    tables = [node.out / TRIALS for node in nodes if node.out is not None and not lacking]
+    trials = [trial for table in tables for trial in read_trials(table, study.row)]
     if not lacking:
         _write(out, study, trials)
         page = out.with_name(f"{out.name}.html")
@@ -185,11 +185,6 @@ def _suite(
 
 def _is_done(run: Run | None, key: str) -> bool:
     return run is not None and run.key == key and run.state in (DONE, FAILED)
-
-
-def _trials_in(node: Node, study: Study[Any]) -> list[Row]:
-    assert node.out is not None
-    return list[Row](read_trials(node.out / TRIALS, study.row))
 
 
 def _verdict(trials: Sequence[Row], lacking: Sequence[str], latest: Mapping[str, Run], num_problems: int) -> Verdict:

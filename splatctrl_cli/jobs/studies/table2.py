@@ -56,16 +56,16 @@ def sections(trials: Sequence[Trial]) -> Iterator[tuple[str, Sequence[str], Rows
         of = [trial for trial in trials if trial.environment == environment]
         if of:
             full = f"{len({t.number for t in of})} of {NUM_PROBLEMS[environment]} problems"
-            yield f"{TITLES[environment]} ({full}), success [%]", header, _rates(of, environment)
+            yield f"{TITLES[environment]} ({full}), success [%]", header, list(_rates(of, environment))
     drawn = [trial for trial in trials if trial.environment in ENVIRONMENTS]
     if len({trial.environment for trial in drawn}) == len(ENVIRONMENTS):
-        yield "The three, weighted by the paper's counts, success [%]", header, _averages(drawn)
+        yield "The three, weighted by the paper's counts, success [%]", header, list(_averages(drawn))
     archive = [trial for trial in trials if trial.environment in FAMILIES]
     if archive:
         full = f"{len({(t.environment, t.number) for t in archive})} of {len(FAMILIES) * PER_FAMILY} problems"
-        yield f"{FAMILY} ({full}), success [%]", header, _rates(archive, "")
-    yield "Judged by the map alone", _JUDGED, _judged(trials)
-    yield "Failures by cause", ("method", *(f"{n} cameras" for n in CAMERAS), "cause"), _causes(trials)
+        yield f"{FAMILY} ({full}), success [%]", header, list(_rates(archive, ""))
+    yield "Judged by the map alone", _JUDGED, list(_judged(trials))
+    yield "Failures by cause", ("method", *(f"{n} cameras" for n in CAMERAS), "cause"), list(_causes(trials))
     yield "The same problems, two methods", _PAIRED, _tests(trials)
 
 
@@ -93,26 +93,22 @@ def _of_paper(environment: str) -> list[tuple[str, ...]]:
     return [(name, "", *(f"{rate:.2f}" for rate in rates)) for name, rates in named]
 
 
-def _rates(trials: Sequence[Trial], environment: str) -> Rows:
-    rows = _of_paper(environment)
+def _rates(trials: Sequence[Trial], environment: str) -> Iterator[Sequence[str]]:
+    yield from _of_paper(environment)
     for method in METHODS:
         cells = [_share(trials, method, n) for n in CAMERAS]
         if cells[0].num:
-            rows.append((NAMES[method], str(cells[0].num), *map(_shown, cells)))
-    return rows
+            yield NAMES[method], str(cells[0].num), *map(_shown, cells)
 
 
-def _averages(trials: Sequence[Trial]) -> Rows:
-    rows = _of_paper("all")
+def _averages(trials: Sequence[Trial]) -> Iterator[Sequence[str]]:
+    yield from _of_paper("all")
+    of = {name: [trial for trial in trials if trial.environment == name] for name in ENVIRONMENTS}
     for method in METHODS:
-        cells = []
-        for num in CAMERAS:
-            strata = {e: _share([t for t in trials if t.environment == e], method, num) for e in ENVIRONMENTS}
-            cells.append(_weighted(strata))
+        strata = ({name: _share(of[name], method, num) for name in ENVIRONMENTS} for num in CAMERAS)
         count = sum(trial.method == method and trial.cameras in (0, CAMERAS[0]) for trial in trials)
         if count:
-            rows.append((NAMES[method], str(count), *cells))
-    return rows
+            yield NAMES[method], str(count), *map(_weighted, strata)
 
 
 def _weighted(strata: Mapping[str, Share]) -> str:
@@ -140,8 +136,7 @@ def _shown(share: Share) -> str:
 _JUDGED = ("method", "cameras", "judged", "safe", "of these collided", "in known space", "not evaluable")
 
 
-def _judged(trials: Sequence[Trial]) -> Rows:
-    rows = []
+def _judged(trials: Sequence[Trial]) -> Iterator[Sequence[str]]:
     for method in METHODS:
         for num in CAMERAS:
             of = [t for t in trials if t.method == method and t.cameras == num and t.verdict]
@@ -152,18 +147,15 @@ def _judged(trials: Sequence[Trial]) -> Rows:
                     sum(t.in_known_space is True for t in of),
                     sum(t.verdict == "not evaluable" for t in of),
                 )
-                rows.append((NAMES[method], str(num), str(len(of)), *map(str, counts)))
-    return rows
+                yield NAMES[method], str(num), str(len(of)), *map(str, counts)
 
 
-def _causes(trials: Sequence[Trial]) -> Rows:
-    rows = []
+def _causes(trials: Sequence[Trial]) -> Iterator[Sequence[str]]:
     for method in METHODS:
         of = [trial for trial in trials if trial.method == method and trial.cause]
         for cause in sorted({trial.cause for trial in of}):
             counts = [sum(t.cause == cause and t.cameras in (0, num) for t in of) for num in CAMERAS]
-            rows.append((NAMES[method], *map(str, counts), cause))
-    return rows
+            yield NAMES[method], *map(str, counts), cause
 
 
 _PAIRED = ("first", "second", "pairs", "only first", "only second", "p (McNemar)")

@@ -25,8 +25,7 @@ from splatctrl_cli.jobs.studies.maps import (
     splat_map,
     tsdf_map,
 )
-from splatctrl_cli.jobs.studies.problems import Problem, ProblemRequest, read_problem
-from splatctrl_cli.jobs.studies.views import Views, views_of
+from splatctrl_cli.jobs.studies.problems import Problem, ProblemRequest, Views, read_problem, views_of
 from splatctrl_cli.jobs.studies.ways import Way, plain_ways
 from splatctrl_cli.planner.configuration_clearance import HasDistance
 from splatctrl_cli.planner.path import joint_length
@@ -290,8 +289,7 @@ def _least_unseen(rig: Rig, way: Way, seeds: Sequence[int], *, gives_up: bool) -
 
 def as_printed(rig: Rig, known: Map) -> Attempt:
     """A planned path that keeps no margin, to the goal from anywhere."""
-    config = rig.config
-    config = replace(config, control=replace(config.control, margin=NO_MARGIN))
+    config = replace(rig.config, control=replace(rig.config.control, margin=NO_MARGIN))
     return _planned(rig, known.scene, config, approach=0.0)
 
 
@@ -342,8 +340,7 @@ def _way_out(rig: Rig, known: Map) -> PlanDetour:
 
 def _printed(rig: Rig) -> Map:
     config = load_config(None, ["preset=paper"])
-    made = fitted(rig.problem, rig.views, config, rig.threads)
-    return printed_map(rig.problem, made, config, rig.threads)
+    return printed_map(rig.problem, fitted(rig.problem, rig.views, config, rig.threads), config, rig.threads)
 
 
 MAKERS: Mapping[str, tuple[Callable[[Rig], Map], Drive]] = {  # how a method's map is made, and what drives the arm

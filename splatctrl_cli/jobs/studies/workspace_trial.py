@@ -236,8 +236,8 @@ def sections(trials: Sequence[Visit]) -> Iterator[tuple[str, Sequence[str], Rows
             num = len({(trial.place, trial.number) for trial in of})
             rows = [_line([t for t in of if t.method == method]) for method in _there(of)]
             yield f"{(place or 'both places').replace('-', ' ').capitalize()} ({num} visits)", COLUMNS, rows
-    yield "Judged by the map alone, and by the truth", JUDGED, _judged(trials)
-    yield "Differences from the standstill of the workspace, within a visit", DIFFERENCES, _paired(trials)
+    yield "Judged by the map alone, and by the truth", JUDGED, list(_judged(trials))
+    yield "Differences from the standstill of the workspace, within a visit", DIFFERENCES, list(_paired(trials))
 
 
 def notes(trials: Sequence[Visit]) -> Iterator[str]:
@@ -282,8 +282,7 @@ def _line(of: Sequence[Visit]) -> list[str]:
     ]
 
 
-def _judged(trials: Sequence[Visit]) -> Rows:
-    rows = []
+def _judged(trials: Sequence[Visit]) -> Iterator[Sequence[str]]:
     for method in _there(trials):
         of = [trial for trial in trials if trial.method == method]
         judged = [trial for trial in of if trial.verdict]
@@ -295,13 +294,12 @@ def _judged(trials: Sequence[Visit]) -> Rows:
             sum((trial.true_clearance or 0.0) <= 0 for trial in of),
             sum((trial.true_clearance or 0.0) < 0.02 for trial in of),
         )
-        rows.append((NAMES[method], *map(str, counts)))
-    return rows
+        yield NAMES[method], *map(str, counts)
 
 
-def _paired(trials: Sequence[Visit]) -> Rows:
+def _paired(trials: Sequence[Visit]) -> Iterator[Sequence[str]]:
     """Of visits that a method and the standstill both had."""
-    rows, base = list[Sequence[str]](), {(t.place, t.number): t for t in trials if t.method == STANDSTILL}
+    base = {(t.place, t.number): t for t in trials if t.method == STANDSTILL}
     for method in _there(trials):
         pairs = [(t, base[t.place, t.number]) for t in trials if t.method == method and (t.place, t.number) in base]
         if method == STANDSTILL or not pairs:
@@ -311,8 +309,7 @@ def _paired(trials: Sequence[Visit]) -> Rows:
             ("mean distance [cm]", [CM * (a.mean_human - b.mean_human) for a, b in pairs]),
             ("least distance [cm]", [CM * (a.least_human - b.least_human) for a, b in pairs]),
         ):
-            rows.append((NAMES[method], what, *signed_rank(values)))
-    return rows
+            yield NAMES[method], what, *signed_rank(values)
 
 
 def _spread(values: Sequence[float]) -> str:

@@ -111,14 +111,12 @@ class Chain:
     def _job(self, stage: Stage, values: Mapping[str, float]) -> Job:
         chosen: dict[str, list[Any]] = {}
         for name, key in self.keys.items():
-            option = self._options(key).get(stage.command)
+            options = options_for(key, is_lockstep="lockstep" in self.stages[-1].options)
+            option = options.get(stage.command)
             if option is not None:
                 value = int(values[name]) if key.is_whole else values[name]
                 chosen[option] = [self._given(stage, option, values, value)]
         return Job(name=stage.command, command=stage.command, options=stage.options, matrix=chosen)
-
-    def _options(self, key: Key) -> Mapping[str, str]:
-        return options_for(key, is_lockstep="lockstep" in self.stages[-1].options)
 
     def _given(self, stage: Stage, option: str, values: Mapping[str, float], value: float) -> Any:
         if option == "cameras":

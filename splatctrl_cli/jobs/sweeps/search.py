@@ -59,7 +59,6 @@ def find_flip(
     index = next((k for k, value in enumerate(tried) if known[value] != known[start]), None)
     gaps = [abs(b - a) for a, b in itertools.pairwise(tried[:index])]
     spacing = max(gaps, default=0.0)
-    alternates = _num_changes(ordered) > 1
     if index is None:
         return Flip(last=None, first=None, outcomes=ordered, is_monotone=True, spacing=spacing)
     last, first = tried[index - 1], tried[index]
@@ -70,7 +69,8 @@ def find_flip(
             break
         try_all([middle])
         last, first = (middle, first) if known[middle] == known[start] else (last, middle)
-    return Flip(last=last, first=first, outcomes=_ordered(known, start), is_monotone=not alternates, spacing=spacing)
+    is_single, outcomes = _num_changes(ordered) <= 1, _ordered(known, start)
+    return Flip(last=last, first=first, outcomes=outcomes, is_monotone=is_single, spacing=spacing)
 
 
 def _ordered(known: Mapping[float, str], start: float) -> dict[float, str]:

@@ -123,9 +123,17 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
     """
     run, ranges = _judged(request.replay), ranges_of(request.over)
     keys = {name: key_of(name) for name in ranges}
-    _check_whole(ranges, keys)
+    for name, (a, b) in ranges.items():
+        if keys[name].is_whole and not (a.is_integer() and b.is_integer()):
+            raise UsageError(f"--over {name}: expected whole numbers, got {a:g}:{b:g}")
     chain, out = chain_of(run, keys, command_line), request.out.absolute()
-    asked = _asked(run, ranges, request)
+    asked = {
+        "run": run.path.absolute().name,
+        "arguments": run.arguments,
+        "inputs": dict(run.run.get("inputs", {})),
+        "over": {name: list(ends) for name, ends in ranges.items()},
+        "tolerance": request.tolerance,
+    }
     check_can_be_written(out)
     check_same_asked(out, FILE, asked, what="sweep")
     runs = Runs(run=run, chain=chain, out=out, command_line=command_line)
@@ -167,12 +175,6 @@ def ranges_of(over: Sequence[str]) -> dict[str, tuple[float, float]]:
     return ranges
 
 
-def _check_whole(ranges: Mapping[str, tuple[float, float]], keys: Mapping[str, Key]) -> None:
-    for name, ends in ranges.items():
-        if keys[name].is_whole and any(value != int(value) for value in ends):
-            raise UsageError(f"--over {name}: expected whole numbers, got {ends[0]:g}:{ends[1]:g}")
-
-
 def _judged(path: Path) -> RunFolder:
     """A replay that came to a verdict which can flip."""
     run = open_run(path)
@@ -187,16 +189,6 @@ def _not_evaluable(what: str, sentence: str) -> NotEvaluableError:
     return NotEvaluableError(
         f"{what}: there is no verdict to flip: {sentence}", remedy="give it the evidence that it lacks first"
     )
-
-
-def _asked(run: RunFolder, ranges: Mapping[str, tuple[float, float]], request: SweepRequest) -> dict[str, Any]:
-    return {
-        "run": run.path.absolute().name,
-        "arguments": run.arguments,
-        "inputs": dict(run.run.get("inputs", {})),
-        "over": {name: list(ends) for name, ends in ranges.items()},
-        "tolerance": request.tolerance,
-    }
 
 
 @dataclass(kw_only=True)
@@ -362,9 +354,8 @@ def _together(
 
 
 def _plain(flip: KeyFlip) -> dict[str, Any]:
-    document = asdict(flip)
-    key = document.pop("key")
-    return {"unit": key["unit"], "is_declared_monotone": key["is_monotone"], "sentence": flip.sentence, **document}
+    first = {"unit": flip.key.unit, "is_declared_monotone": flip.key.is_monotone, "sentence": flip.sentence}
+    return first | {name: value for name, value in asdict(flip).items() if name != "key"}
 
 
 def _write(out: Path, asked: Mapping[str, Any], result: SweepResult | None) -> None:

@@ -57,7 +57,7 @@ def test_a_condition_that_is_none_is_refused_or_finds_nothing(ledger: Ledger, co
 
 def test_a_table_has_every_column_and_run(ledger: Ledger, tmp_path: Path) -> None:
     with ledger:
-        assert write_csv(tmp_path / "runs.csv", ledger.runs()) == 2
+        write_csv(tmp_path / "runs.csv", ledger.runs())
     header, first, _ = (tmp_path / "runs.csv").read_text().splitlines()
     assert header.startswith("node,recording,job,command,key,state") and first.startswith("a/audit,a,audit")
 
@@ -91,7 +91,8 @@ def test_what_is_no_ledger_is_refused_and_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is no ledger"):
         Ledger(tmp_path)
     newer = tmp_path / "newer"
-    Ledger(newer).close()
+    with Ledger(newer):
+        pass
     with sqlite3.connect(newer / NAME) as base:
         base.execute(f"PRAGMA user_version = {VERSION + 1}")
     base.close()

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatctrl_cli.jobs.studies.problems import Problem, simulated_arm
-from splatctrl_cli.jobs.studies.views import Views, views_of
+from splatctrl_cli.jobs.studies.problems import Problem, Views, simulated_arm, views_of
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.environments import drawn_texture
 from splatctrl_cli.simulate.primitives import Primitive

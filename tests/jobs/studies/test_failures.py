@@ -13,9 +13,8 @@ from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.studies import failures, judge, trial
 from splatctrl_cli.jobs.studies.maps import Map
-from splatctrl_cli.jobs.studies.problems import Problem
+from splatctrl_cli.jobs.studies.problems import Problem, Views
 from splatctrl_cli.jobs.studies.trial import OURS, Attempt, Rig, trial_of
-from splatctrl_cli.jobs.studies.views import Views
 from splatctrl_cli.report.trial_picture import COLORS, TOUCHED, UNSEEN
 from tests.jobs.studies.conftest import HOME, blind
 

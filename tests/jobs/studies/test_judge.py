@@ -13,9 +13,8 @@ from splatctrl_cli.jobs.replays.evidence_criteria import NEAR_PLACES
 from splatctrl_cli.jobs.studies import judge, trial
 from splatctrl_cli.jobs.studies.maps import Map
 from splatctrl_cli.jobs.studies.problem_run import FALSE_GREEN, SETTINGS, verdict_on_trials
-from splatctrl_cli.jobs.studies.problems import Problem, read_problem
+from splatctrl_cli.jobs.studies.problems import Problem, Views, read_problem, views_of
 from splatctrl_cli.jobs.studies.trial import OURS, Attempt, Rig, Trial, trial_of
-from splatctrl_cli.jobs.studies.views import Views, views_of
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.records import Float64
 from tests.jobs.studies.conftest import HOME, blind

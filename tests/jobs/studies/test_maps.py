@@ -10,9 +10,8 @@ from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.replays.compare import Certified
 from splatctrl_cli.jobs.studies import judge, maps, trial
 from splatctrl_cli.jobs.studies.maps import Map
-from splatctrl_cli.jobs.studies.problems import Problem, read_problem
+from splatctrl_cli.jobs.studies.problems import Problem, Views, read_problem, views_of
 from splatctrl_cli.jobs.studies.trial import Rig
-from splatctrl_cli.jobs.studies.views import Views, views_of
 from splatctrl_cli.jobs.studies.ways import Way, Ways
 from splatctrl_cli.records import SplatSet
 from splatctrl_cli.scene.posture import posture_of

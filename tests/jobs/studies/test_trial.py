@@ -13,9 +13,8 @@ from splatctrl_cli.control.goals import Detour, PlanDetour
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.studies import judge, trial
 from splatctrl_cli.jobs.studies.maps import Map
-from splatctrl_cli.jobs.studies.problems import Problem
+from splatctrl_cli.jobs.studies.problems import Problem, Views
 from splatctrl_cli.jobs.studies.trial import LITTLE, PLANS, Attempt, Rig, by_planner
-from splatctrl_cli.jobs.studies.views import Views
 from splatctrl_cli.jobs.studies.ways import Way
 from splatctrl_cli.planner.configuration_clearance import HasDistance
 from splatctrl_cli.planner.path import TimedPath
