@@ -296,6 +296,8 @@ class FieldReport:
         """What is printed, and what --json has beside the accuracy."""
         header: Mapping[str, Any] = self.grid.header
         num_used, health = sum(header["splats_used"].values()), header["health"]
+        # cells where the kernel field of sdf, alone, exceeds the exact distance
+        over = header["kernel_counts"].get(f"{KERNEL_OF[header['distance']]}_over_estimates")
         summary = {
             "num_splats": num_used,
             "num_splats_left_out": sum(header["splats_given"].values()) - num_used,
@@ -307,17 +309,12 @@ class FieldReport:
             "median_radius": health["radius"],
             "median_spacing": health["spacing"],
             "never_seen_share": self.statistics.never_seen_share,
-            "over_estimating_share": self._over_estimating_share(header),
+            "over_estimating_share": None if over is None else over / self.statistics.num_cells,
             "num_warnings": len(self.warnings),
         }
         if self.changes is not None:
             summary["blocks_baked"] = f"{self.changes.num_baked} of {self.changes.num_blocks}"
         return summary
-
-    def _over_estimating_share(self, header: Mapping[str, Any]) -> float | None:
-        """Of the cells where the kernel field of sdf, alone, exceeds the exact distance; None without one."""
-        count = header["kernel_counts"].get(f"{KERNEL_OF[header['distance']]}_over_estimates")
-        return None if count is None else count / self.statistics.num_cells
 
 
 def metrics_of(summary: Mapping[str, Any], accuracy: Accuracy) -> dict[str, float | None]:
@@ -328,12 +325,9 @@ def metrics_of(summary: Mapping[str, Any], accuracy: Accuracy) -> dict[str, floa
 
 def counts_of(metrics: Mapping[str, float | None]) -> dict[str, int]:
     """The cells that each of the metrics rests on: those of its band or of the over-estimate, else all."""
-    num_cells, counts = int(metrics["num_cells"] or 0), {}
-    for name in metrics:
-        place, _, figure = name.rpartition(".")
-        is_told = figure == "count" or f"{place}.count" not in metrics
-        counts[name] = num_cells if is_told else int(metrics[f"{place}.count"] or 0)
-    return counts
+    of_bands = {name: f"{name.rpartition('.')[0]}.count" for name in metrics if not name.endswith(".count")}
+    counted = {name: of_bands[name] if of_bands.get(name) in metrics else "num_cells" for name in metrics}
+    return {name: int(metrics[count] or 0) for name, count in counted.items()}
 
 
 def _verdict(

@@ -2,8 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import field as made_by
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +44,7 @@ class BakeRequest:
 
     scene: Path
     out: Path
-    config: Config = made_by(default_factory=Config)
+    config: Config = field(default_factory=Config)
     at: float | None = None
     labels: frozenset[Label] = DEFAULT_LABELS
     box: Box | None = None
@@ -91,7 +90,7 @@ class BakeSource:
     stamp_ns: int | None = None
     workspace: Box | None = None
     cameras: tuple[str, ...] | None = None
-    made_from: Mapping[str, Any] = made_by(default_factory=dict)
+    made_from: Mapping[str, Any] = field(default_factory=dict)
 
 
 def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
@@ -240,8 +239,7 @@ def covered(request: BakeRequest, source: BakeSource, previous: Previous | None)
     if request.box is not None:
         return request.box
     if request.urdf is not None:
-        robot = RobotModel.from_urdf(request.urdf, request.spheres)
-        return robot.reach_box
+        return RobotModel.from_urdf(request.urdf, request.spheres).reach_box
     if previous is not None:
         return previous.box
     return bounding_box(field_splats(source.splats, request.labels), request.config.field.padding)

@@ -78,7 +78,9 @@ def figures_of(comparison: Comparison) -> dict[str, float | None]:
         if not has_truth:
             del values["min_clearance_true"]
         if method in comparison.plans:
-            values |= _plan_values(comparison.plans[method])
+            plan = comparison.plans[method]
+            of_plan = (plan.seconds, finite(plan.margin), finite(plan.self_margin), plan.num_edges, plan.num_proved)
+            values |= dict(zip(PLAN, of_plan, strict=True))
         found |= {f"{method}_{name}": value for name, value in values.items()}
     return found
 
@@ -203,13 +205,16 @@ def _planned(
 
 def planned_ways_out(inputs: ReplayInputs, task: ReplayTask, config: Config) -> PlanDetour | None:
     """What plans the closed loop's ways out of local minima; None where it may take none."""
-
-    def scene_at(stamp_ns: int) -> Certified:
-        return Certified(distance=certified_distance(inputs.scene.at(stamp_ns)))
-
     if config.control.max_detours == 0:
         return None
-    return planned_detours(inputs.model, scene_at, task.frame, config.planner, config.control, home=task.home)
+    return planned_detours(
+        inputs.model,
+        lambda stamp_ns: Certified(distance=certified_distance(inputs.scene.at(stamp_ns))),
+        task.frame,
+        config.planner,
+        config.control,
+        home=task.home,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,10 +247,6 @@ def _yardstick(inputs: ReplayInputs, task: ReplayTask, config: Config) -> Yardst
             known[:] = [(fields, certified_distance(fields))]
         return known[0][1]
 
-    def true_distance(points: Float64, stamp_ns: int) -> Float64:
-        assert truth is not None
-        return truth.closest(points, stamp_ns)[0]
-
     return Yardstick(
         model=inputs.model,
         frame=task.frame,
@@ -253,7 +254,7 @@ def _yardstick(inputs: ReplayInputs, task: ReplayTask, config: Config) -> Yardst
         config=config.control,
         distances_at=lambda stamp: scene.at(stamp).distances,
         certified_at=certified_at,
-        truth=None if truth is None else true_distance,
+        truth=None if truth is None else lambda points, stamp: truth.closest(points, stamp)[0],
     )
 
 
@@ -292,8 +293,3 @@ def _motion_values(figures: MotionFigures | None) -> dict[str, float | None]:
         "min_clearance_true": None if figures.true_clearance is None else finite(figures.true_clearance),
         "num_interventions": figures.num_interventions,
     }
-
-
-def _plan_values(plan: PlannedPath) -> dict[str, float | None]:
-    values = (plan.seconds, finite(plan.margin), finite(plan.self_margin), plan.num_edges, plan.num_proved)
-    return dict(zip(PLAN, values, strict=True))

@@ -53,20 +53,25 @@ def columns_of(replay: Replay, rows: slice = ALL) -> Columns:
         columns[f"nearest_{name}"] = [names[s] for s in clearance.sphere.tolist()]
     if replay.true_clearance is not None:
         columns["clearance_true"] = replay.true_clearance[rows].tolist()
-    columns["obstacle"] = list(replay.obstacles[rows])
-    columns["self_clearance"] = audit.self_clearance.tolist()
-    columns["limit_margin"] = audit.limit_margin.tolist()
-    columns["limit_joint"] = [replay.model.joint_names[j] for j in audit.limit_joint.tolist()]
-    columns["unknown_share"] = audit.unknown_share.tolist()
-    columns["map_age_s"] = replay.map_age_s[rows].tolist()
+    columns |= {
+        "obstacle": list(replay.obstacles[rows]),
+        "self_clearance": audit.self_clearance.tolist(),
+        "limit_margin": audit.limit_margin.tolist(),
+        "limit_joint": [replay.model.joint_names[j] for j in audit.limit_joint.tolist()],
+        "unknown_share": audit.unknown_share.tolist(),
+        "map_age_s": replay.map_age_s[rows].tolist(),
+    }
     if len(replay.steps):
         columns |= _step_columns(replay, rows)
     if replay.open_loop is not None:
         columns |= _open_loop_columns(replay, rows)
     if replay.divergence is not None:
-        columns["divergence_joints"] = replay.divergence.rows("joints")[rows].tolist()
-        columns["divergence_position"] = replay.divergence.rows("position")[rows].tolist()
-        columns["divergence_rotation_deg"] = np.degrees(replay.divergence.rows("rotation")[rows]).tolist()
+        apart = replay.divergence
+        columns |= {
+            "divergence_joints": apart.rows("joints")[rows].tolist(),
+            "divergence_position": apart.rows("position")[rows].tolist(),
+            "divergence_rotation_deg": np.degrees(apart.rows("rotation")[rows]).tolist(),
+        }
     return columns
 
 
@@ -76,11 +81,11 @@ def _step_columns(replay: Replay, rows: slice) -> Columns:
     def each(value: Callable[[ControlStep], object]) -> list[object]:
         return ["" if step is None else value(step) for step in steps]
 
-    def velocity_of(joint: int) -> list[object]:
-        return each(lambda step: float(step.velocity[joint]))
-
     return {
-        **{f"v_{joint}": velocity_of(j) for j, joint in enumerate(replay.model.joint_names)},
+        **{
+            f"v_{joint}": each(lambda step, j=j: float(step.velocity[j]))  # type: ignore[misc]
+            for j, joint in enumerate(replay.model.joint_names)
+        },
         "barrier_clearance": each(lambda step: step.clearance),
         "barrier_nearest": each(lambda step: step.nearest),
         "rung": each(lambda step: str(step.rung)),
@@ -209,10 +214,8 @@ def seconds_of(replay: Replay) -> Float64:
 
 
 def _event_document(event: Event) -> dict[str, Any]:
-    document = asdict(event) | {"unit": UNITS.get(event.kind, "")}
-    for name in ("worst", "worst_s", "start_s", "end_s"):
-        document[name] = finite(document[name])
-    return document
+    numbers = {name: finite(getattr(event, name)) for name in ("worst", "worst_s", "start_s", "end_s")}
+    return asdict(event) | {"unit": UNITS.get(event.kind, "")} | numbers
 
 
 def write_steps(path: Path, chunks: Iterable[Mapping[str, Sequence[object]]]) -> None:

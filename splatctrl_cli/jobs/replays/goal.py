@@ -99,7 +99,8 @@ def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint,
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {error}", remedy="give --waypoints a .toml or .csv file") from None
-    rows = _csv_rows(path, text, model.joint_names) if path.suffix == ".csv" else _toml_rows(path, text)
+    read = _csv_rows(path, text, model.joint_names) if path.suffix == ".csv" else _toml_rows(path, text)
+    rows = list(read)
     if not rows:
         raise InputError(f"{path}: expected at least one waypoint, got none")
     waypoints = []
@@ -117,7 +118,7 @@ def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint,
     return tuple(waypoints)
 
 
-def _csv_rows(path: Path, text: str, joints: tuple[str, ...]) -> list[tuple[str, list[float]]]:
+def _csv_rows(path: Path, text: str, joints: tuple[str, ...]) -> Iterator[tuple[str, list[float]]]:
     reader = csv.DictReader(text.splitlines())
     header = tuple(reader.fieldnames or ())
     wanted = next((names for names in (POSE_COLUMNS, joints) if set(names) <= set(header)), None)
@@ -125,30 +126,26 @@ def _csv_rows(path: Path, text: str, joints: tuple[str, ...]) -> list[tuple[str,
         raise InputError(
             f"{path}: expected the columns {POSE} or {','.join(joints)}, got {','.join(header) or 'none'}"
         )
-    rows = []
     for number, row in enumerate(reader):
         try:
-            rows.append(("pose" if wanted is POSE_COLUMNS else "joints", [float(row[name]) for name in wanted]))
+            yield "pose" if wanted is POSE_COLUMNS else "joints", [float(row[name]) for name in wanted]
         except (TypeError, ValueError):
             raise InputError(f"{path}: waypoint {number}: expected numbers, got {list(row.values())}") from None
-    return rows
 
 
-def _toml_rows(path: Path, text: str) -> list[tuple[str, list[float]]]:
+def _toml_rows(path: Path, text: str) -> Iterator[tuple[str, list[float]]]:
     try:
         document: dict[str, Any] = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from None
     entries = document.get("waypoint", [])
-    rows = []
     for number, entry in enumerate(entries if isinstance(entries, list) else [entries]):
         if not isinstance(entry, dict) or len(entry) != 1 or not set(entry) <= {"pose", "joints"}:
             raise InputError(f"{path}: waypoint {number}: expected pose = [...] or joints = [...], got {entry}")
         ((kind, values),) = entry.items()
         if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
             raise InputError(f"{path}: waypoint {number}: {kind}: expected an array of numbers, got {values}")
-        rows.append((kind, [float(value) for value in values]))
-    return rows
+        yield kind, [float(value) for value in values]
 
 
 def checked_pose(values: Sequence[float]) -> tuple[float, ...]:

@@ -143,7 +143,9 @@ class Hindsight:
         """The first `num` postures against the map at `until_ns`: those that were clear of what was known of then."""
         stamps, q = np.array(self._stamps[:num]), np.asarray(self._postures[:num])
         after = self._clearance_in(until_ns, stamps, q)
-        late = [k for k in np.flatnonzero(after < self._margin) if self._was_clear(stamps[[k]], q[[k]])]
+        near = np.flatnonzero(after < self._margin)
+        before = (self._clearance_in(int(stamps[k]), stamps[[k]], q[[k]])[0] for k in near)  # each in its own time
+        late = [k for k, clearance in zip(near, before, strict=True) if clearance >= self._margin]
         if not late:
             return
         worst = min(late, key=lambda k: after[k])
@@ -152,7 +154,3 @@ class Hindsight:
                 since_ns=since_ns, until_ns=until_ns, stamp_ns=self._stamps[worst], clearance=float(after[worst])
             )
         )
-
-    def _was_clear(self, stamp: Stamps, q: Float64) -> bool:
-        """A state (1,), (1, J) in the map of its own time."""
-        return bool(self._clearance_in(int(stamp[0]), stamp, q)[0] >= self._margin)

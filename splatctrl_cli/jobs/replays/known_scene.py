@@ -3,8 +3,7 @@
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from dataclasses import field as made_by
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -80,7 +79,7 @@ class KnownScene:
     has_seen_times: bool = True
     figures: Callable[[], Mapping[str, Any]] = dict
     has_people_margin: bool = False
-    made_from: Mapping[str, Any] = made_by(default_factory=dict)
+    made_from: Mapping[str, Any] = field(default_factory=dict)
 
     def age_s(self, stamp_ns: int) -> float:
         """How old [s] the scene in use at a stamp is, of a field how far its moment is from it; NaN where there are
@@ -143,12 +142,11 @@ def from_grid(path: Path) -> KnownScene:
     barrier = GridField(grid)
     states = grid.channels.get("observed")
     observed = None if states is None else observed_lookup(states.astype("uint8"), grid.origin, grid.voxel)
-
-    def seen_at(_: int) -> Seen | None:
-        if observed is None:
-            return None
-        return Seen(last_ns=lambda points: np.where(np.isin(observed(points), BY_CAMERA), 0, -1))
-
+    seen = (
+        None
+        if observed is None
+        else Seen(last_ns=lambda points: np.where(np.isin(observed(points), BY_CAMERA), 0, -1))
+    )
     fields = KnownFields(
         barrier=barrier,
         distances={
@@ -162,7 +160,7 @@ def from_grid(path: Path) -> KnownScene:
     return KnownScene(
         at=lambda stamp_ns: fields,
         observed=observed,
-        seen_at=seen_at,
+        seen_at=lambda stamp_ns: seen,
         has_seen_times=False,
         first_ns=None,
         cameras=None,

@@ -105,10 +105,6 @@ def _num_sudden(replay: Replay) -> int:
     return int(np.sum(since >= 2 * MOTION_WINDOW * 1e9)) if np.any(replay.config.control.max_acceleration) else 0
 
 
-def _deficit(replay: Replay) -> float | None:
-    return None if replay.model.coverage is None else replay.model.coverage.max_deficit
-
-
 def _map_error(name: str, figure: str, scale: Scale) -> Metric[Replay]:
     """By held-out depth; None without, or where that is too little."""
 
@@ -132,7 +128,10 @@ OF_AUDIT: Declared = (
     _single("num_spheres", lambda replay: len(replay.model.sphere_set.radii)),
     _single("num_bare_links", lambda r: len(r.model.bare_links), lambda r: len(r.model.urdf.links), FAULTS),
     _single(
-        "coverage_deficit", _deficit, lambda r: 0 if r.model.coverage is None else len(r.model.coverage.links), ERROR
+        "coverage_deficit",
+        lambda r: None if r.model.coverage is None else r.model.coverage.max_deficit,
+        lambda r: 0 if r.model.coverage is None else len(r.model.coverage.links),
+        ERROR,
     ),
     _single("num_self_pairs", lambda replay: len(replay.model.self_pairs())),
     _single("num_states", num_states),
@@ -308,8 +307,7 @@ def metric_names(
     mode: str, of_fields: Sequence[str], *, has_truth: bool, baselines: Sequence[str] = (), has_twists: bool = False
 ) -> tuple[str, ...]:
     """The names that `metrics_of` and the log's own figures have for a --mode and --baseline."""
-    given = {"has_truth": has_truth, "has_twists": has_twists}
-    return tuple(metric_scales(mode, of_fields, baselines=baselines, **given))
+    return tuple(metric_scales(mode, of_fields, has_truth=has_truth, baselines=baselines, has_twists=has_twists))
 
 
 def metric_scales(

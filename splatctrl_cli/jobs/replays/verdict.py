@@ -1,5 +1,7 @@
 """The verdict of a replay: every criterion of *safe*, with what it found, when, where and what to do about it."""
 
+from collections.abc import Iterator
+
 from splatctrl_cli.control.line_process import shown
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
@@ -36,43 +38,41 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
         reasons,
         scope=f"{motion} motion from {first:.2f} to {last:.2f} s of the log, {len(stamps)} states{who}",
         passed=SAFE,
-        notes=_notes(judged),
+        notes=tuple(_notes(judged)),
         counts=counts,
     )
 
 
-def _notes(judged: Judged) -> tuple[str, ...]:
+def _notes(judged: Judged) -> Iterator[str]:
     found = judged.replay.map_error
-    notes = ["map error not measured"] if found is None or found.bound is None else [bound_words(found.bound)]
+    yield "map error not measured" if found is None or found.bound is None else bound_words(found.bound)
     close = [name for name, (first, _) in judged.replay.statics.items() if first < judged.threshold]
     if close:
-        notes.append(f"{len(close)} fixed spheres stand within the margin of their surroundings")
+        yield f"{len(close)} fixed spheres stand within the margin of their surroundings"
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
-        notes.append(f"{judged.replay.lead_in_s:.2f} s before the first map are left out")
+        yield f"{judged.replay.lead_in_s:.2f} s before the first map are left out"
     if nearby(judged, "age") is None:
-        notes.append("age of the evidence about the arm not judged")
-    notes += _declared_notes(judged)
+        yield "age of the evidence about the arm not judged"
+    yield from _declared_notes(judged)
     inside = judged.inputs.scene.figures().get("inside_robot_points")
     if inside:
-        notes.append(f"{inside} measured points lie inside the robot: contact, a carried object, or calibration")
+        yield f"{inside} measured points lie inside the robot: contact, a carried object, or calibration"
     if judged.request.re_anchor is not None:
-        notes.append("the arm is put back into the log's posture on the way: nothing is said between states")
-    return tuple(notes)
+        yield "the arm is put back into the log's posture on the way: nothing is said between states"
 
 
-def _declared_notes(judged: Judged) -> list[str]:
+def _declared_notes(judged: Judged) -> Iterator[str]:
     """Declared contact, what the map was told that the robot carries, and entries that nothing used."""
-    declared, notes = judged.inputs.declared, []
+    declared = judged.inputs.declared
     for index, entry in enumerate(declared.expected_contact):
         num = declared.num_uses.get(("expected_contact", index), 0)
         used = f"{num} times" if num else "warning: not used by any state; check its links and times, or leave it out"
-        notes.append(f"contact of {entry.link} declared ({entry.reason}): {used}")
+        yield f"contact of {entry.link} declared ({entry.reason}): {used}"
     of_map = judged.inputs.scene.figures().get("carried", [])
-    notes += [carried_words(made) for made in of_map]
+    yield from map(carried_words, of_map)
     for given in declared.carried_uses():
         if not any(given | {"num_uses": 0} == made | {"num_uses": 0} for made in of_map):
-            notes.append(
+            yield (
                 f"{given['link']} carries a box: warning: the map was made without this declaration; give reconstruct"
                 " the same --declare"
             )
-    return notes

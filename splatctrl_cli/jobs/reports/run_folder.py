@@ -5,7 +5,7 @@ of a batch: the last state of each of its jobs.
 import csv
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -152,14 +152,10 @@ def open_run(path: Path) -> RunFolder:
         raise InputError(f"{file}: cannot be read: {error}") from None
     if not isinstance(run, dict) or "command" not in run:
         raise InputError(f"{file}: expected what a command of splatctrl writes", remedy="make the run again")
-    check_version(file, str(run.get("splatctrl", "")))
-    return RunFolder(path, run)
-
-
-def check_version(file: Path, version: str) -> None:
-    """Raise InputError for what a newer splatctrl wrote: its values may mean something else."""
-    if _numbers(version) > _numbers(__version__):
+    version = str(run.get("splatctrl", ""))
+    if _numbers(version) > _numbers(__version__):  # its values may mean something else
         raise InputError(f"{file}: written by splatctrl {version}, this is {__version__}", remedy="update splatctrl")
+    return RunFolder(path, run)
 
 
 def _numbers(version: str) -> tuple[int, ...]:
@@ -197,15 +193,12 @@ class Node:
     recording: str = ""
     job: str = ""
     command: str = ""
-    variant: Mapping[str, Any] = field(default_factory=dict)
     words: tuple[str, ...] = ()
-    key: str = ""
     state: str = ""
     expect: str | None = None
     outcome: str | None = None
     label: str | None = None
     sentence: str | None = None
-    exit_code: int | None = None
     seconds: float | None = None
     peak_mb: float | None = None
     out: str = ""

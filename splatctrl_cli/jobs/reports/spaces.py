@@ -37,9 +37,13 @@ def space_of(path: Path, roots: tuple[Path, ...] = ()) -> Space:
 
     Raises InputError for anything else, and for a run whose scene or robot is not found.
     """
-    if path.is_file():
-        return space_of_grid(path) if path.suffix == ".npz" else _of_file(path)
-    return space_of_run(open_run(path), roots)
+    if not path.is_file():
+        return space_of_run(open_run(path), roots)
+    if path.suffix == ".npz":
+        return space_of_grid(path)
+    splats = read_splats(path)[0]
+    chosen = splats if isinstance(splats, SplatSet) else nearest_splats(splats)
+    return Space(splats=[SplatsAt(time_s=0.0, splats=chosen)])
 
 
 def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
@@ -216,18 +220,14 @@ def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
     which = sorted(chosen if worst is None else chosen | {worst})
     bodies = robot_bodies(robot)
     end = run.option("--frame") or robot.frame_names[-1]
-    poses, path = [], []
-    for state in which:
-        q = position_of(states, robot, state)
-        poses.append([robot.frame_pose(q, link) for link in bodies])
-        path.append(robot.frame_pose(q, end)[:3, 3])
+    postures = [position_of(states, robot, state) for state in which]
     least = np.fmin.reduce(list(states.clearance.values())) if states.clearance else np.full(count, np.nan)
     about = run.json_of("summary.json") or {}
     return Motion(
         seconds=states.seconds[which],
         bodies=bodies,
-        poses=np.array(poses),
-        path=np.array(path),
+        poses=np.array([[robot.frame_pose(q, link) for link in bodies] for q in postures]),
+        path=np.array([robot.frame_pose(q, end)[:3, 3] for q in postures]),
         clearance=least[which],
         margin=float(about.get("about", {}).get("margin", 0.0)),
     )
@@ -269,9 +269,3 @@ def _decided(states: States, robot: RobotModel, words: str, time_s: float, place
     return Deciding(
         sentence=words, time_s=time_s, place=np.array(place), sphere=(centers[sphere], float(radii[sphere]))
     )
-
-
-def _of_file(path: Path) -> Space:
-    splats = read_splats(path)[0]
-    chosen = splats if isinstance(splats, SplatSet) else nearest_splats(splats)
-    return Space(splats=[SplatsAt(time_s=0.0, splats=chosen)])
