@@ -4,8 +4,8 @@ import argparse
 import textwrap
 from collections.abc import Iterator, Mapping
 
-from splatctrl_cli.checks.finding import CheckReport, Rate
-from splatctrl_cli.cli.common import Console, table
+from splatctrl_cli.checks.finding import CheckReport
+from splatctrl_cli.cli.common import Console, shown, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.evaluate.verdict import DAMAGED
 from splatctrl_cli.files.summary import Summary
@@ -44,7 +44,17 @@ def _lines(report: CheckReport) -> Iterator[str]:
     rates = [rate for rate in report.rates if rate.is_read]
     if rates:
         yield ""
-        yield from table(["topic", "messages", "hz", "longest gap s", "delay s"], [*map(_rate_row, rates)])
+        rows = [
+            (
+                rate.topic,
+                rate.messages,
+                shown(rate.hz, ".2f"),
+                shown(rate.longest_s, ".3f"),
+                shown(rate.delay_s, ".3f"),
+            )
+            for rate in rates
+        ]
+        yield from table(["topic", "messages", "hz", "longest gap s", "delay s"], rows)
     if len(rates) < len(report.rates):
         yield from () if rates else ("",)
         others = len(report.rates) - len(rates)
@@ -68,14 +78,6 @@ def _needs(report: CheckReport) -> Iterator[str]:
     for need in report.needs:
         for lack in need.lacks:
             yield from textwrap.wrap(f"missing for {need.command}: {lack}", WIDTH, subsequent_indent="  ")
-
-
-def _rate_row(rate: Rate) -> list[object]:
-    return [rate.topic, rate.messages, _shown(rate.hz, 2), _shown(rate.longest_s, 3), _shown(rate.delay_s, 3)]
-
-
-def _shown(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def run_info(args: argparse.Namespace) -> int:

@@ -98,6 +98,11 @@ def long_table(header: Sequence[str], rows: Callable[[], Iterable[Sequence[objec
     yield from map(line, rows())
 
 
+def shown(value: float | None, form: str) -> str:
+    """A number in a format, a dash for none."""
+    return "-" if value is None else format(value, form)
+
+
 def labels_of(text: str) -> frozenset[Label]:
     """The labels in a field: objects, and those that ``--include`` names. Raises UsageError for another name."""
     names = () if text.strip() == "none" else names_of(text, ("robot", "human"), "--include")

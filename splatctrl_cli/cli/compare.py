@@ -3,10 +3,11 @@
 import argparse
 from collections.abc import Iterator
 
-from splatctrl_cli.cli.common import Console, table
+from splatctrl_cli.cli.common import Console, shown, table
 from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.jobs.compare import Change, CompareRequest, CompareResult, FigureChange, compare
 
+FORM = ".6g"
 MOST_ROWS = 20  # of changes that are no regression; --json has all
 
 
@@ -28,11 +29,16 @@ def _lines(result: CompareResult, *, is_long: bool) -> Iterator[str]:
         yield "no figure changed by more than its tolerance"
     if result.jobs:
         yield ""
-        shown = [one for one in result.jobs if is_long or one.change is not Change.SAME]
-        yield f"{len(result.jobs)} figures over recordings, {len(shown)} changed: mean change for the worse"
+        changed = [one for one in result.jobs if is_long or one.change is not Change.SAME]
+        yield f"{len(result.jobs)} figures over recordings, {len(changed)} changed: mean change for the worse"
         cells = [
-            (one.metric, one.job, one.harm.num_pairs, *map(_shown, (one.harm.mean, one.harm.low, one.harm.high)))
-            for one in shown
+            (
+                one.metric,
+                one.job,
+                one.harm.num_pairs,
+                *(shown(value, FORM) for value in (one.harm.mean, one.harm.low, one.harm.high)),
+            )
+            for one in changed
         ]
         yield from table(("figure", "job", "recordings", "mean", "low", "high"), cells) if cells else ()
     if result.differences:
@@ -44,9 +50,5 @@ def _lines(result: CompareResult, *, is_long: bool) -> Iterator[str]:
 
 def _row(one: FigureChange) -> tuple[object, ...]:
     where = "" if one.where is None else f"{one.where.time_s:.2f} s, {one.where}"
-    values = map(_shown, (one.before, one.after, one.allowed))
+    values = (shown(value, FORM) for value in (one.before, one.after, one.allowed))
     return one.metric, one.run, *values, one.unit, one.change, where
-
-
-def _shown(value: float | None) -> str:
-    return "-" if value is None else f"{value:.6g}"

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import io
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from splatctrl_cli.jobs.demo import DemoRequest, StepResult, demo
 from splatctrl_cli.jobs.export import ExportResult
 from splatctrl_cli.jobs.ingest import IngestResult
 from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult
+from splatctrl_cli.jobs.replay import ReplayResult
 from splatctrl_cli.jobs.scores.score import ScoreResult
 from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
 from splatctrl_cli.simulate.arm import UNMODELLED
@@ -51,23 +53,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _show(console: Console, result: StepResult) -> int:
-    match result:
-        case SimulateResult():
-            return show_simulated(console, result)
-        case Summary():
-            return show_described(console, result)
-        case IngestResult():
-            return show_ingested(console, result)
-        case ReconstructResult():
-            return show_reconstructed(console, result)
-        case ExportResult():
-            return show_exported(console, result)
-        case BakeResult():
-            return show_baked(console, result)
-        case ScoreResult():
-            return show_scored(console, result)
-        case _:
-            return show_replayed(console, result, code=result.exit_code(report_only=False))
+    if isinstance(result, ReplayResult):
+        return show_replayed(console, result, code=result.exit_code(report_only=False))
+    return SHOWN[type(result)](console, result)
 
 
 def run_simulate(args: argparse.Namespace) -> int:
@@ -99,7 +87,23 @@ def _simulated(result: SimulateResult) -> list[str]:
         )
         for camera in truth.cameras
     ]
-    lines = [f"{result.out}", "", *table(("file", "bytes"), list(result.sizes.items())), ""]
-    lines += table(("camera", "role", "frames", "size", "luminance std"), cameras)
-    lines += ["", f"joint states {len(truth.stamps)}, true clearance at least {truth.clearance.min() * 100:.1f} cm"]
-    return lines
+    return [
+        f"{result.out}",
+        "",
+        *table(("file", "bytes"), list(result.sizes.items())),
+        "",
+        *table(("camera", "role", "frames", "size", "luminance std"), cameras),
+        "",
+        f"joint states {len(truth.stamps)}, true clearance at least {truth.clearance.min() * 100:.1f} cm",
+    ]
+
+
+SHOWN: Mapping[type, Callable[[Console, Any], int]] = {
+    SimulateResult: show_simulated,
+    Summary: show_described,
+    IngestResult: show_ingested,
+    ReconstructResult: show_reconstructed,
+    ExportResult: show_exported,
+    BakeResult: show_baked,
+    ScoreResult: show_scored,
+}

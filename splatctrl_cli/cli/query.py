@@ -27,7 +27,10 @@ def run(args: argparse.Namespace) -> int:
         labels=labels_of(args.include),
     )
     if args.out is not None or console.is_json:
-        return show_answered(console, query(request, console))
+        result = query(request, console)
+        out = None if result.out is None else str(result.out)
+        found = {"out": out, "source": result.kind, **result.metrics, "notes": result.notes}
+        return console.result(found, _lines(result))
     with tempfile.TemporaryDirectory() as folder:  # a table with a wrong line is refused before anything is printed
         answers = Path(folder) / "answers.csv"
         result = query(replace(request, out=answers), console)
@@ -36,14 +39,6 @@ def run(args: argparse.Namespace) -> int:
     for line in _lines(replace(result, out=None)):
         console.log(line)
     return 0
-
-
-def show_answered(console: Console, result: QueryResult) -> int:
-    """The figures and notes."""
-    out = None if result.out is None else str(result.out)
-    return console.result(
-        {"out": out, "source": result.kind, **result.metrics, "notes": result.notes}, _lines(result)
-    )
 
 
 def _lines(result: QueryResult) -> Iterator[str]:

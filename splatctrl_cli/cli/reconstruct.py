@@ -58,12 +58,15 @@ def show_reconstructed(console: Console, result: ReconstructResult) -> int:
     is_baseline = result.metrics.get("method") == "3dgs"
     found = {"scene": str(result.out), "metrics": result.metrics}
     found |= {} if is_baseline else {"removed": result.removed}
-    lines = _baseline_lines(result) if is_baseline else _lines(result)
-    return console.concluded(result.verdict, found, [*lines, f"wrote {result.out}"])
+    return console.concluded(result.verdict, found, [*_lines(result, is_baseline=is_baseline), f"wrote {result.out}"])
 
 
-def _lines(result: ReconstructResult) -> list[str]:
+def _lines(result: ReconstructResult, *, is_baseline: bool) -> list[str]:
     metrics, removed = result.metrics, result.removed
+    if is_baseline:
+        names = ("iterations", "splats", "cloned", "split", "pruned", "unmet")
+        columns = {name: metrics[name] for name in names} | _quality(metrics, result.seconds["fit"])
+        return table(list(columns), [list(columns.values())])
     columns = {
         **{name.replace("_", " "): metrics[name] for name in ("time_steps", "splats")},
         "robot": metrics["robot_splats"],
@@ -71,17 +74,12 @@ def _lines(result: ReconstructResult) -> list[str]:
         **{name: metrics[name] for name in ("added", "relocated", "unmet")},
         **_quality(metrics, sum(result.seconds.values())),
     }
-    lines = table(list(columns), [list(columns.values())])
     reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in removed.items() if count)
-    lines.append("removed: " + (", ".join(reasons) or "none"))
-    lines.append("computed on " + ", then ".join(shown(device) for device in metrics["devices"]))
-    return lines
-
-
-def _baseline_lines(result: ReconstructResult) -> list[str]:
-    names = ("iterations", "splats", "cloned", "split", "pruned", "unmet")
-    columns = {name: result.metrics[name] for name in names} | _quality(result.metrics, result.seconds["fit"])
-    return table(list(columns), [list(columns.values())])
+    return [
+        *table(list(columns), [list(columns.values())]),
+        f"removed: {', '.join(reasons) or 'none'}",
+        f"computed on {', then '.join(map(shown, metrics['devices']))}",
+    ]
 
 
 def _quality(metrics: Mapping[str, Any], seconds: float) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from collections.abc import Iterator
 
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
@@ -46,7 +47,7 @@ def run_check(args: argparse.Namespace) -> int:
     assert file is not None
     facts = {"urdf": str(args.urdf), "spheres": str(result.spheres), "layout": file.layout}
     found = {**facts, "num_switched_off": file.num_off, "links_left_out": left_out, **result.as_dict()}
-    lines = _coverage_lines(result)
+    lines = [*_coverage_lines(result)]
     if file.num_off:
         lines.append(f"{file.num_off} spheres are switched off (radius 0 or less) and cover nothing")
     if result.is_renamed:
@@ -103,23 +104,20 @@ def _learned_row(part: LearnedLink) -> tuple[object, ...]:
     return part.link, part.num_pixels, part.num_configurations, f"{1e4 * part.area:.0f}", *outside, place, since
 
 
-def _coverage_lines(result: CoverageResult) -> list[str]:
+def _coverage_lines(result: CoverageResult) -> Iterator[str]:
     """The table by link and, below it, what it means."""
-    header, report = (
-        ("link", "spheres", "area cm2", "uncovered %", "deficit mm", "at x, y, z mm", "sticks out mm"),
-        result.report,
-    )
-    lines = [*table(header, [_row(link) for link in report.links]), "", coverage_summary(report)]
+    report = result.report
+    header = ("link", "spheres", "area cm2", "uncovered %", "deficit mm", "at x, y, z mm", "sticks out mm")
+    yield from (*table(header, [_row(link) for link in report.links]), "", coverage_summary(report))
     if report.bare_links:
-        lines.append(bare_links(report))
+        yield bare_links(report)
     if report.open_links:
-        lines.append(
+        yield (
             f"not closed: {', '.join(report.open_links)}: what is said of the surface holds; an inside there is not, "
             "so spheres stick out of its convex hull"
         )
     if report.stray_spheres:
-        lines.append(f"{report.stray_spheres} spheres are on links without collision geometry")
-    return lines
+        yield f"{report.stray_spheres} spheres are on links without collision geometry"
 
 
 def _pairs_lines(result: PairsResult) -> list[str]:

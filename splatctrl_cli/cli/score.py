@@ -1,16 +1,16 @@
 """``splatctrl score``: renders views that did not train a scene and compares them with what was recorded."""
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from splatctrl_cli.cli.common import Console, table
+from splatctrl_cli.cli.common import Console, shown, table
 from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.score_report import PREFIX, counted
-from splatctrl_cli.jobs.device import shown
+from splatctrl_cli.jobs import device
 from splatctrl_cli.jobs.scores.fit import EACH, METHODS, FitRequest, score_fits
 from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.scores.views import CloudSettings
@@ -98,48 +98,47 @@ def _cloud(args: argparse.Namespace) -> CloudSettings | None:
     )
 
 
-def lines_of(report: Mapping[str, Any]) -> list[str]:
+def lines_of(report: Mapping[str, Any]) -> Iterable[str]:
     """The table of a report, and what belongs to its figures."""
     if "fits" in report:
         return _lines_of_fits(report)
     return _lines_of_scans(report) if "results" in report else _lines_of_views(report)
 
 
-def _lines_of_views(report: Mapping[str, Any]) -> list[str]:
+def _lines_of_views(report: Mapping[str, Any]) -> Iterator[str]:
     metrics, columns = report["metrics"], [name for name in COLUMNS if name in report["views"][0]]
     stamps = [f"{view['stamp_ns'] / 1e9:.3f}" if report["has_clock"] else "-" for view in report["views"]]
     rows = [
         [view["view"], stamp, *_cells(columns, view)] for view, stamp in zip(report["views"], stamps, strict=True)
     ]
-    lines = _with_mean(("view", "stamp [s]"), columns, rows, [f"mean of {len(rows)}", "-"], metrics)
-    lines += ["", *_protocol_lines(report["protocol"])]
-    lines.append(
+    yield from _with_mean(("view", "stamp [s]"), columns, rows, [f"mean of {len(rows)}", "-"], metrics)
+    yield from ("", *_protocol_lines(report["protocol"]))
+    yield (
         f"{counted(metrics['num_views'], 'view')} scored, {metrics['num_skipped']:.0f} before the first snapshot; "
         f"depth: median of the absolute error; seen: by {', '.join(report['training_cameras'])} within 2 cm"
     )
     if "chamfer" in metrics:
-        lines += _cloud_lines(metrics, report["protocol"]["definitions"]["cloud"])
+        yield from _cloud_lines(metrics, report["protocol"]["definitions"]["cloud"])
     if "psnr_all_corrected" in columns:
-        lines.append(
+        yield (
             "corrected: all pixels, at the pose and exposure that the view has among the training views, its depth"
             " freed of the bend that theirs was"
         )
-    lines.append("in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one")
+    yield "in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one"
     if metrics["free_mass"] is not None:
-        lines.append(f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free")
-    return lines
+        yield f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free"
 
 
-def _lines_of_scans(report: Mapping[str, Any]) -> list[str]:
+def _lines_of_scans(report: Mapping[str, Any]) -> Iterator[str]:
     metrics, results = report["metrics"], report["results"]
     columns = [name for name in COLUMNS if name in metrics]
     rows = [[s, one["metrics"]["num_views"], *_cells(columns, one["metrics"])] for s, one in results.items()]
     mean = [f"mean of {len(results)}", metrics["num_views"]]
-    lines = _with_mean(("scan", "views"), columns, rows, mean, metrics)
-    lines += ["", *_protocol_lines(report["protocol"])]
+    yield from _with_mean(("scan", "views"), columns, rows, mean, metrics)
+    yield from ("", *_protocol_lines(report["protocol"]))
     if "chamfer" in metrics:
-        lines += _cloud_lines(metrics, "; ".join(one["protocol"]["definitions"]["cloud"] for one in results.values()))
-    return lines
+        words = (one["protocol"]["definitions"]["cloud"] for one in results.values())
+        yield from _cloud_lines(metrics, "; ".join(words))
 
 
 def _with_mean(
@@ -162,13 +161,13 @@ def _lines_of_fits(report: Mapping[str, Any]) -> list[str]:
     metrics, settings, fits = report["metrics"], report["settings"], report["fits"]
     rows, psnr = [], {name: [fit["psnr"] for fit in fits if fit["method"] == name] for name in METHODS}
     for name, method in METHODS.items():
-        rest = [_number(metrics[f"{what}_{method.key}"]) for what in ("splats", "memory", "seconds")]
+        rest = [shown(metrics[f"{what}_{method.key}"], ".0f") for what in ("splats", "memory", "seconds")]
         scans = [_cell("psnr", value) for value in (*psnr[name], metrics[f"psnr_{method.key}"])]
         rows.append([method.name, f"{method.psnr:.2f}", method.splats, *scans, *rest])
     pairs = zip(psnr["budget"], psnr["3dgs"], strict=True)
     gains: list[float | None] = [METHODS["budget"].psnr - METHODS["3dgs"].psnr]
     gains += [None if None in pair else pair[0] - pair[1] for pair in pairs]
-    first, *others = [_number(value, "+.2f") for value in (*gains, metrics["psnr_gain"])]
+    first, *others = [shown(value, "+.2f") for value in (*gains, metrics["psnr_gain"])]
     rows.append(["ours - 3D-GS", first, "-", *others, "-", "-", "-"])
     header = ("method", "paper's dB", "paper's splats", *(f"{scan} dB" for scan in report["scans"]))
     devices = {fit["method"]: fit["devices"] for fit in fits}
@@ -181,7 +180,7 @@ def _lines_of_fits(report: Mapping[str, Any]) -> list[str]:
         *_protocol_lines(report["protocol"]),
         f"PSNR {report['psnr']}; {settings['splats']:,} splats to begin with, {settings['iterations']} iterations,"
         f" seed {settings['seed']}, the same losses; memory: the largest of the scans",
-        *(f"{METHODS[name].name} computed on {shown(on[-1])}" for name, on in devices.items()),
+        *(f"{METHODS[name].name} computed on {device.shown(on[-1])}" for name, on in devices.items()),
     ]
 
 
@@ -192,7 +191,7 @@ def _each_fit(fits: Sequence[Mapping[str, Any]]) -> list[str]:
         [
             *(fit["scan"], METHODS[fit["method"]].name, fit["splats"]),
             *_cells(names, fit["metrics"]),
-            *(_number(fit["memory"]), _number(fit["seconds"])),
+            *(shown(fit["memory"], ".0f"), shown(fit["seconds"], ".0f")),
         ]
         for fit in fits
     ]
@@ -250,7 +249,3 @@ def _cell(name: str, value: float | None) -> str:
     if name in SHARES:
         return f"{100 * value:.1f}%"
     return f"{value:.2f}" if name.startswith("psnr") else f"{value:.4f}"
-
-
-def _number(value: float | None, form: str = ".0f") -> str:
-    return "-" if value is None else format(value, form)

@@ -63,25 +63,24 @@ def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
     return Path(path), tuple(name.strip() for name in cameras.split(",") if name.strip())
 
 
-def _lines(result: BakeResult) -> list[str]:
+def _lines(result: BakeResult) -> Iterator[str]:
     """The summary, and a table for each thing that the field was compared with."""
     rows = [(name.replace("_", " "), _shown(value)) for name, value in result.summary.items()]
-    lines = table(("field", ""), rows)
+    yield from table(("field", ""), rows)
     truth, mesh, held_out = result.accuracy.truth, result.accuracy.reference_mesh, result.accuracy.held_out_depth
     if truth is not None:
-        lines += ["", *_truth_lines(truth)]
+        yield from ("", *_truth_lines(truth))
     if mesh is not None:
         cells = [(name, _band(band), *_errors(band)) for name, band in _each(mesh.accuracy.everywhere)]
-        lines += ["", *table(("field", "from mesh cm", *COLUMNS), cells)]
+        yield from ("", *table(("field", "from mesh cm", *COLUMNS), cells))
     if held_out is not None:
         note = "before it: points whose ball up to it was seen to be free"
-        lines += ["", f"held-out depth of {held_out.num_frames} frames; {note}"]
+        yield from ("", f"held-out depth of {held_out.num_frames} frames; {note}")
         places = {name: [("on it", band)] for name, band in held_out.on_surface.items()}
         for name, band in _each(held_out.before.seen):
             places[name].append((_band(band), band))
         cells = [(name, place, *_errors(band)) for name, bands in places.items() for place, band in bands]
-        lines += table(("field", "from depth cm", *COLUMNS), cells)
-    return lines
+        yield from table(("field", "from depth cm", *COLUMNS), cells)
 
 
 def _truth_lines(compared: TruthComparison) -> list[str]:

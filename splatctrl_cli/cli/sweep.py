@@ -40,7 +40,9 @@ def _lines(result: SweepResult, *, is_long: bool) -> Iterator[str]:
         yield from _least(result)
     if is_long:
         yield ""
-        yield from _all(result)
+        for flip in result.flips:
+            rows = [(f"{each.values[flip.key.name]:.6g}", each.label.upper(), each.folder) for each in flip.tried]
+            yield from table((flip.key.name, "verdict", "folder"), rows)
     yield ""
     yield f"{result.num_runs} runs, {result.num_new} of them new; wrote {result.out / 'sweep.json'}"
 
@@ -63,9 +65,3 @@ def _least(result: SweepResult) -> Iterator[str]:
     values = ", ".join(f"{name}={value:.6g}" for name, value in first.values.items())
     yield f"least change of all together: {values}: {first.label.upper()}, {result.least.length:.3f} of the ranges"
     yield f"  {first.sentence}"
-
-
-def _all(result: SweepResult) -> Iterator[str]:
-    for flip in result.flips:
-        rows = [(f"{each.values[flip.key.name]:.6g}", each.label.upper(), each.folder) for each in flip.tried]
-        yield from table((flip.key.name, "verdict", "folder"), rows)
