@@ -258,7 +258,7 @@ def _stamp_of(path: Path) -> str:
 
 
 def _files(folder: Path) -> list[Path]:
-    """None where it is a file."""
+    """The files below a folder; of a file there are none."""
     return sorted(place for place in folder.rglob("*") if place.is_file())
 
 

@@ -77,9 +77,7 @@ class Scheduler:
             ended, _ = wait(futures, timeout=AGAIN_S if is_busy else STILL_S, return_when=FIRST_COMPLETED)
             now = time.monotonic()
             if not ended and now - last >= STILL_S:
-                names = [node.name for node in futures.values()] or ["what another batch runs"]
-                more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-                self.progress.log(f"batch: still waits for {names[0]}{more}{self.hint()}")
+                self._tell_of([*futures.values()])
             last = now if ended or now - last >= STILL_S else last
             if is_busy and not futures:
                 time.sleep(AGAIN_S)
@@ -130,6 +128,12 @@ class Scheduler:
         line = clock.passed(run)
         if run.started >= clock.started or run.state == SKIPPED:
             self.progress.log(f"{line} {node.name}: {told(run)}{clock.left()}")
+
+    def _tell_of(self, nodes: Sequence[Node]) -> None:
+        """What is waited for."""
+        names = [node.name for node in nodes] or ["what another batch runs"]
+        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        self.progress.log(f"batch: still waits for {names[0]}{more}{self.hint()}")
 
     def _task(self, node: Node, key: str) -> Task:
         return Task(
