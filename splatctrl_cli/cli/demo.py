@@ -67,8 +67,7 @@ def run_simulate(args: argparse.Namespace) -> int:
     parts = () if args.unmodelled is None else names_of(args.unmodelled, tuple(UNMODELLED), "--unmodelled")
     of_arm: dict[str, Any] = {"is_slim": args.slim, "unmodelled": parts}
     request = request_of(SimulateRequest, args, out=args.out or Path("simulated"), options=options, **of_arm)
-    result = simulate(request, console)
-    return show_simulated(console, result)
+    return show_simulated(console, simulate(request, console))
 
 
 def show_simulated(console: Console, result: SimulateResult) -> int:

@@ -31,8 +31,7 @@ def _run_mcap(console: Console, args: argparse.Namespace) -> int:
     for name in ("labels", "layout", "isotropic"):
         if getattr(args, name):
             raise UsageError(f"--{name}: not with --mcap", remedy="leave it out")
-    request = request_of(ExportRunRequest, args, path=args.scene, roots=tuple(args.root))
-    result = export_run(request)
+    result = export_run(request_of(ExportRunRequest, args, path=args.scene, roots=tuple(args.root)))
     rows = [(topic, count) for topic, count in result.messages.items()]
     return console.result(
         result.as_dict(), [f"{result.file}: {result.bytes} bytes", *table(("topic", "messages"), rows)]

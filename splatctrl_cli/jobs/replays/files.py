@@ -81,11 +81,11 @@ def _step_columns(replay: Replay, rows: slice) -> Columns:
     def each(value: Callable[[ControlStep], object]) -> list[object]:
         return ["" if step is None else value(step) for step in steps]
 
+    def velocity_of(joint: int) -> list[object]:
+        return each(lambda step: float(step.velocity[joint]))
+
     return {
-        **{
-            f"v_{joint}": each(lambda step, j=j: float(step.velocity[j]))  # type: ignore[misc]
-            for j, joint in enumerate(replay.model.joint_names)
-        },
+        **{f"v_{joint}": velocity_of(j) for j, joint in enumerate(replay.model.joint_names)},
         "barrier_clearance": each(lambda step: step.clearance),
         "barrier_nearest": each(lambda step: step.nearest),
         "rung": each(lambda step: str(step.rung)),

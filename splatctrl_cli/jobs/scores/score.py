@@ -172,8 +172,8 @@ def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) 
     metrics |= {"free_mass": _free_mass(request.scene, scene), "num_skipped": len(scores.skipped)}
     metrics["num_warnings"] = len(scores.doubts) + len(same["differences"])
     report = _report(request, scorer, scores, same, protocol | {"definitions": definitions}, as_json(metrics))
-    is_damaged = bool(reference.source.loss.damaged)
-    result = replace(_concluded(request, report, is_damaged=is_damaged), first_view=scores.first)
+    concluded = _concluded(request, report, is_damaged=bool(reference.source.loss.damaged))
+    result = replace(concluded, first_view=scores.first)
     if folder:
         _write_table(folder / "views.csv", report["views"])
         with stopwatch.stage("pictures"):
@@ -322,8 +322,7 @@ def _score_scans(
         results[scan] = score_scene(alone, folder and folder / scan, progress)
     report = {"scenes": str(request.scene), "reference": str(request.recording.path)}
     report |= report_of_scans({scan: result.report for scan, result in results.items()})
-    is_damaged = any(result.verdict.is_damaged for result in results.values())
-    result = _concluded(request, report, is_damaged=is_damaged)
+    result = _concluded(request, report, is_damaged=any(one.verdict.is_damaged for one in results.values()))
     if folder is not None:
         names = [name for name in result.metrics if name != "num_scans" and not name.startswith(PREFIX)]
         rows = [{"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items()]
