@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.open3d_multiway import multiway
 from benchmarks.random_tabletop import random_things
 from benchmarks.scenes import SAMPLE, sample_robot
-from splatctrl_cli.calibration.unknowns import transform_of, twist_between
+from splatctrl_cli.calibration.evidence import transform_of, twist_between
 from splatctrl_cli.calibration.views import still_frame
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.errors import NotEvaluableError

@@ -16,7 +16,7 @@ from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.grid_files.grid_formats import write_grid
 from splatctrl_cli.sources.source import open_source
-from splatctrl_cli.splat_files.splat_formats import FORMATS
+from splatctrl_cli.splat_files.splats import FORMATS
 from tests.containers.test_log_formats import as_ros1_bag, as_ros2_folder
 from tests.grid_files.make_grid import random_grid
 from tests.logs.make_log import LogRecipe, make_log

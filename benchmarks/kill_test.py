@@ -29,9 +29,8 @@ from splatctrl_cli.cli.common import table
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.files.output import partial_path
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_source
-from splatctrl_cli.splat_files.splat_formats import FORMATS
+from splatctrl_cli.sources.source import describe, open_source
+from splatctrl_cli.splat_files.splats import FORMATS
 from tests.splat_files.test_gaussian_ply import gaussian_set
 
 _OWN = ("seconds", "arguments")  # of run.json

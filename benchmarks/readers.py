@@ -34,7 +34,7 @@ from splatctrl_cli.logs.messages import decode_rvl, read_image
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.urdf import read_urdf
-from splatctrl_cli.splat_files.splat_formats import FORMATS
+from splatctrl_cli.splat_files.splats import FORMATS
 from tests.containers.test_foxglove import descriptor_set
 from tests.containers.test_log_formats import as_ros1_bag, as_ros2_folder
 from tests.datasets.make_layout import make_nerfstudio, make_redwood, make_tum

@@ -28,7 +28,7 @@ from splatctrl_cli.jobs.judged_runs import Compared, documented
 from splatctrl_cli.jobs.replays.criteria_input import Judged
 from splatctrl_cli.jobs.replays.verdict import CRITERIA
 from splatctrl_cli.splat_files.splat_format import SplatFormat
-from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS
+from splatctrl_cli.splat_files.splats import FORMATS as SPLAT_FORMATS
 
 DOCS = Path(__file__).parent
 NOTICE = "<!-- Made by docs/generate.py; `make docs` writes it again. -->"

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.calibration.evidence import Evidence
-from splatctrl_cli.calibration.unknowns import DEPTH, OF_CAMERA, POSE, Estimate, Unknowns, twist_between
+from splatctrl_cli.calibration.evidence import DEPTH, OF_CAMERA, POSE, Estimate, Evidence, Unknowns, twist_between
 from splatctrl_cli.calibration.views import DepthView, depth_sigma, landed, overlap_rows
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, transform_points

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.calibration.adjustment import Adjustment, Widths
-from splatctrl_cli.calibration.unknowns import POSE, Estimate, Unknowns
+from splatctrl_cli.calibration.evidence import POSE, Estimate, Unknowns
 from splatctrl_cli.calibration.views import DepthView
 from splatctrl_cli.config import fixed
 from splatctrl_cli.records import Float64

@@ -7,8 +7,7 @@ import numpy as np
 
 from splatctrl_cli.calibration.adjustment import ROBOT, Adjustment, Widths
 from splatctrl_cli.calibration.certainty import Certainty, certainty_of, middle_of
-from splatctrl_cli.calibration.evidence import Evidence
-from splatctrl_cli.calibration.unknowns import POSE, Estimate, Unknowns, twist_between
+from splatctrl_cli.calibration.evidence import POSE, Estimate, Evidence, Unknowns, twist_between
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Float64

@@ -10,11 +10,10 @@ from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.config.fixed import TF_GAP_NS
 from splatctrl_cli.logs.decoder import CAMERA_INFO
-from splatctrl_cli.logs.image_stamps import pair_by_stamp
 from splatctrl_cli.logs.registration import DISTORTION_MODELS, NUM_COEFFICIENTS, SAME_MODELS
 from splatctrl_cli.logs.rig import Camera, intrinsics_of, nearest_gap_ns
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
-from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
+from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey, pair_by_stamp
 from splatctrl_cli.records import Float64, Intrinsics
 
 NUM_DISTORTION = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from splatctrl_cli.checks.check_cameras import calibration_findings, camera_findings, tf_findings
+from splatctrl_cli.checks.check_folder import Evidence, judged
 from splatctrl_cli.checks.check_images import depth_findings, image_findings, sample_findings
 from splatctrl_cli.checks.check_states import log_states
 from splatctrl_cli.checks.check_times import (
@@ -17,7 +18,6 @@ from splatctrl_cli.checks.check_times import (
     time_findings,
 )
 from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, warning
-from splatctrl_cli.checks.judge_evidence import Evidence, judged
 from splatctrl_cli.checks.log_pass import LogWatch, checked_camera, image_motion, ready
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.errors import InputError

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from splatctrl_cli.calibration.unknowns import transform_of
+from splatctrl_cli.calibration.evidence import transform_of
 from splatctrl_cli.calibration.views import landed, overlap_rows, surface_normals
 from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.finding import Finding, error, warning

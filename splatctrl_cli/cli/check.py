@@ -10,7 +10,7 @@ from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.evaluate.verdict import DAMAGED
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.check import CheckRequest, check
-from splatctrl_cli.sources.describe import describe
+from splatctrl_cli.sources.source import describe
 
 WIDTH = 118  # columns of text
 

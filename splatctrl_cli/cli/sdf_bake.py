@@ -10,8 +10,7 @@ from splatctrl_cli.cli.common import Console, labels_of, table
 from splatctrl_cli.cli.options import names_of, request_of
 from splatctrl_cli.config import load_config
 from splatctrl_cli.config.fixed import PROBABILITY_NEAR
-from splatctrl_cli.evaluate.field_accuracy import BandAccuracy
-from splatctrl_cli.evaluate.field_truth import TruthComparison
+from splatctrl_cli.evaluate.field_accuracy import BandAccuracy, TruthComparison
 from splatctrl_cli.field.baker import CHANNELS
 from splatctrl_cli.grid_files.grid_formats import FORMATS
 from splatctrl_cli.jobs.bakes.bake import BakeResult, bake

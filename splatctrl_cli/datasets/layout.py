@@ -23,8 +23,8 @@ from splatctrl_cli.datasets.folder_description import (
 from splatctrl_cli.datasets.poses import read_matrix_file, read_numbers
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.image_file import decode_file, image_head
-from splatctrl_cli.logs.image_stamps import pair_by_stamp
 from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.logs.survey import pair_by_stamp
 from splatctrl_cli.records import Float64
 
 CAMERA = "camera"  # the name of a layout's only lens

@@ -8,14 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.calibration.arm import Arm
-from splatctrl_cli.calibration.board import Board, Sighting, other_size, sighting_of
-from splatctrl_cli.calibration.board_start import Rig, board_start
+from splatctrl_cli.calibration.board import Board, Rig, Sighting, board_start, other_size, sighting_of
 from splatctrl_cli.calibration.calibration_file import CalibratedCamera, Calibration, calibration_text
 from splatctrl_cli.calibration.certainty import plane_of, unobserved
-from splatctrl_cli.calibration.evidence import Evidence, evidence_of, moving_cameras
+from splatctrl_cli.calibration.evidence import Arm, Estimate, Evidence, evidence_of, moving_cameras, twist_of
 from splatctrl_cli.calibration.solution import Solution, solved
-from splatctrl_cli.calibration.unknowns import Estimate, twist_of
 from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError

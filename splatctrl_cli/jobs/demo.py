@@ -36,8 +36,7 @@ from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, fie
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.render import render
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, open_scene
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.sources.source import describe, open_source
 
 TRAINING, SCORING = ("cam0", "cam1", "cam2"), ("cam3",)
 CLOSED_LOOP_START = 1.6  # [s]: the visitor appears ahead of the driven arm; started earlier, right where it is

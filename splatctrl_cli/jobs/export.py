@@ -17,14 +17,17 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render
-from splatctrl_cli.splat_files.splat_format import Differences, differences, refuse
-from splatctrl_cli.splat_files.splat_formats import FORMATS, REFERENCE_PLY, SplatFormat, format_of, read_splats
+from splatctrl_cli.splat_files.gaussian_ply import REFERENCE_PLY
+from splatctrl_cli.splat_files.splat_format import Differences, SplatFormat, differences, refuse
 from splatctrl_cli.splat_files.splats import (
+    FORMATS,
     as_gaussians,
     as_splats,
     check_no_shell,
+    format_of,
     nearest_splats,
     read_ply,
+    read_splats,
     write_ply,
 )
 

@@ -17,7 +17,7 @@ from splatctrl_cli import __version__
 from splatctrl_cli.config.fixed import BANDS
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate import field_accuracy, score_report
-from splatctrl_cli.evaluate.field_truth import FIELDS
+from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.metrics import Better, Scale, Shown
 from splatctrl_cli.files.output import PARTIAL, output_path
 from splatctrl_cli.jobs import robot

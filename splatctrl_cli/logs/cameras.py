@@ -10,9 +10,8 @@ from splatctrl_cli.containers.log_formats import told_formats
 from splatctrl_cli.containers.raw_log import RawLog, Topic
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.libraries import is_installed
-from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, VIDEO, is_ros
+from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, VIDEO, device_of, is_ros
 from splatctrl_cli.logs.messages import ImageMessage
-from splatctrl_cli.logs.realsense import device_of
 from splatctrl_cli.logs.source_options import CameraTopics
 from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.logs.video import EXTRA, KEY_FRAME, LIBRARY, OFTENER, is_video

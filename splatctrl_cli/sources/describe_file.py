@@ -19,8 +19,8 @@ from splatctrl_cli.files.arrays import DAMAGE, npy_head, read_arrays
 from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
-from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS
-from splatctrl_cli.splat_files.splat_formats import describe_splats
+from splatctrl_cli.splat_files.splats import FORMATS as SPLAT_FORMATS
+from splatctrl_cli.splat_files.splats import describe_splats
 
 _LIST_LIMIT = 12  # longer lists are counted, not shown
 

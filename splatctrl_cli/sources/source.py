@@ -1,22 +1,35 @@
-"""Opens any recorded input as records in time order."""
+"""Opens any recorded input as records in time order, and describes what any file or folder is and holds."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from splatctrl_cli.calibration.calibration_file import describe_calibration, is_calibration
 from splatctrl_cli.captures.capture import CaptureSource, robot_description_of
-from splatctrl_cli.captures.capture_header import is_capture
-from splatctrl_cli.containers.log_formats import SessionLog, open_raw_log
+from splatctrl_cli.captures.capture_header import is_capture, read_capture_header
+from splatctrl_cli.captures.capture_writer import check_not_partial
+from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.containers.log_formats import CONTAINERS, SUFFIXES, SessionLog, is_bag_folder, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
-from splatctrl_cli.datasets.image_folder import ImageFolderSource, open_image_folder
-from splatctrl_cli.datasets.layouts import has_views, open_layout
+from splatctrl_cli.datasets.image_folder import ImageFolderSource, RigFolderSource, open_image_folder
+from splatctrl_cli.datasets.layouts import BARE_REMEDY, bare_images, has_views, layout_of, open_layout, readable_in
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.summary import Grid, Summary, files_below, names_in
+from splatctrl_cli.grid_files.grid_format import FORMAT, covers, header_facts
+from splatctrl_cli.logs.rig import camera_topics, missing
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
-from splatctrl_cli.logs.stored_frame import FrameSource
-from splatctrl_cli.logs.survey import RobotDescription, robot_descriptions
+from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.logs.survey import NAME as ROBOT
+from splatctrl_cli.logs.survey import RobotDescription, Survey, TopicSurvey, robot_descriptions, survey_to_describe
+from splatctrl_cli.logs.video import SUFFIXES as VIDEOS
 from splatctrl_cli.logs.video import open_log
+from splatctrl_cli.scene_files.scene_folder import run_value
+from splatctrl_cli.scene_files.voxel_file import known_space, read_occupancy
 from splatctrl_cli.sources.calibrated import calibrated
+from splatctrl_cli.sources.describe_file import describe_file
 
 __all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_source"]
 
@@ -91,3 +104,210 @@ def open_logs(paths: Sequence[Path]) -> RawLog | None:
             raise InputError(f"{path}: expected a log beside others, got none", remedy="give it alone")
     logs = tuple(open_log(path) for path in paths)
     return logs[0] if len(logs) == 1 else SessionLog(logs)
+
+
+def describe(path: Path, options: SourceOptions | None = None) -> Summary:
+    """Describe `path`. Raises InputError where there is nothing, or nothing known."""
+    options = options or SourceOptions()
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    if path.is_dir():
+        return _describe_folder(path, options)
+    with path.open("rb") as stream:
+        start = stream.read(16)
+    if start.startswith(tuple(kind.magic for kind in CONTAINERS)) or path.suffix in (*SUFFIXES, *VIDEOS):
+        return describe_log(open_log(path), options)
+    if path.suffix == ".toml" and is_calibration(path):
+        return describe_calibration(path)
+    if path.suffix == ".toml":
+        return _describe_images(path, open_image_folder(path, options), "image folder")
+    if (layout := layout_of(path)) is not None:
+        return _describe_images(path, open_layout(path, options), layout.name)
+    return describe_file(path)
+
+
+def describe_log(log: RawLog, options: SourceOptions) -> Summary:
+    """Topics, times, frames, cameras, and what a reconstruction would lack."""
+    found, sampling = survey_to_describe(log)
+    with_messages = [t for t in found.topics.values() if t.count]
+    facts: dict[str, object] = {
+        "bytes": sum(file.stat().st_size for file in log.files),
+        "messages": found.num_messages,
+    }
+    if with_messages:
+        first, last = min(t.first_log_ns for t in with_messages), max(t.last_log_ns for t in with_messages)
+        facts |= {"start_s": first * 1e-9, "end_s": last * 1e-9, "duration_s": (last - first) * 1e-9}
+    if found.tf.frames:
+        facts |= {"tf_frames": list(found.tf.frames), "tf_roots": list(found.tf.roots)}
+    joints = next((t.joints.first_names for t in found.topics.values() if t.joints.first_names is not None), ())
+    if joints:
+        facts["joints"] = list(joints)
+    robots = [name for name, t in sorted(found.topics.items()) if t.count and name.endswith(f"/{ROBOT}")]
+    if robots:
+        facts[ROBOT] = robots
+    grids = [Grid(name="topics", header=_TOPIC_COLUMNS, rows=[_topic_row(t) for t in _by_name(found)])]
+    cameras = camera_topics(log, found, options)
+    if cameras:
+        rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
+        grids.append(Grid(name="cameras", header=("camera", "color", "depth", "camera_info"), rows=rows))
+    lacks = missing(log, found, options) if found.num_messages else ["the log holds no messages"]
+    notes = [*sampling, *found.damage.notes, *found.tf.notes]
+    return Summary(
+        path=str(log.path),
+        kind=log.container,
+        facts=facts,
+        grids=tuple(grids),
+        missing=tuple(lacks),
+        notes=tuple(notes),
+        damaged=found.damage.count,
+    )
+
+
+_TOPIC_COLUMNS = ("topic", "type", "encoding", "count", "hz", "first message")
+
+
+def _by_name(found: Survey) -> list[TopicSurvey]:
+    return [found.topics[name] for name in sorted(found.topics)]
+
+
+def _topic_row(entry: TopicSurvey) -> list[object]:
+    span = (entry.last_log_ns - entry.first_log_ns) * 1e-9
+    rate = f"{(entry.count - 1) / span:.2f}" if entry.count > 1 and span > 0 else "-"
+    return [
+        entry.topic.name,
+        entry.topic.schema or entry.topic.type_name or "-",
+        entry.topic.encoding or "-",
+        entry.count,
+        rate,
+        _first(entry),
+    ]
+
+
+def _first(entry: TopicSurvey) -> str:
+    image, calibration = entry.first_image, entry.calibration
+    if image is not None:
+        wrapped = " compressed" if image.compressed is not None else ""
+        return f"{image.width}x{image.height} {image.encoding}{wrapped} in frame {image.frame_id!r}"
+    if calibration is not None:
+        K = calibration.K
+        return f"{calibration.width}x{calibration.height} fx {K[0, 0]:.1f} cx {K[0, 2]:.1f} cy {K[1, 2]:.1f}"
+    if entry.joints.first_names is not None:
+        return f"{len(entry.joints.first_names)} joints"
+    return "-"
+
+
+_KNOWN_FILES = ("run.json", "splats.ply", "occupancy.npz", "field.json")
+
+
+def _describe_folder(path: Path, options: SourceOptions) -> Summary:
+    if is_capture(path):
+        return _describe_capture(path)
+    check_not_partial(path)
+    if is_bag_folder(path):
+        return describe_log(open_log(path), options)
+    if (layout := layout_of(path)) is not None:
+        return _describe_images(path, open_layout(path, options), layout.name)
+    names = {name for name in _KNOWN_FILES if (path / name).is_file()}
+    is_dtu = all((path / name).is_dir() for name in ("Cameras", "Rectified"))
+    if not ("run.json" in names or "splats.ply" in names or is_dtu):
+        inside = readable_in(path)
+        if not inside and (found := bare_images(path)):
+            raise InputError(f"{path}: {found}", remedy=BARE_REMEDY)
+        raise InputError(
+            f"{path}: a folder of no known kind",
+            remedy=f"give one that is in it: {inside}"
+            if inside
+            else "expected a capture, ROS 2 bag, dataset folder (docs/formats.md), MVSNet scan, output of splatctrl;"
+            " for other images give their .toml",
+        )
+    field = _field_facts(path / "field.json") if "field.json" in names else {}
+    kind = "MVSNet scan" if is_dtu else "scene folder" if "splats.ply" in names else "run folder"
+    kind = "field folder" if field else kind
+    rows: list[list[object]] = []
+    for name in names_in(path)[:1000]:
+        file = path / name
+        rows.append([name + "/" if file.is_dir() else name, *files_below(file)])
+    count, size = files_below(path)
+    facts: dict[str, object] = {"files": count, "bytes": size}
+    if "splats.ply" in names:
+        facts["splats"] = describe_file(path / "splats.ply").facts
+    if "occupancy.npz" in names:
+        facts["space"] = _known_space(path, has_run="run.json" in names)
+    facts |= field
+    if "run.json" in names and not field:
+        run = describe_file(path / "run.json").facts
+        facts["run"] = {key: value for key, value in run.items() if key != "config"}  # `info run.json` shows it
+    grid = Grid(name="files", header=("name", "files", "bytes"), rows=rows)
+    return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,))
+
+
+def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
+    """What is known at the end of a scene, by the thresholds it was made with."""
+    run: Mapping[str, Any] = describe_file(path / "run.json").facts if has_run else {}
+
+    def used(name: str, default: float) -> float:
+        return run_value(run, ("config", "occupancy", name), _probability, default, where=str(path / "run.json"))
+
+    thresholds = OccupancyConfig()
+    low, high = used("free_below", thresholds.free_below), used("occupied_above", thresholds.occupied_above)
+    return known_space(
+        read_occupancy(path / "occupancy.npz"), replace(thresholds, free_below=low, occupied_above=high)
+    )
+
+
+def _probability(value: Any) -> float:
+    number = float(value)
+    if not 0.0 < number < 1.0:
+        raise ValueError(f"{number}, expected a probability between 0 and 1")
+    return number
+
+
+def _field_facts(path: Path) -> dict[str, object]:
+    """What a distance grid covers and how it was made; empty where the file is none of ours."""
+    header: Mapping[str, Any] = describe_file(path).facts
+    if header.get("format") != FORMAT or not {"shape", "first_cell", "voxel"} <= header.keys():
+        return {}
+    return {**covers(header["first_cell"], header["voxel"], header["shape"]), **header_facts(header)}
+
+
+def _describe_capture(path: Path) -> Summary:
+    header = read_capture_header(path)
+    rows = []
+    for name, camera in header["cameras"].items():
+        size = f"{camera['width']}x{camera['height']}"
+        rows.append([name, camera["num_frames"], size, camera["fx"], camera["depth_scale"]])
+    loss: dict[str, Any] = header["loss"]
+    facts: dict[str, object] = {
+        "recorded_from": header["name"],
+        "world_frame": header["world_frame"],
+        "has_clock": header["has_clock"],
+        "joints": header["joint_names"],
+        "loss": {key: value for key, value in loss.items() if key != "notes"},
+        "sources": len(header["sources"]),
+    }
+    grid = Grid(name="cameras", header=("camera", "frames", "size", "fx", "depth_scale"), rows=rows)
+    return Summary(path=str(path), kind="capture", facts=facts, grids=(grid,), notes=tuple(loss.get("notes", ())))
+
+
+def _describe_images(path: Path, source: ImageFolderSource | RigFolderSource, kind: str) -> Summary:
+    first = next((item for item in source.stored() if isinstance(item, StoredFrame)), None)
+    counts = source.count_views()
+    facts: dict[str, object] = {"has_clock": source.has_clock}
+    if first is not None:
+        valid = first.frame.depth > 0
+        intrinsics = first.frame.intrinsics
+        facts |= {
+            "size": f"{intrinsics.width}x{intrinsics.height}",
+            "fx_fy_cx_cy": [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy],
+            "first_valid_depth_share": round(float(valid.mean()), 4),
+        }
+    loss = source.loss
+    facts["loss"] = {
+        "unpaired_color": loss.unpaired_color,
+        "unpaired_depth": loss.unpaired_depth,
+        "without_pose": loss.without_pose,
+    }
+    grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])
+    refusal = lacks_depth(source)
+    lacks = () if refusal is None else (str(refusal)[str(refusal).index("depth is missing") :],)
+    return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,), missing=lacks, notes=tuple(loss.notes))

@@ -1,4 +1,4 @@
-"""Isotropic splats: as 3D-GS PLY files that stock viewers open, plus label and density; as Gaussians, and back.
+"""Splats in files: isotropic ones as 3D-GS PLY, as Gaussians and back; any format by suffix.
 
 Layout: the reference implementation's names and order without ``f_rest_*`` (degree-0 colour): ``x y z nx ny nz
 f_dc_0..2 opacity scale_0..2 rot_0..3``, then ``label`` (uchar) and ``density`` (float). The normals are zeros:
@@ -7,15 +7,28 @@ equal log(radius), ``rot`` is 1 0 0 0, ``opacity`` is a logit and ``f_dc`` is ``
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.ply import PlyFile, read_table, write_table
-from splatctrl_cli.records import Bool, Float32, GaussianSet, SplatSet
-from splatctrl_cli.splat_files.gaussian_ply import labels_of
-from splatctrl_cli.splat_files.splat_format import SH_C0, check_finite, logit, refuse, sigma_of_log, sigmoid
+from splatctrl_cli.files.summary import Summary
+from splatctrl_cli.libraries import entries_of
+from splatctrl_cli.records import Bool, Float32, GaussianSet, Label, SplatSet
+from splatctrl_cli.splat_files.gaussian_ply import gaussians_of, labels_of
+from splatctrl_cli.splat_files.splat_format import (
+    SH_C0,
+    Comments,
+    SplatFormat,
+    check_finite,
+    logit,
+    refuse,
+    sigma_of_log,
+    sigmoid,
+)
 
 MAX_SCALE_SPREAD = 1e-5  # largest difference of log scales that still reads as isotropic
 NAMES = (
@@ -205,3 +218,72 @@ def check_splats(where: str, splats: SplatSet) -> None:
     check_finite(where, len(splats), groups)
     refuse(where, "radius", splats.radii, splats.radii <= 0, "more than 0 m")
     refuse(where, "opacity", splats.opacities, (splats.opacities < 0) | (splats.opacities > 1), "0 to 1")
+
+
+FORMATS: Mapping[str, SplatFormat] = {kind.suffix: kind for kind in entries_of(__package__, SplatFormat)}
+
+
+def format_of(path: Path) -> SplatFormat:
+    """The format that the suffix of `path` names, PLY without one. Raises UsageError for an unknown one."""
+    found = FORMATS.get(path.suffix.lower() or ".ply")
+    if found is None:
+        raise UsageError(f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}")
+    return found
+
+
+def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
+    """What a file of splats holds, and its comments: a SplatSet where all are round and of one colour by side.
+
+    Raises InputError for a file that is missing, not whole, of an unknown kind, or holds what is no splat.
+    """
+    try:
+        kind = format_of(path)
+    except UsageError as error:
+        raise InputError(error.message) from None
+    if kind is not FORMATS[".ply"]:
+        gaussians, comments = kind.read(path)
+        return (as_splats(gaussians, str(path)) if is_isotropic(gaussians) else gaussians), comments
+    ply = read_table(path, "vertex", REQUIRED)
+    has_rest = any(name.startswith("f_rest_") and ply.column(name).any() for name in ply.names)
+    if num_stretched(ply) == 0 and not has_rest:
+        return splats_of(ply), ply.pairs()
+    return gaussians_of(ply), ply.pairs()
+
+
+def read_spheres(path: Path) -> SplatSet:
+    """The splats of a file of any format as spheres in the world, which have distances; harmonics above the constant
+    one are only colour and are left out. Raises InputError as `read_splats`, and for splats that are not
+    round, in another unit or another frame.
+    """
+    if (path.suffix.lower() or ".ply") == ".ply":
+        return read_world_splats(path)
+    found, comments = read_splats(path)
+    check_world(path, comments)
+    if isinstance(found, SplatSet):
+        return found
+    return as_splats(replace(found, harmonics=found.harmonics[:, :1]), str(path))
+
+
+def describe_splats(path: Path, _head: bytes) -> Summary:
+    """Number, shape, box and ranges of the splats of a file. Raises InputError for a file of another kind."""
+    found, comments = read_splats(path)
+    gaussians = as_gaussians(found) if isinstance(found, SplatSet) else found
+    facts: dict[str, object] = {
+        "format": format_of(path).name,
+        "splats": len(gaussians),
+        "shape": "isotropic" if isinstance(found, SplatSet) else "anisotropic",
+        "degree_of_harmonics": int(np.sqrt(gaussians.harmonics.shape[1])) - 1,
+    }
+    if (gaussians.labels != Label.OBJECT).any():
+        facts["labels"] = {label.name.lower(): int(np.count_nonzero(gaussians.labels == label)) for label in Label}
+    if len(gaussians):
+        facts["lower_m"] = _rounded(gaussians.centers.min(axis=0))
+        facts["upper_m"] = _rounded(gaussians.centers.max(axis=0))
+        facts["sigma_m"] = _rounded(np.percentile(gaussians.scales, [0, 50, 100]))
+        facts["opacity"] = _rounded(np.percentile(gaussians.opacities, [0, 50, 100]))
+    facts["comments"] = comments
+    return Summary(path=str(path), kind="splats", facts=facts)
+
+
+def _rounded(values: NDArray[np.floating]) -> list[float]:
+    return [float(f"{value:.4g}") for value in values]

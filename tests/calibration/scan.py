@@ -12,8 +12,8 @@ import numpy as np
 
 from benchmarks.calibration import SetUp, write_log
 from splatctrl_cli.calibration.board import Board, matrix_of
-from splatctrl_cli.calibration.depth_bend import bends_alone, unbent
-from splatctrl_cli.calibration.unknowns import transform_of
+from splatctrl_cli.calibration.evidence import transform_of
+from splatctrl_cli.calibration.pose_refinement import bends_alone, unbent
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import back_project, invert_transform
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate

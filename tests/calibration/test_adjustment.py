@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.calibration.unknowns import HELD, Estimate, Unknowns, transform_of, twist_between, twist_of
+from splatctrl_cli.calibration.evidence import HELD, Estimate, Unknowns, transform_of, twist_between, twist_of
 from splatctrl_cli.calibration.views import DepthView, landed, overlap_rows, still_frame, strided, surface_normals
 from splatctrl_cli.geometry import back_project, look_at, transform_points
 from splatctrl_cli.records import Intrinsics, RgbdFrame

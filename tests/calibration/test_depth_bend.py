@@ -7,10 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.calibration.depth_bend import BentViews, bends_alone, largest_share, stretch, unbent
+from splatctrl_cli.calibration.evidence import HELD, transform_of
 from splatctrl_cli.calibration.gray_views import gray_view, rows_of
-from splatctrl_cli.calibration.pose_refinement import FoundBends, depth_bends, freed, refined_poses
-from splatctrl_cli.calibration.unknowns import HELD, transform_of
+from splatctrl_cli.calibration.pose_refinement import (
+    BentViews,
+    FoundBends,
+    bends_alone,
+    depth_bends,
+    freed,
+    largest_share,
+    refined_poses,
+    stretch,
+    unbent,
+)
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Float64, RgbdFrame

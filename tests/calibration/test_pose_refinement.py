@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.calibration.exposure import exposed, exposure_gains
+from splatctrl_cli.calibration.evidence import transform_of
+from splatctrl_cli.calibration.gray_views import exposed, exposure_gains
 from splatctrl_cli.calibration.pose_refinement import refined_poses
-from splatctrl_cli.calibration.unknowns import transform_of
 from splatctrl_cli.calibration.views import by_twists
 from splatctrl_cli.geometry import invert_transform, transform_from, transform_points
 from splatctrl_cli.jobs.progress import SILENT

@@ -12,8 +12,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.logs import ros_log
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import StoredFrame
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.sources.source import describe, open_source
 from tests.logs.make_log import LogRecipe, make_log
 
 

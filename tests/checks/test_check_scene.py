@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.calibration.exposure import exposed
+from splatctrl_cli.calibration.gray_views import exposed
 from splatctrl_cli.checks.check_arm import motion_findings
+from splatctrl_cli.checks.check_folder import exposure_findings, usable_frames
 from splatctrl_cli.checks.check_images import alignment_findings
 from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.checks.check_states import log_states
 from splatctrl_cli.checks.check_views import ViewsCheck, check_views
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import Finding, Severity
-from splatctrl_cli.checks.judge_evidence import exposure_findings, usable_frames
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.logs.source_options import SourceOptions

@@ -22,7 +22,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import npy_of
 from splatctrl_cli.robot.link_meshes import mesh_path
 from splatctrl_cli.robot.urdf import MeshShape
-from splatctrl_cli.splat_files.splat_formats import FORMATS
+from splatctrl_cli.splat_files.splats import FORMATS
 from tests.datasets.make_layout import make_tum
 from tests.files.make_npz import write_zeros
 from tests.logs.make_log import LogRecipe, make_log
@@ -133,7 +133,7 @@ CODES = {"grid announced": {0, 4}, "splats announced": {0, 4}, "states of 16 GiB
 RUN = """
 import resource, sys
 from splatctrl_cli.cli.main import main
-import splatctrl_cli.cli.recordings, cv2, numpy, splatctrl_cli.sources.source, splatctrl_cli.sources.describe
+import splatctrl_cli.cli.recordings, cv2, numpy, splatctrl_cli.sources.source, splatctrl_cli.sources.source
 pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + 2**30
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
@@ -192,7 +192,7 @@ def test_a_npy_file_is_read_as_numpy_reads_it_and_no_further() -> None:
 RUN_LINES = """
 import contextlib, io, sys
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.splat_files.splat_formats import FORMATS
+from splatctrl_cli.splat_files.splats import FORMATS
 for line in sys.stdin:
     said = io.StringIO()
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):

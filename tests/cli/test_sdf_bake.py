@@ -10,8 +10,7 @@ from splatctrl_cli.cli.parser import words
 from splatctrl_cli.cli.sdf_bake import split_cameras
 from splatctrl_cli.config import ControlConfig, FieldConfig
 from splatctrl_cli.control import qp
-from splatctrl_cli.evaluate.field_accuracy import metric_names
-from splatctrl_cli.evaluate.field_truth import FIELDS
+from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_names
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_field import exact_channel
@@ -20,8 +19,7 @@ from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.bakes.bake import SUMMARY_METRICS
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.truth import load_truth
-from splatctrl_cli.splat_files import splat_formats
-from splatctrl_cli.splat_files.splats import write_ply
+from splatctrl_cli.splat_files.splats import FORMATS, write_ply
 from tests.cli import here
 from tests.cli.test_command_line import splatctrl
 from tests.field.scenes import cloud, splat_set
@@ -174,7 +172,7 @@ def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
     assert tuple(probability.PROBABILITIES) == words(FieldConfig, "probability")
     assert tuple(qp.SOLVERS) == words(ControlConfig, "solver")
     assert tuple(grid_formats.FORMATS) == scene_options.GRID_FORMATS
-    assert tuple(splat_formats.FORMATS) == scene_options.SPLAT_FORMATS
+    assert tuple(FORMATS) == scene_options.SPLAT_FORMATS
     assert tuple(baker.CHANNELS) == scene_options.CHANNELS
     assert scene_options.CHANNELS[:4] == baker.DEFAULT_CHANNELS
 

@@ -23,8 +23,7 @@ from splatctrl_cli.containers.foxglove import DEFINITIONS, MessageTypes
 from splatctrl_cli.containers.raw_log import RawMessage, Topic
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOINT_STATE, MessageDecoder
 from splatctrl_cli.records import JointState, RgbdFrame
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.sources.source import describe, open_source
 from tests.containers.test_log_formats import assert_same
 from tests.logs.make_log import LogRecipe, make_log, messages_of, rewritten, write_bag
 from tests.logs.make_log import encoded as ros_message

@@ -10,8 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import JointState, Record, RgbdFrame
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.sources.source import describe, open_source
 from tests.logs.make_log import STORE, LogRecipe, make_log, messages_of, write_bag
 
 

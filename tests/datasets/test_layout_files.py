@@ -13,8 +13,7 @@ from splatctrl_cli.files.image_file import write_pfm
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_logs, open_source
+from splatctrl_cli.sources.source import describe, open_logs, open_source
 from tests.datasets.make_layout import (
     GIVEN,
     HEIGHT,

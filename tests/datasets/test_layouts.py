@@ -14,8 +14,7 @@ from splatctrl_cli.datasets.layouts import LAYOUTS, layout_of
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.sources.source import describe, open_source
 from tests.datasets.make_layout import (
     EXAMPLES,
     GIVEN,

@@ -11,7 +11,7 @@ import trimesh
 
 from splatctrl_cli.config.fixed import ROBOT_MARGIN
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.evaluate.field_truth import TrueCells, TruthComparison, compare_with_mesh, compare_with_truth
+from splatctrl_cli.evaluate.field_accuracy import TrueCells, TruthComparison, compare_with_mesh, compare_with_truth
 from splatctrl_cli.evaluate.held_out_depth import compare_with_held_out_depth, counted_pixels
 from splatctrl_cli.evaluate.views import surface_points
 from splatctrl_cli.geometry import look_at

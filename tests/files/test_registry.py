@@ -9,8 +9,8 @@ from splatctrl_cli.datasets.layouts import LAYOUTS
 from splatctrl_cli.files.summary import files_below, names_in
 from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
 from splatctrl_cli.libraries import entries_of
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS
+from splatctrl_cli.sources.source import describe
+from splatctrl_cli.splat_files.splats import FORMATS as SPLAT_FORMATS
 
 
 @dataclass(frozen=True)

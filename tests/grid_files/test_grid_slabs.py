@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.grid_files.grid_slabs import GridSlabs, SlabPlan, resume_slabs, start_slabs
+from splatctrl_cli.grid_files.grid_format import GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.records import DistanceGrid
 from tests.grid_files.make_grid import SHAPE, random_grid
 

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.calibration import T_HAND_WRIST, WRIST, SetUp, errors
 from splatctrl_cli.calibration.calibration_file import read_calibration
-from splatctrl_cli.calibration.unknowns import transform_of, twist_between
+from splatctrl_cli.calibration.evidence import transform_of, twist_between
 from splatctrl_cli.checks import check_log
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError

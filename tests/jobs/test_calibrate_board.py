@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration import T_HAND_WRIST, WRIST, SetUp, errors
-from splatctrl_cli.calibration.board import Board, board_of, sighting_of
-from splatctrl_cli.calibration.board_start import hand_eye
-from splatctrl_cli.calibration.unknowns import transform_of, twist_between
+from splatctrl_cli.calibration.board import Board, board_of, hand_eye, sighting_of
+from splatctrl_cli.calibration.evidence import transform_of, twist_between
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.geometry import invert_transform, look_at
 from splatctrl_cli.jobs.calibrate import CalibrateResult

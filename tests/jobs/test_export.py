@@ -16,8 +16,7 @@ from splatctrl_cli.jobs.export import ExportRequest, ExportResult
 from splatctrl_cli.records import Float64, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
-from splatctrl_cli.splat_files.splat_formats import FORMATS
-from splatctrl_cli.splat_files.splats import as_gaussians, read_ply, write_ply
+from splatctrl_cli.splat_files.splats import FORMATS, as_gaussians, read_ply, write_ply
 from tests.jobs.export_scene import ball, written
 
 

@@ -22,8 +22,7 @@ from splatctrl_cli.jobs.replays.inputs import open_log
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.reports.spaces import space_of
 from splatctrl_cli.robot.urdf import read_urdf
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.sources.source import describe, open_source
 from tests.jobs.bakes.baked import Said
 from tests.jobs.stage import Stage
 from tests.logs.make_log import START_NS, STORE, LogRecipe, encoded, make_log, messages_of, write_bag, write_raw

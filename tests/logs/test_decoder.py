@@ -16,8 +16,7 @@ from splatctrl_cli.logs import decoder
 from splatctrl_cli.logs.decoder import COMPRESSED_IMAGE, MessageDecoder, UndecodableMessageError
 from splatctrl_cli.logs.messages import decode_rvl, depth_of, read_image
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.sources.source import describe, open_source
 from tests.logs.make_log import START_NS, STORE, T, header, make_log, messages_of, write_raw
 
 DEEP = "\n".join(f"{'=' * 80}\nMSG: a/T{i}\nT{i + 1} x" for i in range(2000))

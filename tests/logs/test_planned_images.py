@@ -10,9 +10,9 @@ import pytest
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.logs import frame_plan
 from splatctrl_cli.logs.frame_plan import HeldMessages, PlannedImages
-from splatctrl_cli.logs.image_stamps import pair_by_stamp
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.logs.survey import pair_by_stamp
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
 from tests.logs.make_log import LogRecipe, make_log, messages_of, write_raw

@@ -18,8 +18,7 @@ from splatctrl_cli.logs import survey as surveys
 from splatctrl_cli.logs.survey import survey
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from splatctrl_cli.scene.keyframes import make_view
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import CameraTopics, SourceOptions, open_source
+from splatctrl_cli.sources.source import CameraTopics, SourceOptions, describe, open_source
 from tests.containers.test_log_formats import as_ros1_bag, assert_same
 from tests.logs.make_log import (
     FRAME_NS,

@@ -12,8 +12,7 @@ from splatctrl_cli.geometry import quat_from_rotation, rotation_from_quat, trans
 from splatctrl_cli.logs.source_options import PoseTopic, SourceOptions
 from splatctrl_cli.logs.tf_tree import TfTree
 from splatctrl_cli.records import Float64, RgbdFrame
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.sources.source import describe, open_source
 from tests.logs.make_log import (
     FRAME_NS,
     START_NS,

@@ -25,8 +25,7 @@ from splatctrl_cli.logs.decoder import COMPRESSED_IMAGE
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.video import VideoFileLog, open_log
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_logs, open_session, open_source
+from splatctrl_cli.sources.source import describe, open_logs, open_session, open_source
 from tests.logs.make_log import (
     FRAME_NS,
     HEIGHT,

@@ -21,7 +21,6 @@ from splatctrl_cli.report.pictures import (
     renders_picture,
     view_picture,
 )
-from splatctrl_cli.report.reliability import reliability, reliability_picture
 from splatctrl_cli.report.replay_pictures import (
     SHORTEST,
     clearance_picture,
@@ -32,7 +31,7 @@ from splatctrl_cli.report.replay_pictures import (
     open_loop_picture,
     spans,
 )
-from splatctrl_cli.report.study_pictures import Panel, trials_picture
+from splatctrl_cli.report.study_pictures import Panel, reliability, reliability_picture, trials_picture
 
 
 def row(depth_error: float) -> ComparisonRow:

@@ -24,7 +24,7 @@ from splatctrl_cli.scene_files.voxel_file import (
     write_occupancy,
     write_states,
 )
-from splatctrl_cli.sources.describe import describe
+from splatctrl_cli.sources.source import describe
 from splatctrl_cli.voxels import SWEPT, UNANSWERED, LostEdges, OccupancyGrid
 from tests.plain import known, plain_grid, plain_splats
 

@@ -11,8 +11,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError
 from splatctrl_cli.records import Label
 from splatctrl_cli.scene_files.voxel_file import write_occupancy
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import SourceOptions, open_source
+from splatctrl_cli.sources.source import SourceOptions, describe, open_source
 from splatctrl_cli.splat_files.splats import write_ply
 from splatctrl_cli.voxels import SWEPT
 from tests.logs.make_log import LogRecipe, make_log

@@ -10,11 +10,10 @@ import pytest
 from splatctrl_cli.containers.log_formats import SessionLog
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.image_stamps import StampClock, dropped, first_of_each
 from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.logs.survey import StampClock, dropped, first_of_each
 from splatctrl_cli.records import JointState, Record, RgbdFrame
-from splatctrl_cli.sources.describe import describe
-from splatctrl_cli.sources.source import open_session, open_source
+from splatctrl_cli.sources.source import describe, open_session, open_source
 from tests.containers.test_log_formats import assert_same
 from tests.logs import make_log as maker
 from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, broken_log, camera_x, make_log

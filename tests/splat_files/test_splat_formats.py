@@ -8,19 +8,20 @@ import pytest
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import GaussianSet, SplatSet
-from splatctrl_cli.sources.describe import describe
+from splatctrl_cli.sources.source import describe
 from splatctrl_cli.splat_files import usd
-from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
-from splatctrl_cli.splat_files.splat_format import differences
-from splatctrl_cli.splat_files.splat_formats import (
+from splatctrl_cli.splat_files.gaussian_ply import REFERENCE_PLY, write_gaussian_ply
+from splatctrl_cli.splat_files.splat_format import SplatFormat, differences
+from splatctrl_cli.splat_files.splats import (
     FORMATS,
-    REFERENCE_PLY,
-    SplatFormat,
+    as_gaussians,
+    as_splats,
     describe_splats,
     format_of,
+    nearest_splats,
     read_splats,
+    write_ply,
 )
-from splatctrl_cli.splat_files.splats import as_gaussians, as_splats, nearest_splats, write_ply
 from tests.splat_files.test_gaussian_ply import gaussian_set
 from tests.splat_files.test_splats import splat_set
 

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import COMPARED_CELLS
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.evaluate.field_accuracy import median_radius
-from splatctrl_cli.evaluate.field_truth import (
+from splatctrl_cli.evaluate.field_accuracy import (
     MeshComparison,
     TrueCells,
     TruthComparison,
     compare_with_mesh,
     compare_with_truth,
+    median_radius,
 )
 from splatctrl_cli.evaluate.held_out_depth import HeldOutComparison, compare_with_held_out_depth, counted_pixels
 from splatctrl_cli.field.clustered_splats import Spheres

@@ -11,7 +11,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import FAR_GRID
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate import field_accuracy
-from splatctrl_cli.evaluate.field_truth import FIELDS
+from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS, LENGTH
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
@@ -43,7 +43,7 @@ from splatctrl_cli.jobs.reconstructions.resume import deciding_versions, told_ho
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
-from splatctrl_cli.report.reliability import reliability_picture
+from splatctrl_cli.report.study_pictures import reliability_picture
 
 SUMMARY_METRICS = {
     **dict.fromkeys(("num_splats", "num_splats_left_out", "num_cells"), DESCRIBES),

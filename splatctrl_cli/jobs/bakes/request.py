@@ -23,7 +23,7 @@ from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, Snapshot, open_scene
-from splatctrl_cli.splat_files.splat_formats import read_spheres
+from splatctrl_cli.splat_files.splats import read_spheres
 from splatctrl_cli.voxels import Balls, OccupancyGrid
 
 NOT_COMPARED = ("voxel", "padding", "max_loss")  # voxel is compared with the grid's; the others change no cell

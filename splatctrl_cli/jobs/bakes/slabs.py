@@ -12,8 +12,8 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_cells import GridLayout, check_room
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
+from splatctrl_cli.grid_files.grid_format import GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.grid_files.grid_formats import FORMATS
-from splatctrl_cli.grid_files.grid_slabs import GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.jobs.progress import Progress, Wait
 
 FOLDER = "channels"

@@ -6,9 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.calibration.depth_bend import largest_share, unbent
-from splatctrl_cli.calibration.exposure import exposed, exposure_gains
-from splatctrl_cli.calibration.pose_refinement import FoundBends, depth_bends, freed, refined_poses
+from splatctrl_cli.calibration.gray_views import exposed, exposure_gains
+from splatctrl_cli.calibration.pose_refinement import (
+    FoundBends,
+    depth_bends,
+    freed,
+    largest_share,
+    refined_poses,
+    unbent,
+)
 from splatctrl_cli.config import fixed
 from splatctrl_cli.datasets.folder_views import HOLDOUT
 from splatctrl_cli.errors import InputError, UsageError

@@ -21,8 +21,7 @@ from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
 from splatctrl_cli.report.space import Deciding, Motion, Space, SplatsAt, Surface, bodies_of, coarsened
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, Snapshot, open_scene
-from splatctrl_cli.splat_files.splat_formats import read_splats
-from splatctrl_cli.splat_files.splats import nearest_splats
+from splatctrl_cli.splat_files.splats import nearest_splats, read_splats
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
 MOST_STATES = 240  # of a motion

@@ -38,8 +38,7 @@ from splatctrl_cli.jobs.scores.reference import (
 from splatctrl_cli.jobs.scores.views import CloudSettings, Scorer, Scores, cloud_figures
 from splatctrl_cli.records import Label
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, view_picture
-from splatctrl_cli.scene_files.scene_folder import SceneFolder, run_value
-from splatctrl_cli.scene_files.splat_file import open_splats
+from splatctrl_cli.scene_files.scene_folder import SceneFolder, open_splats, run_value
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from splatctrl_cli.jobs.studies import judge
 from splatctrl_cli.jobs.studies.problems import Problem, Views
 from splatctrl_cli.planner.configuration_clearance import HasDistance
 from splatctrl_cli.records import Float32, Float64
-from splatctrl_cli.report import trial_picture as drawn
+from splatctrl_cli.report import study_pictures as drawn
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 

@@ -18,8 +18,8 @@ from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.field import grid_cells, slabs
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_cells import GridLayout
+from splatctrl_cli.grid_files.grid_format import GridSlabs
 from splatctrl_cli.grid_files.grid_formats import FORMATS
-from splatctrl_cli.grid_files.grid_slabs import GridSlabs
 from splatctrl_cli.jobs.bakes import slabs as bake_slabs
 from splatctrl_cli.jobs.bakes.bake import BakeResult
 from splatctrl_cli.records import Label
@@ -107,7 +107,7 @@ def test_a_killed_process_goes_on_to_the_same_bytes(splats: Path, whole: dict[st
 import os, signal, sys
 from pathlib import Path
 from splatctrl_cli.field import grid_cells, slabs
-from splatctrl_cli.grid_files.grid_slabs import GridSlabs
+from splatctrl_cli.grid_files.grid_format import GridSlabs
 from tests.jobs.bakes.test_bake_resume import bake
 slabs.SLAB_BYTES, real, calls = 1, GridSlabs.write, []
 def write(self, *slab):

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.calibration.depth_bend import unbent
-from splatctrl_cli.calibration.exposure import exposed
+from splatctrl_cli.calibration.gray_views import exposed
+from splatctrl_cli.calibration.pose_refinement import unbent
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.open_recording import RecordingRequest

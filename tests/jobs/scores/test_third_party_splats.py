@@ -16,8 +16,7 @@ from splatctrl_cli.jobs.scores.views import CloudSettings
 from splatctrl_cli.records import GaussianSet
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
-from splatctrl_cli.splat_files.splat_formats import FORMATS
-from splatctrl_cli.splat_files.splats import as_gaussians
+from splatctrl_cli.splat_files.splats import FORMATS, as_gaussians
 from tests.jobs.scores.wall import FRAMES, INTRINSICS, SIDE, FakeSource, wall
 
 STRETCHED = np.array([1.0, 0.6, 1.4], np.float32)

@@ -15,7 +15,7 @@ from splatctrl_cli.jobs.studies import failures, judge, trial
 from splatctrl_cli.jobs.studies.maps import Map
 from splatctrl_cli.jobs.studies.problems import Problem, Views
 from splatctrl_cli.jobs.studies.trial import OURS, Attempt, Rig, trial_of
-from splatctrl_cli.report.trial_picture import COLORS, TOUCHED, UNSEEN
+from splatctrl_cli.report.study_pictures import COLORS, TOUCHED, UNSEEN
 from tests.jobs.studies.conftest import HOME, blind
 
 MOST = 150_000  # bytes
