@@ -15,8 +15,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from benchmarks.fuzz_samples import ROBOT, capture_of, plain_log
 from splatctrl_cli.captures.capture import CaptureSource
-from splatctrl_cli.containers.bag1_log import Bag1Log
-from splatctrl_cli.containers.db3_log import Db3Log
+from splatctrl_cli.containers.bag_logs import Bag1Log, Db3Log
 from splatctrl_cli.containers.foxglove import MessageTypes
 from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.raw_log import Damage

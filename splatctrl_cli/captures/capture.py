@@ -11,8 +11,7 @@ import numpy as np
 
 from splatctrl_cli.captures.capture_header import COLUMNS, ROBOT, FileSums, FrameRows, read_capture_header
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.array_columns import NpzFile
-from splatctrl_cli.files.arrays import DAMAGE, npy_of
+from splatctrl_cli.files.arrays import DAMAGE, NpzFile, npy_of
 from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.geometry import transform_from

@@ -8,7 +8,7 @@ are google.protobuf.Timestamp.
 import base64
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -113,18 +113,6 @@ def _object(value: Any) -> Any:
     return [_object(item) for item in value] if isinstance(value, list) else value
 
 
-@dataclass(frozen=True, kw_only=True)
-class _CameraInfo:
-    header: Any
-    width: int
-    height: int
-    distortion_model: str
-    d: Any
-    k: Any
-    r: Any
-    p: Any
-
-
 def _header(message: Any, frame_id: str) -> Any:
     time = getattr(message, "timestamp", None)
     seconds = _either(time, "sec", "seconds")
@@ -163,7 +151,7 @@ def _raw_image(message: Any) -> Any:
 
 
 def _calibration(message: Any) -> Any:
-    return _CameraInfo(
+    return SimpleNamespace(
         header=_header(message, _frame(message)),
         width=int(message.width),
         height=int(message.height),

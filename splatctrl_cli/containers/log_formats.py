@@ -16,8 +16,7 @@ from typing import Any
 import yaml
 import zstandard
 
-from splatctrl_cli.containers.bag1_log import Bag1Log
-from splatctrl_cli.containers.db3_log import Db3Log
+from splatctrl_cli.containers.bag_logs import Bag1Log, Db3Log
 from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.raw_log import Damage, JoinedLog, RawLog, RawMessage
 from splatctrl_cli.errors import InputError

@@ -1,4 +1,4 @@
-"""The records of an MCAP file, each parsed from its bytes and from no more than them.
+"""The records of an MCAP file whose fields are read, each parsed from its bytes and from no more than them.
 
 Names and order are those of the format's specification (mcap.dev/spec). Bytes after the last field are allowed, as
 it demands of a reader.
@@ -37,9 +37,6 @@ class _Fields:
         self._at += form.size
         return int(form.unpack_from(self._content, self._at - form.size)[0])
 
-    def u8(self) -> int:
-        return self.take(1)[0]
-
     def u16(self) -> int:
         return self._number(_U16)
 
@@ -61,9 +58,6 @@ class _Fields:
     def short_bytes(self) -> bytes:
         return self.take(self.u32())
 
-    def long_bytes(self) -> bytes:
-        return self.take(self.u64())
-
     def text(self) -> str:
         return self.short_bytes().decode("utf-8", "replace")
 
@@ -73,9 +67,6 @@ class _Fields:
     def counts(self) -> dict[int, int]:
         return dict(self._entries(_Fields.u16, _Fields.u64))
 
-    def pairs(self) -> tuple[tuple[int, int], ...]:
-        return tuple(self._entries(_Fields.u64, _Fields.u64))
-
     def _entries(self, key: "Callable[[_Fields], K]", value: "Callable[[_Fields], V]") -> Iterator[tuple[K, V]]:
         """The entries of a map or a list of pairs, read within the bytes that it announces."""
         inner = _Fields(self.short_bytes())
@@ -83,24 +74,14 @@ class _Fields:
             yield key(inner), value(inner)
 
 
-U8 = Annotated[int, _Fields.u8]
 U16 = Annotated[int, _Fields.u16]
 U32 = Annotated[int, _Fields.u32]
 U64 = Annotated[int, _Fields.u64]
 Text = Annotated[str, _Fields.text]
 Texts = Annotated[dict[str, str], _Fields.texts]
 Counts = Annotated[dict[int, int], _Fields.counts]
-Pairs = Annotated[tuple[tuple[int, int], ...], _Fields.pairs]
 ShortBytes = Annotated[bytes, _Fields.short_bytes]
-LongBytes = Annotated[bytes, _Fields.long_bytes]
 Rest = Annotated[bytes, _Fields.rest]
-
-
-class Header(NamedTuple):
-    """First record of a file."""
-
-    profile: Text
-    library: Text
 
 
 class Footer(NamedTuple):
@@ -130,16 +111,6 @@ class Channel(NamedTuple):
     metadata: Texts
 
 
-class Message(NamedTuple):
-    """One message; times [ns]."""
-
-    channel_id: U16
-    sequence: U32
-    log_time: U64
-    publish_time: U64
-    data: Rest
-
-
 class Chunk(NamedTuple):
     """A batch of records."""
 
@@ -157,13 +128,6 @@ class Chunk(NamedTuple):
         return self.rest[: self.compressed_size]
 
 
-class MessageIndex(NamedTuple):
-    """(log time, offset in the chunk) of each message of a channel."""
-
-    channel_id: U16
-    records: Pairs
-
-
 class ChunkIndex(NamedTuple):
     """Where a chunk lies and what it holds."""
 
@@ -176,29 +140,6 @@ class ChunkIndex(NamedTuple):
     compression: Text
     compressed_size: U64
     uncompressed_size: U64
-
-
-class Attachment(NamedTuple):
-    """A file within the file."""
-
-    log_time: U64
-    create_time: U64
-    name: Text
-    media_type: Text
-    data: LongBytes
-    crc: U32
-
-
-class AttachmentIndex(NamedTuple):
-    """Where an attachment lies."""
-
-    offset: U64
-    length: U64
-    log_time: U64
-    create_time: U64
-    data_size: U64
-    name: Text
-    media_type: Text
 
 
 class Statistics(NamedTuple):
@@ -222,22 +163,6 @@ class Metadata(NamedTuple):
     metadata: Texts
 
 
-class MetadataIndex(NamedTuple):
-    """Where a metadata record lies."""
-
-    offset: U64
-    length: U64
-    name: Text
-
-
-class SummaryOffset(NamedTuple):
-    """Where the summary's records of one opcode lie."""
-
-    group_opcode: U8
-    group_start: U64
-    group_length: U64
-
-
 class DataEnd(NamedTuple):
     """End of the data section; its checksum, of which 0 means not computed."""
 
@@ -245,20 +170,13 @@ class DataEnd(NamedTuple):
 
 
 _KINDS: dict[int, type[Any]] = {  # by opcode
-    0x01: Header,
     FOOTER: Footer,
     SCHEMA: Schema,
     CHANNEL: Channel,
-    MESSAGE: Message,
     CHUNK: Chunk,
-    MESSAGE_INDEX: MessageIndex,
     CHUNK_INDEX: ChunkIndex,
-    ATTACHMENT: Attachment,
-    0x0A: AttachmentIndex,
     STATISTICS: Statistics,
     0x0C: Metadata,
-    0x0D: MetadataIndex,
-    0x0E: SummaryOffset,
     DATA_END: DataEnd,
 }
 _READERS = {  # of the fields in their order, as their types say
@@ -268,7 +186,7 @@ _READERS = {  # of the fields in their order, as their types say
 
 
 def parse_record(opcode: int, content: bytes) -> object:
-    """The record of these bytes, None for an opcode that the format leaves open. Raises BadRecordError."""
+    """The record of these bytes, None for an opcode that is not among `_KINDS`. Raises BadRecordError."""
     kind = _KINDS.get(opcode)
     if kind is None:
         return None

@@ -24,8 +24,7 @@ from splatctrl_cli.jobs.reports.run_folder import (
 )
 from splatctrl_cli.jobs.reports.sections import PASSED, changes_since, section_of
 from splatctrl_cli.jobs.reports.spaces import space_of, space_of_run
-from splatctrl_cli.report.page import Cell, Page, Picture, Row, RunSection, Table, picture, rendered
-from splatctrl_cli.report.space import packed
+from splatctrl_cli.report.page import Cell, Page, Picture, Row, RunSection, Table, packed, picture, rendered
 
 MOST_SCENES = 6  # of a batch, without `all_scenes`
 PICTURES = {True: (3, 800), False: (1, 640)}  # of a batch's run with and without a scene: how many, how wide [px]

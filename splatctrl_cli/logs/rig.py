@@ -10,9 +10,17 @@ import numpy as np
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.logs.cameras import find_cameras, find_info, frame_of, is_registered, listed, no_camera
+from splatctrl_cli.logs.cameras import (
+    find_cameras,
+    find_info,
+    frame_of,
+    is_registered,
+    join_pose_topics,
+    listed,
+    no_camera,
+    pose_topics,
+)
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
-from splatctrl_cli.logs.pose_topics import join_pose_topics, pose_topics
 from splatctrl_cli.logs.registration import DISTORTION_MODELS, SAME_MODELS, DepthToColor, Undistortion
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.survey import Calibration, Survey

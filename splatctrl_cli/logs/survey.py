@@ -244,7 +244,7 @@ def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: 
 
 
 def _calibration(message: Any) -> Calibration | None:
-    fields = {name.lower(): getattr(message, name) for name in message.__dataclass_fields__}
+    fields = {name.lower(): value for name, value in vars(message).items()}
     K = np.asarray(fields["k"], dtype=np.float64).reshape(3, 3)
     if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
         return None  # an uncalibrated driver publishes zeros

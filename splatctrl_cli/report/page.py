@@ -1,17 +1,286 @@
-"""One HTML file that opens from disk: verdict, timelines, pictures, tables, and scenes in 3-D."""
+"""One HTML file that opens from disk: verdict, timelines, pictures, tables, and scenes in 3-D.
+
+A scene is splats by time, an arm that moves among them, and what decided, packed into text for the viewer, which uses
+the three.js that trimesh brings. Packed, it is ``{"header": {...}, "bytes": "..."}`` in JSON: the bytes are deflated,
+base64; the header names each array in them by type, first byte and count. Points are whole numbers of 16 bits within
+their box: at three metres half a tenth of a millimetre.
+"""
 
 import base64
 import json
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
+import numpy as np
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
-from splatctrl_cli.errors import InputError
-from splatctrl_cli.report.space import for_script, three_js
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.kernels.surface_image import BALL, BOX, CAPSULE
+from splatctrl_cli.libraries import trimesh
+from splatctrl_cli.records import Float32, Float64, Label, SplatSet
+from splatctrl_cli.robot.surface import RobotSurface
+
+SIDES = 24  # of a cylinder or capsule as it is drawn
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """Triangles: vertices (V, 3) float32 [m], faces (F, 3) uint32."""
+
+    vertices: Float32
+    faces: NDArray[np.uint32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatsAt:
+    """The splats that were known from `time_s` [s] of the motion on."""
+
+    time_s: float
+    splats: SplatSet
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """An arm over T states: seconds (T,) since the first; the bodies (L) of its links by name, each in its link's
+    frame; poses (T, L, 4, 4), world; path (T, 3) [m], world, of the end effector; clearance (T,) [m], NaN where it
+    is not known; margin [m].
+    """
+
+    seconds: Float64
+    bodies: dict[str, Surface]
+    poses: Float64
+    path: Float64
+    clearance: Float64
+    margin: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deciding:
+    """What decided a verdict: in words, when [s], where (3,) [m], world, and the sphere of the arm that came there,
+    its centre (3,) and radius [m], None where the robot is not known.
+    """
+
+    sentence: str
+    time_s: float
+    place: Float64
+    sphere: tuple[Float64, float] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Space:
+    """What a three-dimensional page shows, in the world frame [m].
+
+    splats: by time, the first from the start on. unknown: centres (K, 3) of cubes of edge `voxel` never seen.
+    surface: where a baked distance is 0.
+    """
+
+    splats: Sequence[SplatsAt] = ()
+    unknown: Float32 | None = None
+    voxel: float = 0.0
+    surface: Surface | None = None
+    motion: Motion | None = None
+    deciding: Deciding | None = None
+
+    def box(self) -> tuple[Float64, Float64]:
+        """The lower and upper corner (3,) of what there is to see: nine tenths of the splats, path and surface."""
+        parts = [np.asarray(at.splats.centers, np.float64) for at in self.splats]
+        if self.motion is not None:
+            parts += [self.motion.path, self.motion.poses[:, :, :3, 3].reshape(-1, 3)]
+        if self.surface is not None:
+            parts.append(np.asarray(self.surface.vertices, np.float64))
+        points = np.concatenate([np.zeros((0, 3)), *parts])
+        if not len(points):
+            return np.full(3, -0.5), np.full(3, 0.5)
+        lower, upper = np.percentile(points, [5, 95], axis=0)
+        return lower, upper
+
+
+def bodies_of(surface: RobotSurface) -> dict[str, Surface]:
+    """The collision geometry of each link of a robot as triangles, in its frame."""
+    parts: dict[str, list[trimesh.Trimesh]] = {}
+    for kind, size, T, link in zip(
+        surface.kinds, surface.sizes, surface.T_link_solid, surface.solid_links, strict=True
+    ):
+        parts.setdefault(surface.links[link], []).append(_primitive(kind, size).apply_transform(T))
+    for number in np.unique(surface.triangle_links):
+        corners = surface.triangles[surface.triangle_links == number]
+        mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners), process=True)
+        parts.setdefault(surface.links[number], []).append(mesh)
+    return {link: _as_surface(trimesh.util.concatenate(meshes)) for link, meshes in parts.items()}
+
+
+def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
+    """size (3,): half edges of a box; radius and half length of a cylinder or capsule; radius of a ball."""
+    if kind == BOX:
+        return trimesh.creation.box(extents=2 * size)
+    if kind == BALL:
+        return trimesh.creation.icosphere(subdivisions=2, radius=size[0])
+    if kind == CAPSULE:
+        made = trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=[SIDES, SIDES // 2])
+        return made.apply_translation([0.0, 0.0, -made.bounds.mean(axis=0)[2]])
+    return trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=SIDES)
+
+
+def _as_surface(mesh: "trimesh.Trimesh") -> Surface:
+    return Surface(vertices=np.asarray(mesh.vertices, np.float32), faces=np.asarray(mesh.faces, np.uint32))
+
+
+def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
+    """Centres (K, 3) [m] and edge [m] of at most `most` cubes for the voxels (X, Y, Z) that are unknown and border on
+    one that is not: the rest lies behind them. Cubes of 2, 3, ... voxels a side, unknown by half or more.
+    """
+    factor = 1
+    while True:
+        shape = np.array(is_unknown.shape) // factor
+        blocks = is_unknown[tuple(slice(0, n * factor) for n in shape)]
+        cells = blocks.reshape(shape[0], factor, shape[1], factor, shape[2], factor)
+        full = 2 * cells.sum(axis=(1, 3, 5), dtype=np.int32) >= factor**3
+        borders = np.argwhere(full & ~_inner(full))
+        if len(borders) <= most:
+            centers = origin + voxel * (factor * borders + (factor - 1) / 2)
+            return np.asarray(centers, np.float32), factor * voxel
+        factor += 1
+
+
+def _inner(full: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells whose six neighbours are full; what lies outside the grid counts as full."""
+    padded = np.pad(full, 1, constant_values=True)
+    inner = np.ones_like(full)
+    for axis in range(3):
+        for shift in (0, 2):
+            where = [slice(1, -1)] * 3
+            where[axis] = slice(shift, shift + full.shape[axis])
+            inner &= padded[tuple(where)]
+    return inner
+
+
+STEPS = 65535  # of a number of 16 bits
+END_OF_LIBRARY = "var camera,controls"  # where three.js ends in trimesh's page and its own script begins
+REMEDY = "pip install 'trimesh>=4.4,<6'"
+
+
+def three_js() -> str:
+    """The source of three.js, deflated, base64. Raises UsageError where trimesh no longer brings it."""
+    try:
+        archive = trimesh.util.decompress(trimesh.resources.get_bytes("templates/viewer.zip"), file_type="zip")
+        page = archive["viewer.html.template"].read().decode("utf-8")
+        script = page[page.index("<script>") + len("<script>") : page.index(END_OF_LIBRARY)]
+    except (OSError, KeyError, ValueError) as error:
+        raise UsageError(f"three.js: not found in trimesh: {error}", remedy=REMEDY) from None
+    return _deflated(script.encode("utf-8"))
+
+
+def packed(space: Space) -> str:
+    """A scene as the viewer reads it, JSON."""
+    block = _Block()
+    lower, upper = space.box()
+    header: dict[str, Any] = {
+        "middle": ((lower + upper) / 2).tolist(),
+        "size": max(float(np.linalg.norm(upper - lower)), 0.2),
+        "splats": [_splats(block, at, without_robot=space.motion is not None) for at in space.splats],
+    }
+    if space.unknown is not None and len(space.unknown):
+        header["unknown"] = {"points": block.points(space.unknown), "edge": space.voxel}
+    if space.surface is not None:
+        header["surface"] = _mesh(block, space.surface.vertices, space.surface.faces)
+    if space.motion is not None:
+        header["motion"] = _motion(block, space.motion)
+    if (deciding := space.deciding) is not None:
+        header["deciding"] = {
+            "sentence": deciding.sentence,
+            "time": deciding.time_s,
+            "place": np.asarray(deciding.place).tolist(),
+        }
+        if deciding.sphere is not None:
+            center, radius = deciding.sphere
+            header["deciding"] |= {"center": np.asarray(center).tolist(), "radius": radius}
+    return json.dumps({"header": header, "bytes": _deflated(block.bytes())}, allow_nan=False)
+
+
+class _Block:
+    """Arrays one after the other, each at a multiple of four bytes."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def add(self, values: ArrayLike, kind: type[np.generic]) -> list[Any]:
+        """[type, first byte, count] of the values, column by column: a column deflates better than a row."""
+        array = np.asarray(values, kind)
+        data = np.ascontiguousarray(array.T).tobytes()
+        start = self._size
+        self._parts.append(data + bytes(-len(data) % 4))
+        self._size += len(self._parts[-1])
+        return [np.dtype(kind).name, start, array.size]
+
+    def points(self, points: NDArray[np.floating]) -> dict[str, Any]:
+        """Points (K, 3) within their box, by column."""
+        values = np.asarray(points, np.float64).reshape(-1, 3)
+        lower, upper = (values.min(axis=0), values.max(axis=0)) if len(values) else (np.zeros(3), np.zeros(3))
+        step = np.where(upper > lower, (upper - lower) / STEPS, 1.0)
+        whole = np.rint((values - lower) / step)
+        return {"array": self.add(whole, np.uint16), "lower": lower.tolist(), "step": step.tolist()}
+
+    def bytes(self) -> bytes:
+        return b"".join(self._parts)
+
+
+def _splats(block: _Block, at: SplatsAt, *, without_robot: bool) -> dict[str, Any]:
+    chosen = at.splats.select(at.splats.labels != Label.ROBOT) if without_robot else at.splats
+    largest = float(chosen.radii.max(initial=1e-6))
+    colors = np.column_stack([np.clip(chosen.colors, 0.0, 1.0), np.clip(chosen.opacities, 0.0, 1.0)])
+    return {
+        "time": at.time_s,
+        "centers": block.points(chosen.centers),
+        "radii": block.add(np.rint(chosen.radii / largest * STEPS), np.uint16),
+        "largest": largest,
+        "colors": block.add(np.rint(255 * colors), np.uint8),
+        "labels": block.add(chosen.labels, np.uint8),
+    }
+
+
+def _motion(block: _Block, motion: Motion) -> dict[str, Any]:
+    states, links = motion.poses.shape[:2]
+    quats = _quats(motion.poses.reshape(-1, 4, 4)).reshape(states, links * 4)
+    return {
+        "seconds": block.add(motion.seconds, np.float32),
+        "clearance": [_or_none(value) for value in motion.clearance.round(6)],
+        "margin": motion.margin,
+        "links": [_mesh(block, body.vertices, body.faces) for body in motion.bodies.values()],
+        "quats": block.add(np.rint(32767 * quats), np.int16),
+        "places": block.points(motion.poses[:, :, :3, 3]),
+        "path": block.points(motion.path),
+    }
+
+
+def _or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _quats(poses: Float64) -> Float64:
+    """(K, 4, 4) -> unit quaternions (K, 4), w last."""
+    return np.asarray(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), np.float64)
+
+
+def _mesh(block: _Block, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> dict[str, Any]:
+    return {"vertices": block.points(vertices), "faces": block.add(faces, np.uint32)}
+
+
+def _deflated(data: bytes) -> str:
+    return base64.b64encode(zlib.compress(data)).decode("ascii")
+
+
+def for_script(text: str) -> str:
+    """JSON that may stand in a script element: no end of one, and no comment, is in it."""
+    return text.replace("<", "\\u003c")
+
 
 PARTS = Path(__file__).parent / "page_parts"
 QUALITY = 70  # of JPEG: WebP is a third smaller, and takes ten times as long

@@ -12,7 +12,7 @@ from typing import Any
 
 from splatctrl_cli.datasets.layout import read_json
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.array_columns import ParquetFile
+from splatctrl_cli.files.arrays import ParquetFile
 
 INFO, POSITION, EPISODE = Path("meta/info.json"), "observation.state", "episode_index"
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from splatctrl_cli.datasets.folder_description import read_table
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.array_columns import ArrayFile, Hdf5File, NpzFile, ParquetFile
+from splatctrl_cli.files.arrays import ArrayFile, Hdf5File, NpzFile, ParquetFile
 from splatctrl_cli.files.spilled_rows import Rows, absent, scaled
 from splatctrl_cli.logs.state_messages import pose_of_columns, pose_of_quat, rigid_or_none
 from splatctrl_cli.logs.state_track import RawTrack

@@ -8,7 +8,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.typesys import Stores, get_typestore
 
-from splatctrl_cli.containers.bag1_log import Bag1Log, BagFile
+from splatctrl_cli.containers.bag_logs import Bag1Log, BagFile
 from splatctrl_cli.containers.raw_log import Damage, RawMessage
 from splatctrl_cli.files.unpacking import MAX_BLOCK
 

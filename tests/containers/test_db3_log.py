@@ -11,7 +11,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.rosbag2 import Reader as Bag2Reader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-from splatctrl_cli.containers.db3_log import Db3Log
+from splatctrl_cli.containers.bag_logs import Db3Log
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.raw_log import Damage, RawMessage
 from splatctrl_cli.errors import InputError

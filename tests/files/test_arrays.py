@@ -10,8 +10,7 @@ from splatctrl_cli.datasets.idr import read_idr
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate import images
 from splatctrl_cli.evaluate.images import Lpips
-from splatctrl_cli.files.array_columns import NpzFile
-from splatctrl_cli.files.arrays import DAMAGE, read_arrays, savez
+from splatctrl_cli.files.arrays import DAMAGE, NpzFile, read_arrays, savez
 from splatctrl_cli.grid_files.npz_grid import MOST_PACKED, read_npz
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT, read_checkpoint
 from splatctrl_cli.scene_files.voxel_file import read_occupancy, read_states

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.files import array_columns, spilled_rows
+from splatctrl_cli.files import arrays, spilled_rows
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, ranges, scratch_folder, selected
 from splatctrl_cli.logs import state_columns
 from splatctrl_cli.logs.state_columns import StateCollector
@@ -23,7 +23,7 @@ JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 @pytest.fixture(params=[1, 7, 10_000])
 def block(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
     """So many states at once, everywhere."""
-    for module in (spilled_rows, array_columns, state_columns, state_csv):
+    for module in (spilled_rows, arrays, state_columns, state_csv):
         monkeypatch.setattr(module, "BLOCK", request.param)
     return int(request.param)
 

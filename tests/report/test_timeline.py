@@ -13,7 +13,7 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Label
-from splatctrl_cli.report.space import Space, SplatsAt, bodies_of, coarsened, packed, three_js
+from splatctrl_cli.report.page import Space, SplatsAt, bodies_of, coarsened, packed, three_js
 from splatctrl_cli.report.timeline import HEIGHT, LEFT, RIGHT, TOP, WIDTH, legend, runs_of, timeline
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape

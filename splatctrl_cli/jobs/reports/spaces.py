@@ -18,7 +18,7 @@ from splatctrl_cli.grid_files.iso_surface import iso_surface
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.reports.run_folder import REPLAY, RunFolder, States, open_run
 from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
-from splatctrl_cli.report.space import Deciding, Motion, Space, SplatsAt, Surface, bodies_of, coarsened
+from splatctrl_cli.report.page import Deciding, Motion, Space, SplatsAt, Surface, bodies_of, coarsened
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, Snapshot, open_scene
 from splatctrl_cli.splat_files.splats import nearest_splats, read_splats
