@@ -101,7 +101,7 @@ def _reach(adjustment: Adjustment, estimate: Estimate) -> Float64:
         if pose[0] >= 0:
             block = np.eye(POSE)
             block[:3, :3] *= radius
-            block[3:, :3] = -_cross(middle)
+            block[3:, :3] = np.cross(middle, np.eye(3))  # -[middle]x
             reach[np.ix_(pose, pose)] = block
         if depth[0] >= 0:
             reach[depth[0], depth[0]] = np.linalg.norm(middle)
@@ -118,11 +118,6 @@ def middle_of(adjustment: Adjustment, camera: str) -> tuple[Float64, float]:
         return np.array([0.0, 0.0, 1.0]), 0.3
     middle = np.median(cloud, axis=0)
     return middle, max(float(np.median(np.linalg.norm(cloud - middle, axis=1))), 0.05)
-
-
-def _cross(v: Float64) -> Float64:
-    """[v]x, so that ``[v]x w = v x w``."""
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -225,15 +225,11 @@ class Arm:
         for stamp in stamps:
             poses = self.surface_poses(stamp)
             if poses is not None:
-                places.append(np.concatenate([poses[:, :3, 3], transform_points_each(poses, 0.1 * np.eye(3))]))
+                tips = [transform_points(T, 0.1 * np.eye(3)) for T in poses]
+                places.append(np.concatenate([poses[:, :3, 3], *tips]))
         if len(places) < 2:
             return 0.0
         return float(np.linalg.norm(np.array(places) - places[0], axis=2).max())
-
-
-def transform_points_each(T: Float64, points: Float64) -> Float64:
-    """Points (K, 3) moved by each of L transforms (L, 4, 4): (L K, 3)."""
-    return np.concatenate([transform_points(one, points) for one in T])
 
 
 def _velocities(before: Float64, after: Float64, poses: Float64, T_world_camera: Float64) -> Float64:
@@ -260,13 +256,6 @@ def _inside_links(link: NDArray[np.int16], depth: Float32) -> Bool:
     is_same = np.logical_and.reduce([middle == other for other in around])
     inside[1:-1, 1:-1] = (middle >= 0) & is_same
     return np.asarray(inside & (bend(depth) < fixed.CALIBRATION_BEND * depth))
-
-
-def twist_by_clock(T_before: Float64, T_after: Float64) -> Float64:
-    """How a camera moves with the clock (6,) [1/s], from where it is a step before and after: a later clock takes an
-    earlier pose.
-    """
-    return np.asarray(twist_between(T_after, T_before) / (2e-9 * STEP_NS))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -307,7 +296,9 @@ class Evidence:
         now, before, after = (None if pose is None else pose @ T_link_camera for pose in poses)
         if now is None:
             return item.T_world_camera, np.zeros(POSE)
-        return now, np.zeros(POSE) if before is None or after is None else twist_by_clock(before, after)
+        if before is None or after is None:
+            return now, np.zeros(POSE)
+        return now, twist_between(after, before) / (2e-9 * STEP_NS)  # a later clock takes an earlier pose
 
     def thinned(self) -> "Evidence":
         """For a first look: with fewer frames that show the robot, as many of each camera, and fewer pairs."""
@@ -325,7 +316,11 @@ def evidence_of(frames: Sequence[RgbdFrame], arm: Arm | None) -> Evidence:
     for frame in frames:
         by_camera.setdefault(frame.camera, []).append(strided(frame, fixed.CALIBRATION_ROWS))
     moving = moving_cameras(frames)
-    mounts = {camera: _mount(arm, by_camera[camera]) for camera in moving} if arm is not None else {}
+    mounts = {
+        camera: arm.mount_of([(f.stamp_ns, f.T_world_camera) for f in by_camera[camera]])
+        for camera in moving
+        if arm is not None
+    }
     views: list[DepthView] = []
     for camera, its in sorted(by_camera.items()):
         if camera not in moving:
@@ -357,10 +352,6 @@ def moving_cameras(frames: Sequence[RgbdFrame]) -> frozenset[str]:
         if np.abs(frame.T_world_camera - T).max() >= fixed.CALIBRATION_MOUNT:
             moving.add(frame.camera)
     return frozenset(moving)
-
-
-def _mount(arm: Arm | None, frames: Sequence[RgbdFrame]) -> tuple[str, Float64] | None:
-    return None if arm is None else arm.mount_of([(frame.stamp_ns, frame.T_world_camera) for frame in frames])
 
 
 def _step(frame: RgbdFrame, num_averaged: int) -> int:

@@ -225,7 +225,8 @@ def refined_poses(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | 
         pairs = overlapping(views, recorded, is_free | ~wanted, is_free)
         is_free &= np.bincount(np.ravel(pairs).astype(np.int64), minlength=len(views)) > 0
         poses = _solved(views, recorded, pairs, is_free)
-        moved, turned = _motions(recorded, poses)
+        twists = np.array([twist_between(a, b) for a, b in zip(recorded, poses, strict=True)]).reshape(-1, POSE)
+        moved, turned = np.linalg.norm(twists[:, 3:], axis=1), np.degrees(np.linalg.norm(twists[:, :3], axis=1))
         is_far = (moved > fixed.REFINE_FARTHEST[0]) | (turned > fixed.REFINE_FARTHEST[1])
         if not is_far.any():
             break
@@ -365,9 +366,3 @@ def _distances(
         found.append(np.minimum(np.abs(distance[lands]), fixed.REFINE_FARTHEST[0]))
     every = np.concatenate(found)
     return float(np.median(every)) if len(every) else 0.0
-
-
-def _motions(before: Sequence[Float64], after: Sequence[Float64]) -> tuple[Float64, Float64]:
-    """How far [m] and by what angle [deg] each pose (4, 4) was moved (N,)."""
-    twists = np.array([twist_between(a, b) for a, b in zip(before, after, strict=True)]).reshape(-1, POSE)
-    return np.linalg.norm(twists[:, 3:], axis=1), np.degrees(np.linalg.norm(twists[:, :3], axis=1))

@@ -103,16 +103,11 @@ def pack_capture(capture: Path, out: Path, progress: Callable[[int], None] | Non
         images = {row[name] for row in map(source.row, range(len(source))) for name in _IMAGES if row.get(name)}
         for name in sorted(p.relative_to(capture).as_posix() for p in capture.rglob("*") if p.is_file()):
             if name not in images:
-                _check_inside(capture, name)
+                if not Path(os.path.realpath(capture / name)).is_relative_to(os.path.realpath(capture)):
+                    raise InputError(f"{capture / name}: leads out of the capture", remedy="remove the link")
                 media_type = _TYPES.get(PurePosixPath(name).suffix, "application/octet-stream")
                 log.attach(name, media_type, (capture / name).read_bytes())
     return len(source)
-
-
-def _check_inside(capture: Path, name: str) -> None:
-    """Raise InputError for a link that leads out of the capture: the file behind it would be given away."""
-    if not Path(os.path.realpath(capture / name)).is_relative_to(os.path.realpath(capture)):
-        raise InputError(f"{capture / name}: leads out of the capture", remedy="remove the link")
 
 
 def unpack_capture(packed: Path, folder: Path) -> int:

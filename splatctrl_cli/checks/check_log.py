@@ -8,7 +8,6 @@ from splatctrl_cli.checks.check_folder import Evidence, judged
 from splatctrl_cli.checks.check_images import depth_findings, image_findings, sample_findings
 from splatctrl_cli.checks.check_states import log_states
 from splatctrl_cli.checks.check_times import (
-    TimesWatch,
     clock_findings,
     ending_findings,
     file_findings,
@@ -78,7 +77,10 @@ def check_log(
         start_ns=watch.first_ns,
         num_cameras=len(cameras),
         num_frames=max((images.count for images in watch.images.values()), default=0),
-        rates=[t.rate(is_read=_is_read(found, name)) for name, t in sorted(watch.times.items())],
+        rates=[
+            t.rate(is_read=found.topics[name].topic.type_name in (*IMAGES, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS))
+            for name, t in sorted(watch.times.items())
+        ],
         frames=[frame for camera in checked for frame in camera.frames],
         depth_units={c.camera.name: watch.images[c.topics.depth].unit for c in checked if c.frames},
         motion=image_motion(watch, checked),
@@ -116,10 +118,6 @@ def _parted(lack: str) -> tuple[str, str]:
     return (what, remedy) if what else (remedy, "")
 
 
-def _is_read(found: Survey, name: str) -> bool:
-    return found.topics[name].topic.type_name in (*IMAGES, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS)
-
-
 def _span(found: Survey) -> tuple[int, int]:
     entries = [t for t in found.topics.values() if t.count]
     return min((t.first_log_ns for t in entries), default=0), max((t.last_log_ns for t in entries), default=0)
@@ -130,7 +128,11 @@ def _time_findings(watch: LogWatch, found: Survey, cameras: Sequence[CameraTopic
     judged = [name for name in names if name in watch.times and not _is_beside(watch, name, cameras)]
     times = [watch.times[name] for name in judged]
     each = [f for t in times for f in time_findings(t, "images" if t.topic in watch.images else "states")]
-    each += [f for edge in watch.transforms.values() for f in _edge_findings(edge)]
+    each += [
+        replace(f, code="tf-gap") if f.code == "gap" else f
+        for edge in watch.transforms.values()
+        for f in time_findings(edge, "transforms")
+    ]
     last_ns = max((t.last_ns for t in times if t.topic in watch.images), default=0)
     peers = [[watch.times[getattr(camera, kind)] for camera in cameras] for kind in ("color", "depth")]
     clocks = clock_findings(times)
@@ -141,14 +143,6 @@ def _time_findings(watch: LogWatch, found: Survey, cameras: Sequence[CameraTopic
         *(part_findings(times) if not any(f.code in {"clock", "clock-offset"} for f in clocks) else ()),
         *clocks,
         *ending_findings(list(watch.transforms.values()), last_ns),
-    ]
-
-
-def _edge_findings(edge: TimesWatch) -> list[Finding]:
-    """Of one moving transform: the same as of a topic, a gap under its own name."""
-    return [
-        replace(finding, code="tf-gap") if finding.code == "gap" else finding
-        for finding in time_findings(edge, "transforms")
     ]
 
 

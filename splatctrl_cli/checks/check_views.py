@@ -126,7 +126,14 @@ def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> lis
         camera, T = found[best]
         its = _with(views, pairs, camera)
         own_before, own_after = _cost(views, its)[0], _cost(_moved(views, camera, T), its)
-        move = _move(camera, T, own_before, own_after[0])
+        move = Move(
+            camera=camera,
+            T_camera_corrected=T,
+            distance=float(np.linalg.norm(T[:3, 3])),
+            angle=float(np.degrees(np.linalg.norm(cv2.Rodrigues(T[:3, :3])[0]))),
+            before=own_before,
+            after=own_after[0],
+        )
         is_large = move.distance > limits.MOVE_METRES or move.angle > limits.MOVE_DEGREES
         is_dear = move.after > (1 - limits.MOVE_CHEAPER) * move.before
         if not is_large or is_dear or own_after[1] < limits.MOVE_GOOD_SHARE:
@@ -367,9 +374,3 @@ def _all_moved(views: Sequence[_View], moves: Sequence[Move]) -> list[_View]:
     for move in moves:
         moved = _moved(moved, move.camera, move.T_camera_corrected)
     return moved
-
-
-def _move(camera: str, T: Float64, before: float, after: float) -> Move:
-    angle = float(np.degrees(np.linalg.norm(cv2.Rodrigues(T[:3, :3])[0])))
-    distance = float(np.linalg.norm(T[:3, 3]))
-    return Move(camera=camera, T_camera_corrected=T, distance=distance, angle=angle, before=before, after=after)

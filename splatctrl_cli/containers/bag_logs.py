@@ -1,8 +1,8 @@
 """The messages of ROS bags: ROS 1, with or without index, and ROS 2 sqlite3; damage is left out and counted.
 
 A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is a sequence of records, each a header of named fields and a
-body, read from front to back in bounded memory. Its index stands at the end and is written last, so a bag that was cut, or
-is still being written, has none: nothing here needs it.
+body, read from front to back in bounded memory. Its index stands at the end and is written last, so a bag that was
+cut, or is still being written, has none: nothing here needs it.
 
 rosbags' reader of ROS 2 (rosbags/rosbag2/storage_sqlite3.py) counts all messages when it opens a file, and so refuses
 one with a single bad page. Tables as rosbag2_storage_sqlite3 creates them: topics, messages, since Iron

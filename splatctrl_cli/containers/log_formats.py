@@ -80,14 +80,6 @@ def _unpacked_message(data: bytes, budget: Budget) -> bytes:
     return budget.unpacked(data, "zstd", len(content))
 
 
-def check_compression(path: Path, kind: str) -> None:
-    """Raise InputError for a compression other than zstd."""
-    if kind != "zstd":
-        raise InputError(
-            f"{path}: compression {kind!r} is unknown, expected zstd", remedy="rewrite the bag with zstd"
-        )
-
-
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
@@ -176,9 +168,11 @@ def _open_folder(path: Path) -> RawLog:
         raise InputError(f"{path}: metadata.yaml names {missing[0]}, which is not there", remedy="copy the whole bag")
     if not files:
         raise InputError(f"{path}: a bag folder without .mcap or .db3 files", remedy="copy the whole bag")
-    mode = str(told.get("compression_mode", "")).lower()
-    if mode:
-        check_compression(path, str(told.get("compression_format")))
+    mode, compression = str(told.get("compression_mode", "")).lower(), str(told.get("compression_format"))
+    if mode and compression != "zstd":
+        raise InputError(
+            f"{path}: compression {compression!r} is unknown, expected zstd", remedy="rewrite the bag with zstd"
+        )
     parts = tuple(open_raw_log(file) for file in files)
     kind = "mcap" if ".mcap" in files[0].suffixes else "sqlite3"
     container = f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})"

@@ -248,13 +248,9 @@ class McapLog:
         if isinstance(record, Schema):
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
-            self._add_channel(record)
+            self._channels[record.id] = _topic(record, self._schemas.get(record.schema_id))
         elif isinstance(record, Statistics):
             self._statistics = record
-
-    def _add_channel(self, channel: Channel) -> None:
-        schema = self._schemas.get(channel.schema_id)
-        self._channels[channel.id] = _topic(channel, schema)
 
 
 def _topic(channel: Channel, schema: Schema | None) -> Topic:

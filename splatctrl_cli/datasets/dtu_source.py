@@ -106,7 +106,10 @@ class DtuSource:
             )
 
     def digests(self) -> dict[str, str]:
-        return {_relative(path, self._root): sha256(path) for path in sorted(set(self._files))}
+        return {
+            str(path.relative_to(self._root) if path.is_relative_to(self._root) else path): sha256(path)
+            for path in sorted(set(self._files))
+        }
 
 
 def shrunk(view: DtuView, factor: int) -> DtuView:
@@ -149,10 +152,6 @@ def _factor(view: DtuView, protocol: ScoreProtocol | None) -> int:
     factor = view.intrinsics.width // width
     is_whole = factor >= 1 and (view.intrinsics.width, view.intrinsics.height) == (factor * width, factor * height)
     return factor if is_whole else 1
-
-
-def _relative(path: Path, root: Path) -> str:
-    return str(path.relative_to(root) if path.is_relative_to(root) else path)
 
 
 def _held_out(numbers: tuple[int, ...], holdout: frozenset[int], root: Path) -> Split:

@@ -2,7 +2,6 @@
 
 import os
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -51,12 +50,6 @@ class View:
         T = self.T_world_camera.copy()
         T[:3, 3] *= metres
         return replace(self, T_world_camera=T, depth_scale=self.depth_scale * metres)
-
-
-def cameras_apart(views: Sequence[View]) -> float:
-    """The diagonal of the box of the cameras' places, in the unit of the poses."""
-    places = np.array([view.T_world_camera[:3, 3] for view in views])
-    return float(np.linalg.norm(np.ptp(places, axis=0)))
 
 
 def length_unit(median: float, apart: float) -> float:

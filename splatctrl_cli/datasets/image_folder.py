@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import UNIT_BASELINE
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ImageFile, read_description, read_rig
-from splatctrl_cli.datasets.folder_views import HOLDOUT, UNITS, View, cameras_apart, find_files, length_unit, views_of
+from splatctrl_cli.datasets.folder_views import HOLDOUT, UNITS, View, find_files, length_unit, views_of
 from splatctrl_cli.datasets.layout_nerfstudio import with_transforms
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of
@@ -102,7 +102,8 @@ class ImageFolderSource:
 
     def _in_metres(self) -> str:
         """Take lengths for millimetres or centimetres where depth and the cameras' places both look so; in words."""
-        apart = cameras_apart(self._views)
+        places = [view.T_world_camera[:3, 3] for view in self._views]
+        apart = float(np.linalg.norm(np.ptp(places, axis=0)))  # the diagonal of their box, in the unit of the poses
         for view in self._views if apart > UNIT_BASELINE / max(UNITS) else ():
             depth = self._depth(view, self._lens(view))
             if depth is None or not (depth > 0).any():

@@ -197,7 +197,9 @@ def _parse_header(path: Path, content: bytes) -> _Header:
             case ["property", "list", _, _, name] if elements:
                 elements[-1].properties.append((name, "list"))
             case ["property", kind, name] if elements and kind in SCALARS:
-                _append_property(path, elements[-1], name, kind)
+                if name in (known for known, _ in elements[-1].properties):
+                    raise InputError(f"{path}: element {elements[-1].name} names property {name} twice")
+                elements[-1].properties.append((name, kind))
             case []:
                 continue
             case _:
@@ -205,12 +207,6 @@ def _parse_header(path: Path, content: bytes) -> _Header:
     if not form:
         raise InputError(f"{path}: its header has no format line; expected one of {', '.join(BYTE_ORDERS)}")
     return _Header(format=form, elements=elements, comments=comments, length=newline + 1)
-
-
-def _append_property(path: Path, element: _Element, name: str, kind: str) -> None:
-    if name in (known for known, _ in element.properties):
-        raise InputError(f"{path}: element {element.name} names property {name} twice")
-    element.properties.append((name, kind))
 
 
 def read_points(path: Path) -> PointCloud:

@@ -63,7 +63,9 @@ def _unpacked_up_to(data: bytes, compression: str, most: int) -> bytes:
     try:
         match compression:
             case "zstd":
-                return _of_zstd(data, most)
+                decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
+                with decompressor.stream_reader(data, read_across_frames=True) as stream:
+                    return stream.read(most)
             case "lz4":
                 return _of_lz4(data, most)
             case "bz2":
@@ -71,12 +73,6 @@ def _unpacked_up_to(data: bytes, compression: str, most: int) -> bytes:
     except _FAILURES:
         raise BadBlockError("cannot be decompressed") from None
     raise BadBlockError(f"compression {compression!r} is unknown; expected zstd, lz4 or bz2")
-
-
-def _of_zstd(data: bytes, most: int) -> bytes:
-    decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
-    with decompressor.stream_reader(data, read_across_frames=True) as stream:
-        return stream.read(most)
 
 
 def _of_lz4(data: bytes, most: int) -> bytes:

@@ -128,7 +128,11 @@ def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info:
         return False
     calibration = survey.topics[info].calibration if info else None
     depth_calibration = survey.topics[depth_info].calibration if depth_info else None
-    return calibration is None or depth_calibration is None or _same_intrinsics(calibration, depth_calibration)
+    return (
+        calibration is None
+        or depth_calibration is None
+        or bool(abs(calibration.K - depth_calibration.K).max() <= 0.01 * calibration.K[0, 0])
+    )
 
 
 def frame_of(survey: Survey, color: str, depth: str) -> str:
@@ -151,10 +155,6 @@ def common_prefix(name: str, other: str) -> tuple[str, ...]:
             break
         shared.append(a)
     return tuple(shared)
-
-
-def _same_intrinsics(a: Calibration, b: Calibration) -> bool:
-    return bool(abs(a.K - b.K).max() <= 0.01 * a.K[0, 0])
 
 
 def _fits(calibration: Calibration, image: ImageMessage) -> bool:

@@ -136,11 +136,6 @@ def intrinsics_of(calibration: Calibration) -> Intrinsics:
     )
 
 
-def _is_rectified(topic: str) -> bool:
-    """Whether a topic's name says that its images are rectified (image_rect, image_rect_color, image_rect_raw)."""
-    return any(part.startswith("image_rect") for part in topic.split("/"))
-
-
 def _rectified(calibration: Calibration) -> Calibration:
     """The camera of the rectified image: P where it is set, and no distortion; valid where the lens is known."""
     K = calibration.projection if calibration.projection[0, 0] > 0 else calibration.K
@@ -253,7 +248,7 @@ class _Builder:
                 remedy="name the right CameraInfo with --camera",
             )
         sized = replace(calibration, width=size[0], height=size[1])
-        return _rectified(sized) if _is_rectified(image_topic) else sized
+        return _rectified(sized) if any(part.startswith("image_rect") for part in image_topic.split("/")) else sized
 
     def _given(self, intrinsics: tuple[float, ...], image_topic: str) -> Calibration:
         """What --intrinsics says, for images without distortion of the size that they are."""

@@ -60,7 +60,9 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
         for axes, cut in panels:
             distance = _floats(cut, grid, "sdf")
             image = draw_distance(axes, cut.coordinates, distance, cut.voxel, names_lines=False)
-            _veil(axes, cut, grid)
+            if _knows_seen(grid):
+                never_seen = cut.of(grid, "observed") == VoxelState.NEVER_SEEN
+                draw_never_seen(axes, cut.coordinates, never_seen, cut.voxel)
         figure.colorbar(image, ax=[axes for axes, _ in panels], extend="both", label="distance [cm]", pad=0.01)
         never = "; hatched: never seen" if _knows_seen(grid) else ""
         lines = ", ".join(f"{100 * level:g}" for level in CONTOURS)
@@ -181,11 +183,6 @@ def _label(axes: Any, cut: Cut) -> None:
     right, up = cut.names
     axes.set(xlabel=f"{right} [m]", ylabel=f"{up} [m]", aspect="equal")
     axes.set_title(f"{'xyz'[cut.axis]} = {round(cut.plane, 2) + 0.0:.2f} m", pad=8)
-
-
-def _veil(axes: Any, cut: Cut, grid: DistanceGrid) -> None:
-    if _knows_seen(grid):
-        draw_never_seen(axes, cut.coordinates, cut.of(grid, "observed") == VoxelState.NEVER_SEEN, cut.voxel)
 
 
 def _knows_seen(grid: DistanceGrid) -> bool:

@@ -113,7 +113,11 @@ def bodies_of(surface: RobotSurface) -> dict[str, Surface]:
         corners = surface.triangles[surface.triangle_links == number]
         mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners), process=True)
         parts.setdefault(surface.links[number], []).append(mesh)
-    return {link: _as_surface(trimesh.util.concatenate(meshes)) for link, meshes in parts.items()}
+    whole = {link: trimesh.util.concatenate(meshes) for link, meshes in parts.items()}
+    return {
+        link: Surface(vertices=np.asarray(mesh.vertices, np.float32), faces=np.asarray(mesh.faces, np.uint32))
+        for link, mesh in whole.items()
+    }
 
 
 def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
@@ -126,10 +130,6 @@ def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
         made = trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=[SIDES, SIDES // 2])
         return made.apply_translation([0.0, 0.0, -made.bounds.mean(axis=0)[2]])
     return trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=SIDES)
-
-
-def _as_surface(mesh: "trimesh.Trimesh") -> Surface:
-    return Surface(vertices=np.asarray(mesh.vertices, np.float32), faces=np.asarray(mesh.faces, np.uint32))
 
 
 def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
@@ -248,10 +248,10 @@ def _splats(block: _Block, at: SplatsAt, *, without_robot: bool) -> dict[str, An
 
 def _motion(block: _Block, motion: Motion) -> dict[str, Any]:
     states, links = motion.poses.shape[:2]
-    quats = _quats(motion.poses.reshape(-1, 4, 4)).reshape(states, links * 4)
+    quats = Rotation.from_matrix(motion.poses[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(states, links * 4)
     return {
         "seconds": block.add(motion.seconds, np.float32),
-        "clearance": [_or_none(value) for value in motion.clearance.round(6)],
+        "clearance": [float(value) if np.isfinite(value) else None for value in motion.clearance.round(6)],
         "margin": motion.margin,
         "links": [_mesh(block, body.vertices, body.faces) for body in motion.bodies.values()],
         "quats": block.add(np.rint(32767 * quats), np.int16),
@@ -260,26 +260,12 @@ def _motion(block: _Block, motion: Motion) -> dict[str, Any]:
     }
 
 
-def _or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _quats(poses: Float64) -> Float64:
-    """(K, 4, 4) -> unit quaternions (K, 4), w last."""
-    return np.asarray(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), np.float64)
-
-
 def _mesh(block: _Block, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> dict[str, Any]:
     return {"vertices": block.points(vertices), "faces": block.add(faces, np.uint32)}
 
 
 def _deflated(data: bytes) -> str:
     return base64.b64encode(zlib.compress(data)).decode("ascii")
-
-
-def for_script(text: str) -> str:
-    """JSON that may stand in a script element: no end of one, and no comment, is in it."""
-    return text.replace("<", "\\u003c")
 
 
 PARTS = Path(__file__).parent / "page_parts"
@@ -364,7 +350,7 @@ def rendered(page: Page) -> str:
     environment = Environment(loader=FileSystemLoader(PARTS), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {
         "classed": lambda state: str(state).replace(" ", "-"),
-        "scripted": lambda text: Markup(for_script(text)),
+        "scripted": lambda text: Markup(text.replace("<", "\\u003c")),
         "shown": _shown,
     }
     environment.tests["a_cell"] = lambda value: isinstance(value, Cell)

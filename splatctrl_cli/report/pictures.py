@@ -167,7 +167,9 @@ def draw_distance(
         100.0 * distance,
         origin="lower",
         extent=extent_of(coordinates, voxel),
-        cmap=pale_red_to_blue(),
+        cmap=mpl.colors.LinearSegmentedColormap.from_list(  # pale enough for lines and circles on top
+            "pale_red_blue", mpl.colormaps["RdBu"](np.linspace(0.18, 0.80, 63))
+        ),
         vmin=-limit,
         vmax=limit,
         interpolation="nearest",
@@ -185,13 +187,6 @@ def draw_distance(
         if names_lines:
             axes.clabel(lines, fmt=lambda level: f"{100 * level:g} cm", fontsize=9)
     return image
-
-
-def pale_red_to_blue() -> Any:
-    """Red inside, blue outside, white on the surface, pale enough for lines and circles on top."""
-    return mpl.colors.LinearSegmentedColormap.from_list(
-        "pale_red_blue", mpl.colormaps["RdBu"](np.linspace(0.18, 0.80, 63))
-    )
 
 
 def draw_never_seen(axes: Any, coordinates: Sequence[Float64], never_seen: NDArray[np.bool_], voxel: float) -> None:
@@ -261,7 +256,7 @@ def view_picture(path: Path, row: ComparisonRow) -> None:
         depth = axes[1, 1].imshow(
             depth_error, cmap="cividis", vmin=0.0, vmax=100.0 * MAX_DEPTH_ERROR, interpolation="nearest"
         )
-        axes[1, 1].imshow(np.where(hole[:, :, None], _rgba(HOLE), 0.0), interpolation="nearest")
+        axes[1, 1].imshow(np.where(hole[:, :, None], mpl.colors.to_rgba(HOLE), 0.0), interpolation="nearest")
         labels = ("mean of |render - photo| over RGB, % of the range", "|render - recorded depth|, cm")
         for image, panel, label in zip((color, depth), axes[1], labels, strict=True):
             figure.colorbar(image, ax=panel, extend="max", fraction=0.045, pad=0.02, label=label)
@@ -311,10 +306,6 @@ def _outline(panels: Any, mask: NDArray[np.bool_]) -> None:
         return
     for panel in panels:
         panel.contour(mask.astype(float), levels=[0.5], colors=OUTLINE, linewidths=1.0)
-
-
-def _rgba(color: str) -> Float64:
-    return np.asarray(mpl.colors.to_rgba(color))
 
 
 def _finish(panel: Any, text: str) -> None:

@@ -67,7 +67,7 @@ def clearance_picture(
     """
     shown = {kind: intervals for kind, intervals in events.items() if intervals}
     with drawn_figure(4.8 + _strip_height(shown)) as figure:
-        axes, strip = _with_strip(figure, 4.4, shown)
+        axes, strip = figure.subplots(2, 1, sharex=True, height_ratios=[4.4, max(_strip_height(shown), 0.05)])
         found = [_clearance_curve(axes, seconds, values, name) for name, values in curves.items()]
         lowest = min(0.0, *found)
         bottom = lowest * 1.15 - 0.2 if lowest < 0 else 0.0
@@ -247,11 +247,6 @@ def _limit_axis(axes: Any, joint: str, limit: float, peak: float, beneath: float
 
 def _strip_height(events: Mapping[str, Intervals]) -> float:
     return 0.28 * len(events) + 0.55 if events else 0.4
-
-
-def _with_strip(figure: Any, height: float, events: Mapping[str, Intervals]) -> tuple[Any, Any]:
-    """Axes over a strip for events that share the time."""
-    return tuple(figure.subplots(2, 1, sharex=True, height_ratios=[height, max(_strip_height(events), 0.05)]))
 
 
 def _draw_strip(axes: Any, above: Any, events: Mapping[str, Intervals], seconds: Float64) -> None:

@@ -254,7 +254,9 @@ def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping
     for suite, case in [pair for pair in worst_first(suites) if pair[1].kind is not Kind.SKIPPED][:MOST_ANNOTATIONS]:
         file = _in_repository(suite.path, environment)
         properties = {**({"file": file} if file else {}), "title": f"{case.group}: {case.name} ({case.kind})"}
-        given = ",".join(f"{name}={_property(value)}" for name, value in properties.items())
+        given = ",".join(
+            f"{name}={_escaped(value).replace(':', '%3A').replace(',', '%2C')}" for name, value in properties.items()
+        )
         lines.append(f"::{level} {given}::{_escaped(case.text)}")
     return lines
 
@@ -313,7 +315,3 @@ def _in_repository(path: str, environment: Mapping[str, str]) -> str:
 def _escaped(text: str) -> str:
     """As actions/toolkit writes the message of a workflow command."""
     return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
-
-
-def _property(text: str) -> str:
-    return _escaped(text).replace(":", "%3A").replace(",", "%2C")

@@ -23,7 +23,7 @@ from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.logs.survey import NAME as ROBOT
-from splatctrl_cli.logs.survey import RobotDescription, Survey, TopicSurvey, robot_descriptions, survey_to_describe
+from splatctrl_cli.logs.survey import RobotDescription, TopicSurvey, robot_descriptions, survey_to_describe
 from splatctrl_cli.logs.video import SUFFIXES as VIDEOS
 from splatctrl_cli.logs.video import open_log
 from splatctrl_cli.scene_files.scene_folder import run_value
@@ -145,7 +145,8 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
     robots = [name for name, t in sorted(found.topics.items()) if t.count and name.endswith(f"/{ROBOT}")]
     if robots:
         facts[ROBOT] = robots
-    grids = [Grid(name="topics", header=_TOPIC_COLUMNS, rows=[_topic_row(t) for t in _by_name(found)])]
+    rows = [_topic_row(found.topics[name]) for name in sorted(found.topics)]
+    grids = [Grid(name="topics", header=_TOPIC_COLUMNS, rows=rows)]
     cameras = camera_topics(log, found, options)
     if cameras:
         rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
@@ -164,10 +165,6 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
 
 
 _TOPIC_COLUMNS = ("topic", "type", "encoding", "count", "hz", "first message")
-
-
-def _by_name(found: Survey) -> list[TopicSurvey]:
-    return [found.topics[name] for name in sorted(found.topics)]
 
 
 def _topic_row(entry: TopicSurvey) -> list[object]:
