@@ -1,4 +1,6 @@
-"""TUM RGB-D and what others publish in its form: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``, all by stamps.
+"""Layouts that pair images by their stamps: TUM RGB-D and what is published in its form, SUN3D.
+
+TUM RGB-D and what others publish in its form: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``, all by stamps.
 
 Depth counts 1/5000 m. Files, factor and cameras are those of the dataset's page (Sturm et al., A benchmark for the
 evaluation of RGB-D SLAM systems, IROS 2012; "File Formats" and "Intrinsic Camera Calibration"; the same in
@@ -13,16 +15,31 @@ ICL-NUIM in its TUM-compatible form: ``rgb/N.png``, ``depth/N.png`` and a ``*.gt
 renderer's camera is left-handed, which its page writes as a negative focal length (481.20, -480.00, 319.50, 239.50):
 y points up, in the camera and in the world. Both are mirrored here, so that poses stay rigid and fy is positive, as
 in theNded/MeshHashing (src/io/config_manager.cc). The trajectory begins with image 1; image 0 has no pose.
+
+SUN3D: ``image/NUMBER-MICROSECONDS.jpg``, ``depth/NUMBER-MICROSECONDS.png``, ``intrinsics.txt``, ``extrinsics/``.
+
+As the dataset's own reader takes them (SUN3DreaderWithAnnotation, readSUN3Dannotation.m): depth with its bits rotated
+left by three, in millimetres, registered to colour; the depth nearest in time belongs to an image; the last file of
+``extrinsics/`` holds a 3x4 matrix for each image in order, camera to world; the first pixel's centre is at 1.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ImageFile, PosesTable
-from splatctrl_cli.datasets.layout import Layout, described, images_of, paired_by_name, paired_by_stamp, pinhole
+from splatctrl_cli.datasets.layout import (
+    Layout,
+    described,
+    images_of,
+    paired_by_name,
+    paired_by_stamp,
+    pinhole,
+    pose_or_none,
+    read_K,
+)
 from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_tum, rigid, stamp_of_text
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
@@ -88,12 +105,12 @@ _BONN_NOTE = (
 )
 
 
-def matches(folder: Path) -> bool:
+def is_tum(folder: Path) -> bool:
     """Whether the folder lists its images in rgb.txt and depth.txt."""
     return all((folder / name).is_file() for name in ("rgb.txt", "depth.txt"))
 
 
-def read(folder: Path, options: SourceOptions) -> Description:
+def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
     """The folder as a description: pairs within the pairing tolerance, poses interpolated."""
     colors, depths = listed(folder / "rgb.txt"), listed(folder / "depth.txt")
     series = _series(folder)
@@ -195,7 +212,7 @@ ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by number; mirror
     481.2, 480, 319.5, 239.5
 """
 
-_DOCS = """
+_TUM_DOCS = """
 TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated at the colour's stamp | 1/5000 m, paired
     within 20 ms | by freiburg1, 2 or 3 (fr1, ...) in the folder's name or the heads of its lists, else
     `--intrinsics`
@@ -207,7 +224,51 @@ ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
 """
 
 
+def is_sun3d(folder: Path) -> bool:
+    """Whether the folder is such a sequence."""
+    has_folders = all((folder / name).is_dir() for name in ("image", "depth", "extrinsics"))
+    return has_folders and (folder / "intrinsics.txt").is_file()
+
+
+def read_sun3d(folder: Path, options: SourceOptions) -> Description:
+    """The folder as a description; images within the pairing tolerance of a depth image."""
+    colors, depths = _by_stamp(folder / "image"), _by_stamp(folder / "depth")
+    extrinsics = sorted((folder / "extrinsics").glob("*.txt"))
+    poses = _poses(extrinsics[-1]) if extrinsics else []
+    at = {stamp_ns: pose_or_none(poses[index]) for index, (stamp_ns, _) in enumerate(colors) if index < len(poses)}
+    return described(
+        paired_by_stamp(folder, colors, depths, at.get, options),
+        folder,
+        options,
+        poses=PosesTable(format="matrix-rows", file="extrinsics/*.txt"),
+        lens=lambda image: replace(pinhole(read_K(folder / "intrinsics.txt"), image), pixel_center=1.0),
+        depth=DepthTable(encoding="uint16-rotated3"),
+        has_stamps=True,
+    )
+
+
+def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
+    found = [(stamp_of_text(f"{path.stem.partition('-')[2]}e-6"), path) for path in images_of(folder).values()]
+    return [(stamp_ns, path) for stamp_ns, path in found if stamp_ns is not None]
+
+
+def _poses(path: Path) -> list[Float64]:
+    """T_world_camera (4, 4) of each image."""
+    values = read_numbers(path)
+    if len(values) % 12:
+        raise InputError(f"{path}: expected 3x4 matrices, got {len(values)} numbers", remedy="copy the file again")
+    rows = np.array(values).reshape(-1, 3, 4)
+    bottom = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 4))
+    return list(np.concatenate([rows, bottom], axis=1))
+
+
+_SUN3D_DOCS = """
+SUN3D | `image/`, `depth/`, `extrinsics/`, `intrinsics.txt` | the newest file of `extrinsics/`, by order | 1 mm,
+    bits rotated by three, paired within 20 ms | `intrinsics.txt`, the first pixel's centre at 1
+"""
+
 ENTRIES = (
-    Layout(name="TUM RGB-D", order=0, matches=matches, read=read, docs=_DOCS),
+    Layout(name="TUM RGB-D", order=0, matches=is_tum, read=read_tum_folder, docs=_TUM_DOCS),
     Layout(name="ICL-NUIM", order=5, matches=is_icl, read=read_icl, docs=_ICL_DOCS),
+    Layout(name="SUN3D", order=8, matches=is_sun3d, read=read_sun3d, docs=_SUN3D_DOCS),
 )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.datasets import layout_nerfstudio
-from splatctrl_cli.datasets.layout_frames import COLOR_LENS, DEPTH_LENS, T_COLOR_DEPTH
+from splatctrl_cli.datasets.layout_scenes import COLOR_LENS, DEPTH_LENS, T_COLOR_DEPTH
 from splatctrl_cli.datasets.layout_tum import marker_to_camera
 from splatctrl_cli.datasets.poses import stamp_of_text
 from splatctrl_cli.errors import InputError
