@@ -6,9 +6,8 @@ Members: ``origin`` (3,) float64 [m], ``voxel`` () float64 [m], ``header`` () st
 
 import errno
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 
@@ -33,13 +32,9 @@ from splatctrl_cli.records import DistanceGrid
 PLACE: Mapping[str, tuple[str, tuple[int, ...]]] = {"origin": ("<f8", (3,)), "voxel": ("<f8", ())}
 
 
-MOST_PACKED = 1 << 29  # bytes
+MOST_PACKED = 1 << 29  # bytes of arrays that are compressed; stored ones are as large as the file
 
-
-@dataclass(frozen=True, kw_only=True)
-class _Member:
-    dtype: np.dtype[np.generic]
-    shape: tuple[int, ...]
+_Members = dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]]
 
 
 def write_npz(path: Path, grid: DistanceGrid) -> None:
@@ -96,9 +91,9 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
         raise InputError(f"{path}: not a whole distance grid: {error}", remedy="bake it again") from None
 
 
-def _members(archive: zipfile.ZipFile) -> dict[str, _Member]:
+def _members(archive: zipfile.ZipFile) -> _Members:
     """Type and shape by name, as long as what the archive says is there. Raises ValueError where it is not."""
-    members: dict[str, _Member] = {}
+    members: _Members = {}
     for entry in archive.infolist():
         name = entry.filename.removesuffix(".npy")
         if name in members or name == entry.filename:
@@ -109,39 +104,28 @@ def _members(archive: zipfile.ZipFile) -> dict[str, _Member]:
             size = stream.tell() + dtype.itemsize * prod(shape)
         if entry.file_size != size:
             raise ValueError(f"{entry.filename}: expected {size} bytes, got {entry.file_size}")
-        members[name] = _Member(dtype=dtype, shape=shape)
-    _check_size(archive.infolist())
-    return members
-
-
-def _check_size(entries: Sequence[zipfile.ZipInfo]) -> None:
-    """Raise ValueError for a file whose compressed arrays hold more than a grid that is stored would.
-
-    Stored arrays, as `write_npz` writes them, are as large as the file.
-    """
-    packed = [entry for entry in entries if entry.compress_type != zipfile.ZIP_STORED]
-    size = sum(entry.file_size for entry in packed)
+        members[name] = (dtype, shape)
+    size = sum(entry.file_size for entry in archive.infolist() if entry.compress_type != zipfile.ZIP_STORED)
     if size > MOST_PACKED:
         raise ValueError(
             f"{size} bytes in compressed arrays, expected at most {MOST_PACKED}, or arrays not compressed"
         )
+    return members
 
 
-def _head(path: Path, archive: zipfile.ZipFile, members: dict[str, _Member]) -> GridHead:
+def _head(path: Path, archive: zipfile.ZipFile, members: _Members) -> GridHead:
     missing = {*PLACE, "header", "sdf"} - members.keys()
     if missing:
         raise InputError(
             f"{path}: expected the arrays origin, voxel, header and sdf, got {', '.join(members) or 'none'}",
             remedy="give a field.npz that sdf-bake wrote",
         )
-    text = members["header"]
-    if text.dtype.kind != "U" or text.shape != ():
-        raise InputError(
-            f"{path}: header: expected one string, got {text.dtype} {text.shape}", remedy="bake it again"
-        )
+    dtype, text_shape = members["header"]
+    if dtype.kind != "U" or text_shape != ():
+        raise InputError(f"{path}: header: expected one string, got {dtype} {text_shape}", remedy="bake it again")
     header = parse_header(str(path), str(_array(archive, "header")))
     for name, expected in PLACE.items():
-        got = (members[name].dtype.str, members[name].shape)
+        got = (members[name][0].str, members[name][1])
         if got != expected:
             raise InputError(f"{path}: {name}: expected {expected}, got {got}", remedy="bake it again")
     origin, voxel = _array(archive, "origin").astype(np.float64), float(_array(archive, "voxel").astype(np.float64))
@@ -149,7 +133,7 @@ def _head(path: Path, archive: zipfile.ZipFile, members: dict[str, _Member]) -> 
         raise InputError(f"{path}: origin: expected 3 finite float64, got {origin.tolist()}", remedy="bake it again")
     if not 0.0 < voxel < np.inf:
         raise InputError(f"{path}: voxel: expected a size above 0 m, got {voxel}", remedy="bake it again")
-    layout = {name: (m.dtype.str, m.shape) for name, m in members.items() if name not in {*PLACE, "header"}}
+    layout = {name: (kind.str, size) for name, (kind, size) in members.items() if name not in {*PLACE, "header"}}
     shape = check_layout(str(path), layout)
     return GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header)
 

@@ -10,7 +10,7 @@ import gzip
 import struct
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +38,7 @@ def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
     """
     check_gaussians("Gaussians to write", gaussians)
     held, bits = held_by_spz(gaussians), _fraction_bits(gaussians.centers)
-    num_coefficients = held.harmonics.shape[1]
-    degree = {1: 0, 4: 1, 9: 2, 16: 3}[num_coefficients]
+    degree = {1: 0, 4: 1, 9: 2, 16: 3}[held.harmonics.shape[1]]
     fixed = np.rint(np.ldexp(held.centers.astype(np.float64), bits)).astype("<i4")
     parts = [
         HEADER.pack(MAGIC, 3, len(held), degree, bits, 0, 0),
@@ -64,14 +63,14 @@ def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
         raise InputError(f"{path}: no whole .spz file: {error}", remedy="copy or write the file again") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    columns = _columns(path, content)
+    bits, (centers, opacities, colors, sigmas, quats, rest) = _columns(path, content)
     gaussians = GaussianSet(
-        centers=_centers(columns.centers, columns.bits),
-        scales=np.exp(columns.sigmas / 16.0 - 10.0).astype(np.float32),
-        quats_wxyz=_quaternions(columns.quats),
-        opacities=(columns.opacities[:, 0] / 255.0).astype(np.float32),
-        harmonics=_harmonics(columns),
-        labels=np.zeros(len(columns.centers), dtype=np.uint8),
+        centers=_centers(centers, bits),
+        scales=np.exp(sigmas / 16.0 - 10.0).astype(np.float32),
+        quats_wxyz=_quaternions(quats),
+        opacities=(opacities[:, 0] / 255.0).astype(np.float32),
+        harmonics=_harmonics(colors, rest),
+        labels=np.zeros(len(centers), dtype=np.uint8),
     )
     check_gaussians(str(path), gaussians)
     return gaussians, {}
@@ -102,19 +101,8 @@ def spz_bound(gaussians: GaussianSet) -> Differences:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Columns:
-    bits: int
-    centers: UInt8
-    opacities: UInt8
-    colors: UInt8
-    sigmas: UInt8
-    quats: UInt8
-    rest: UInt8
-
-
-def _columns(path: Path, content: bytes) -> _Columns:
-    """The bytes of each attribute, a row per Gaussian, of a file that has neither more nor less."""
+def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
+    """The fraction bits, and the bytes of each attribute, a row per Gaussian, of a file of no more and no fewer."""
     if len(content) < HEADER.size or HEADER.unpack_from(content)[0] != MAGIC:
         raise InputError(f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {content[:4].hex()}")
     _, version, num, degree, bits, flags, _ = HEADER.unpack_from(content)
@@ -132,10 +120,7 @@ def _columns(path: Path, content: bytes) -> _Columns:
     for width in widths:
         tables.append(np.frombuffer(content, np.uint8, num * width, offset).reshape(num, width))
         offset += num * width
-    centers, opacities, colors, sigmas, quats, rest = tables
-    return _Columns(
-        bits=bits, centers=centers, opacities=opacities, colors=colors, sigmas=sigmas, quats=quats, rest=rest
-    )
+    return bits, tables
 
 
 def _fraction_bits(centers: Float32) -> int:
@@ -156,11 +141,10 @@ def _centers(table: UInt8, bits: int) -> Float32:
     return np.ldexp(fixed.astype(np.float64), -bits).astype(np.float32)
 
 
-def _harmonics(columns: _Columns) -> Float32:
-    num, width = columns.rest.shape
-    constant = ((columns.colors / 255.0 - 0.5) / 0.15)[:, None]
-    rest = (columns.rest / 128.0 - 1.0).reshape(num, width // 3, 3)
-    return np.concatenate([constant, rest], axis=1).astype(np.float32)
+def _harmonics(colors: UInt8, rest: UInt8) -> Float32:
+    constant = ((colors / 255.0 - 0.5) / 0.15)[:, None]
+    further = (rest / 128.0 - 1.0).reshape(len(rest), rest.shape[1] // 3, 3)
+    return np.concatenate([constant, further], axis=1).astype(np.float32)
 
 
 def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
