@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.grid_files.curobo_grid import round_down, write_curobo
+from splatctrl_cli.grid_files.planner_grids import round_down, write_curobo
 from splatctrl_cli.records import DistanceGrid
 from tests.grid_files.make_grid import HEADER, centers, random_grid, with_unknown
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.grid_files import moveit_field
-from splatctrl_cli.grid_files.moveit_field import read_moveit_head, write_moveit
+from splatctrl_cli.grid_files import planner_grids
+from splatctrl_cli.grid_files.planner_grids import read_moveit_head, write_moveit
 from splatctrl_cli.records import Bool, DistanceGrid, Float64
 from tests.grid_files.make_grid import HEADER, ball_grid, centers, random_grid, with_unknown
 
@@ -58,7 +58,7 @@ def touched(grid: DistanceGrid, radius: float) -> Bool:
 def test_the_cells_that_a_splat_may_reach_into_are_occupied(
     tmp_path: Path, channels: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(moveit_field, "CHUNK", 4 * 22 * 23 * 2)
+    monkeypatch.setattr(planner_grids, "CHUNK", 4 * 22 * 23 * 2)
     grid = ball_grid()
     kept = {name: grid.channels[name] for name in channels}
     write_moveit(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.splat_files.dot_splat import read_splat, write_splat
+from splatctrl_cli.splat_files.packed_splats import read_splat, write_splat
 from tests.splat_files.test_gaussian_ply import gaussian_set
 
 ROW = struct.Struct("<6f8B")

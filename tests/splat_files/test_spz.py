@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.splat_files.packed_splats import read_spz, spz_bound, write_spz
 from splatctrl_cli.splat_files.splat_format import differences
-from splatctrl_cli.splat_files.spz import read_spz, spz_bound, write_spz
 from tests.splat_files.test_gaussian_ply import gaussian_set
 
 HEADER = struct.Struct("<IIIBBBB")

@@ -1,4 +1,6 @@
-"""A distance channel as the voxel grid of NVIDIA's cuRobo: ``field.curobo.npz``, which a few lines of its user load.
+"""Baked grids for the planners of other programs: NVIDIA's cuRobo and MoveIt.
+
+A distance channel as the voxel grid of NVIDIA's cuRobo: ``field.curobo.npz``, which a few lines of its user load.
 
 Read in its source (NVlabs/curobo), not tried on it. Both generations flatten (x, y, z) with z fastest and place the
 grid by the pose of its middle, ``x y z qw qx qy qz``. They differ in the rest:
@@ -11,9 +13,17 @@ grid by the pose of its middle, ``x y z qw qx qy qz``. They differ in the rest:
 - 0.8 (curobo/_src/geom/types.py, geom/data/data_voxel.py): positive outside, float16; ``round(dims / voxel)`` cells
   a side, which the kernel truncates in float32; trilinear between centres, the pose in the middle of the cells.
   Outside all is free.
+
+Occupied cells as the stream of MoveIt's distance field, which propagates distances from them itself.
+
+Format: moveit_core, distance_field/src/propagation_distance_field.cpp (`readFromStream`; the same in MoveIt 1 and 2)
+and voxel_grid.h. Seven lines of text, then a zlib stream of bits: x slowest, each run of z in whole bytes, lowest bit
+first. The reader takes ``int(size * (1 / resolution))`` cells a side, and puts the centre of cell 0 at the origin.
 """
 
 import json
+import re
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, get_args
@@ -24,13 +34,23 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.arrays import DAMAGE, Pieces, has_arrays, read_arrays, savez
 from splatctrl_cli.files.summary import Summary
-from splatctrl_cli.grid_files.grid_format import GridFormat, check_grid, header_facts, header_text, slabs
-from splatctrl_cli.records import DistanceGrid, Float64
+from splatctrl_cli.grid_files.grid_format import (
+    CHUNK,
+    GridFormat,
+    check_grid,
+    covers,
+    header_facts,
+    header_text,
+    slabs,
+)
+from splatctrl_cli.records import Bool, DistanceGrid, Float64
 
 CuroboVersion = Literal["0.7", "0.8"]
 VERSIONS: tuple[str, ...] = get_args(CuroboVersion)
 DISTANCES = ("sdf", "bound", "hard", "se", "gpdf")
-MARGIN = 1e-3  # [cells] by which 0.8 is given a longer side, so that float32 does not truncate it to a cell less
+CUROBO_MARGIN = (
+    1e-3  # [cells] by which 0.8 is given a longer side, so that float32 does not truncate it to a cell less
+)
 
 
 def write_curobo(path: Path, grid: DistanceGrid, *, version: str = "0.7", channel: str = "sdf") -> None:
@@ -81,7 +101,7 @@ def _place(grid: DistanceGrid, shape: Float64, version: str) -> tuple[Float64, F
     middle = grid.origin + 0.5 * grid.voxel * (shape - 1)
     if version == "0.7":
         return grid.voxel * (shape - 1.0), middle - 0.5 * grid.voxel
-    return grid.voxel * (shape + MARGIN), middle
+    return grid.voxel * (shape + CUROBO_MARGIN), middle
 
 
 def round_down(values: NDArray[np.float32]) -> NDArray[np.float16]:
@@ -114,10 +134,86 @@ def describe_curobo(path: Path, head: bytes) -> Summary | None:
     return Summary(path=str(path), kind="cuRobo voxel grid", facts=facts)
 
 
-_DOCS = """
+_CUROBO_DOCS = """
 `curobo` | `field.curobo.npz`: `features`, `dims`, `voxel_size`, `pose`, `shape` | NVIDIA cuRobo, by the lines
     below | its index arithmetic; cuRobo not tried | 1.1 s, 48 MiB (one channel)
 """
+
+
+FIELDS = ("resolution", "size_x", "size_y", "size_z", "origin_x", "origin_y", "origin_z")
+MOVEIT_MARGIN = 1e-6  # [cells] by which a size is larger, so that no rounding truncates it to a cell less
+REACH = np.sqrt(3.0) / 2.0  # [cells] from a centre to a corner
+ROUNDING = 1e-6  # [m] of float32 values a metre or two from their origin
+
+
+def write_moveit(path: Path, grid: DistanceGrid) -> None:
+    """Write the cells that are taken for occupied: a splat may reach into the cell's cube, or sdf is not above 0.
+
+    The first is ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` in a grid without bound; the second takes in the
+    distance's own zero level, unknown space where the policy makes it an obstacle, and cells that are NaN.
+    Raises InputError where the grid has neither bound nor hard.
+    """
+    shape = check_grid(grid)
+    if not {"bound", "hard"} & grid.channels.keys():
+        raise InputError(
+            f"grid to write for MoveIt: expected the channel bound or hard, got {', '.join(grid.channels)}",
+            remedy="bake it with one of them",
+        )
+    numbers = (grid.voxel, *((n + MOVEIT_MARGIN) * grid.voxel for n in shape), *grid.origin)
+    text = "".join(f"{name}: {float(value)!r}\n" for name, value in zip(FIELDS, numbers, strict=True))
+    step = max(1, CHUNK // (4 * shape[1] * shape[2]))
+    packer = zlib.compressobj()
+    with path.open("wb") as stream:
+        stream.write(text.encode("ascii"))
+        for start in range(0, shape[0], step):
+            occupied = is_occupied(grid, slice(start, start + step))
+            stream.write(packer.compress(np.packbits(occupied, axis=2, bitorder="little").tobytes()))
+        stream.write(packer.flush())
+
+
+def is_occupied(grid: DistanceGrid, layers: slice) -> Bool:
+    """(L, Y, Z) which cells of these layers of x are written as occupied."""
+    if "bound" in grid.channels:
+        reached = np.asarray(grid.channels["bound"][layers]) <= np.float32(0.0)
+    else:
+        reached = np.asarray(grid.channels["hard"][layers]) <= np.float32(REACH * grid.voxel + ROUNDING)
+    is_clear: NDArray[np.bool_] = np.asarray(grid.channels["sdf"][layers]) > np.float32(0.0)  # False for NaN
+    return reached | ~is_clear
+
+
+def read_moveit_head(path: Path) -> tuple[dict[str, float], int]:
+    """The numbers at the head of a stream, and where its bits start. Raises InputError for a file that has none."""
+    with path.open("rb") as stream:
+        lines = [stream.readline(128) for _ in FIELDS]
+        start = stream.tell()
+    numbers: dict[str, float] = {}
+    for name, line in zip(FIELDS, lines, strict=True):
+        key, _, value = line.decode("ascii", errors="replace").partition(": ")
+        try:
+            numbers[name] = float(value)
+        except ValueError:
+            numbers[name] = np.nan
+        if key != name or not np.isfinite(numbers[name]):
+            raise InputError(f"{path}: expected '{name}: NUMBER', got {line!r}", remedy="the file is damaged")
+    return numbers, start
+
+
+def describe_moveit(path: Path, head: bytes) -> Summary | None:
+    """A stream of MoveIt's distance field."""
+    if re.match(rb"resolution: \S+\nsize_x: ", head) is None:
+        return None
+    numbers, start = read_moveit_head(path)
+    cells = [int(numbers[f"size_{axis}"] * (1.0 / numbers["resolution"])) for axis in "xyz"]
+    place = covers([numbers[f"origin_{axis}"] for axis in "xyz"], numbers["resolution"], cells)
+    facts = {**place, "packed_bytes": path.stat().st_size - start}
+    return Summary(path=str(path), kind="MoveIt distance field", facts=facts)
+
+
+_MOVEIT_DOCS = """
+`moveit` | `field.moveit`: occupied cells | `PropagationDistanceField(stream, max_distance)` of MoveIt 1 and 2 | a
+    reader that follows its source; MoveIt not tried | 0.4 s, 16 MiB (one channel)
+"""
+
 ENTRIES = (
     GridFormat(
         name="curobo",
@@ -127,6 +223,16 @@ ENTRIES = (
         describe=describe_curobo,
         holds_unknown=False,
         bytes_per_cell=4,
-        docs=_DOCS,
+        docs=_CUROBO_DOCS,
+    ),
+    GridFormat(
+        name="moveit",
+        order=5,
+        suffix=".moveit",
+        write=write_moveit,
+        describe=describe_moveit,
+        needs=frozenset({"bound", "hard"}),
+        bytes_per_cell=0,
+        docs=_MOVEIT_DOCS,
     ),
 )
