@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.cloud import drawn_on
+from splatctrl_cli.evaluate.held_out_depth import drawn_on
 from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.mesh_distance import TriangleMesh
 from splatctrl_cli.records import Float64, Index

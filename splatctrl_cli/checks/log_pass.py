@@ -26,11 +26,10 @@ from splatctrl_cli.logs.decoder import (
     stamp_ns,
 )
 from splatctrl_cli.logs.messages import color_of, depth_of, num_invalid, read_image
-from splatctrl_cli.logs.registration import DepthToColor
+from splatctrl_cli.logs.registration import DepthToColor, TfTree
 from splatctrl_cli.logs.rig import Camera, build_cameras
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.survey import Survey
-from splatctrl_cli.logs.tf_tree import TfTree
 from splatctrl_cli.records import Float64, RgbdFrame
 
 _HEADED = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu")

@@ -13,7 +13,7 @@ from splatctrl_cli.config.fixed import POSE_TOLERANCE_NS
 from splatctrl_cli.config.ranges import MAX_PLACE
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform, pose_at, quat_from_rotation, transform_from
-from splatctrl_cli.logs.tf_tree import TfTree
+from splatctrl_cli.logs.registration import TfTree
 from splatctrl_cli.records import Float64
 
 FORMATS = ("matrix-blocks", "trajectory-log", "tum", "nerfstudio", "matrix-files")

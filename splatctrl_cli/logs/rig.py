@@ -21,10 +21,9 @@ from splatctrl_cli.logs.cameras import (
     pose_topics,
 )
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
-from splatctrl_cli.logs.registration import DISTORTION_MODELS, SAME_MODELS, DepthToColor, Undistortion
+from splatctrl_cli.logs.registration import DISTORTION_MODELS, SAME_MODELS, DepthToColor, TfTree, Undistortion
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.survey import Calibration, Survey
-from splatctrl_cli.logs.tf_tree import TfTree
 from splatctrl_cli.records import Bool, Float64, Intrinsics
 
 

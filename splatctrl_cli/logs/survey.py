@@ -32,8 +32,8 @@ from splatctrl_cli.logs.decoder import (
     stamp_ns,
 )
 from splatctrl_cli.logs.messages import ImageMessage, read_image
+from splatctrl_cli.logs.registration import TfTree
 from splatctrl_cli.logs.state_messages import STANDARD_TYPES, STATE_TYPES, JointLog, RawJoints, read_states
-from splatctrl_cli.logs.tf_tree import TfTree
 from splatctrl_cli.logs.video import VideoLog
 from splatctrl_cli.records import Bool, Float64
 

@@ -17,8 +17,7 @@ import numpy as np
 
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.files.digests import Parts
-from splatctrl_cli.files.output import PARTIAL
+from splatctrl_cli.files.output import PARTIAL, Parts
 from splatctrl_cli.records import Float64, GaussianSet, SplatSet
 from splatctrl_cli.scene_files.voxel_file import (
     read_known_occupancy,

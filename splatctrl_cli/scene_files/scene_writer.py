@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
-from splatctrl_cli.files.digests import Parts
-from splatctrl_cli.files.output import flush, sha256, write_durably
+from splatctrl_cli.files.output import Parts, flush, sha256, write_durably
 from splatctrl_cli.records import SplatSet, UInt8
 from splatctrl_cli.scene_files.scene_folder import SHELL_FILE, Snapshot
 from splatctrl_cli.scene_files.voxel_file import write_occupancy, write_states

@@ -15,7 +15,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import npy_of, read_arrays, savez
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.logs.messages import decode_rvl
-from splatctrl_cli.logs.tf_tree import TfTree
+from splatctrl_cli.logs.registration import TfTree
 from tests.logs.test_decoder import encoded_rvl
 from tests.properties import few
 

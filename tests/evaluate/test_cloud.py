@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.evaluate.cloud import cloud_score, points_on, spaced, thinned
+from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, spaced, thinned
 from splatctrl_cli.mesh_distance import TriangleMesh
 from splatctrl_cli.records import Float64
 

@@ -8,8 +8,7 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.digests import Parts
-from splatctrl_cli.files.output import Stopwatch, part_digests, sha256, write_run
+from splatctrl_cli.files.output import Parts, Stopwatch, part_digests, sha256, write_run
 from splatctrl_cli.jobs.replays.known_scene import from_grid
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.splat_files.splats import read_ply, read_world_splats, write_ply

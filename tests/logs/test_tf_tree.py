@@ -9,8 +9,8 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import quat_from_rotation, rotation_from_quat, transform_from
+from splatctrl_cli.logs.registration import TfTree
 from splatctrl_cli.logs.source_options import PoseTopic, SourceOptions
-from splatctrl_cli.logs.tf_tree import TfTree
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.sources.source import describe, open_source
 from tests.logs.make_log import (

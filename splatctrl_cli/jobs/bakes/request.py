@@ -15,8 +15,7 @@ from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field.distance import KERNEL_OF
 from splatctrl_cli.field.grid_cells import GridLayout, bounding_box, check_room
 from splatctrl_cli.field.obstacles import DEFAULT_LABELS, field_splats
-from splatctrl_cli.files.digests import Parts
-from splatctrl_cli.files.output import sha256
+from splatctrl_cli.files.output import Parts, sha256
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.device import CUDA, TO_CPU, Device, chosen
 from splatctrl_cli.jobs.progress import Progress

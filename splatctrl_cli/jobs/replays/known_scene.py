@@ -21,8 +21,7 @@ from splatctrl_cli.field.clustered_splats import Spheres
 from splatctrl_cli.field.distance import SphereField, field_over
 from splatctrl_cli.field.grid_field import GridField, exact_channel
 from splatctrl_cli.field.obstacles import NO_SPLAT, ObstacleSpheres, obstacle_spheres
-from splatctrl_cli.files.digests import Parts
-from splatctrl_cli.files.output import sha256
+from splatctrl_cli.files.output import Parts, sha256
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, Index, Label, SplatSet
 from splatctrl_cli.scene_files.scene_folder import open_scene

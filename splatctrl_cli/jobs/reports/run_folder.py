@@ -14,8 +14,7 @@ import numpy as np
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.digests import Parts
-from splatctrl_cli.files.output import PARTIAL, sha256
+from splatctrl_cli.files.output import PARTIAL, Parts, sha256
 from splatctrl_cli.records import Float64, Stamps
 
 REPLAY = "replay"

@@ -14,7 +14,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.evaluate.cloud import cloud_score, points_on, spaced, thinned
+from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, spaced, thinned
 from splatctrl_cli.evaluate.protocols import ObservedSpace, cloud_of_scan, read_observed
 from splatctrl_cli.evaluate.score import Perceptual, ViewScore, score_view
 from splatctrl_cli.evaluate.score_report import Doubts

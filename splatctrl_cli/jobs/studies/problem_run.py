@@ -11,8 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar, get_args, get_type_hints
 from splatctrl_cli.config import Config, PlannerConfig
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
-from splatctrl_cli.files.digests import Parts
-from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
+from splatctrl_cli.files.output import Parts, Stopwatch, output_path, sha256, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.studies.problems import ARCHIVE, ProblemRequest
 from splatctrl_cli.jobs.studies.trial import TSDF

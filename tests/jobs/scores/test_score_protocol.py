@@ -16,7 +16,7 @@ from splatctrl_cli.datasets.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.datasets.dtu_source import DtuSource
 from splatctrl_cli.datasets.idr import write_idr
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.cloud import spaced
+from splatctrl_cli.evaluate.held_out_depth import spaced
 from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.open_recording import RecordingRequest, is_folder_of_views
