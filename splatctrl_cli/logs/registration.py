@@ -1,4 +1,4 @@
-"""The tree of coordinate frames of /tf and /tf_static, asked at any time; depth seen from the colour camera, and images
+"""The tree of frames of /tf and /tf_static, asked at any time; depth seen from the colour camera, and images
 without lens distortion. The tree takes 16 bytes of memory a sample.
 """
 
