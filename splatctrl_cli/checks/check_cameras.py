@@ -60,14 +60,12 @@ def calibration_findings(found: Survey, cameras: Sequence[CameraTopics], changed
         name, calibration = entry.topic.name, entry.calibration
         if calibration is None:
             text = "K is zero: the camera was never calibrated"
-            remedy = "calibrate it, or record the driver's factory values"
             make = note if cameras and all(camera.info for camera in cameras) else warning
-            findings.append(make("uncalibrated", name, text, remedy))
+            findings.append(make("uncalibrated", name, text))
             continue
         if name in changed:
             text = "the CameraInfo changes within the log; the first is used for all frames"
-            remedy = "split the log there, or record with one setting"
-            findings.append(warning("camera-info-changes", name, text, remedy, stamp_ns=changed[name]))
+            findings.append(warning("camera-info-changes", name, text, stamp_ns=changed[name]))
         if name in used:
             findings += _distortion(name, calibration)
     for camera in cameras:
@@ -101,8 +99,7 @@ def _sizes(found: Survey, camera: CameraTopics) -> list[Finding]:
             continue
         if (image.width, image.height) != (calibration.width, calibration.height):
             text = f"{topic} is {image.width}x{image.height}, its CameraInfo {calibration.width}x{calibration.height}"
-            remedy = "record the CameraInfo of this stream, or name it with --camera"
-            findings.append(error("camera-info-size", info, text, remedy))
+            findings.append(error("camera-info-size", info, text))
     return findings
 
 
@@ -159,8 +156,7 @@ def pose_findings(where: str, stamps_ns: Sequence[int], poses: Sequence[Float64 
     if lost:
         share = f"{len(lost)} of {len(poses)} images have no pose"
         severity = error if len(lost) == len(poses) else warning
-        remedy = "tf starts late, ends early, or has a gap of more than 1 s; if it stands still give --camera-pose"
-        findings.append(severity("pose-missing", where, share, remedy, value=len(lost), stamp_ns=lost[0]))
+        findings.append(severity("pose-missing", where, share, value=len(lost), stamp_ns=lost[0]))
     known = [(s, T[:3, 3]) for s, T in zip(stamps_ns, poses, strict=True) if T is not None]
     steps = [
         (float(np.linalg.norm(b - a)), first)
@@ -172,8 +168,7 @@ def pose_findings(where: str, stamps_ns: Sequence[int], poses: Sequence[Float64 
         median = float(np.median([step for step, _ in steps]))
         if longest > max(limits.POSES_JUMP, limits.POSES_JUMP_RATIO * median):
             text = f"the camera jumps by {longest:.3g} m from one frame to the next (median {median:.2g} m)"
-            remedy = "two publishers of one frame, or a localisation that was corrected; reconstruct refuses it"
-            findings.append(error("pose-jump", where, text, remedy, value=longest, unit="m", stamp_ns=at))
+            findings.append(error("pose-jump", where, text, value=longest, unit="m", stamp_ns=at))
     return findings
 
 
@@ -209,13 +204,11 @@ def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> lis
     if other > limits.RATE_SLOWER * rarer and rarer >= limits.RATE_FEWEST and is_all:
         names = ("depth", "colour") if len(depth) < len(color) else ("colour", "depth")
         text = f"{rarer} {names[0]} images to {other} of {names[1]}: {other - len(pairs)} {names[1]} images go unused"
-        remedy = "record both at one rate; more frames show more, and what moves is seen sooner"
-        findings.append(note("rates-differ", where, text, remedy, value=rarer / other))
+        findings.append(note("rates-differ", where, text, value=rarer / other))
     offset = float(np.median([depth[j] - color[i] for i, j in pairs])) * 1e-9
     if abs(offset) > limits.PAIRED_LATE:
         text = f"depth is stamped {1e3 * offset:+.1f} ms against its colour image (median)"
-        remedy = "let the driver synchronise colour and depth: what moves is in two places"
-        findings.append(note("pair-offset", where, text, remedy, value=1e3 * offset, unit="ms"))
+        findings.append(note("pair-offset", where, text, value=1e3 * offset, unit="ms"))
     return findings
 
 

@@ -160,13 +160,11 @@ def image_findings(images: ImageWatch) -> list[Finding]:
     if images.num_bad:
         text = f"{images.num_bad} of {images.count} images do not decode; the first: {images.first_bad}"
         severity = error if images.num_bad == images.count else warning
-        remedy = "they are left out; copy the file again, or look at the recorder"
         at = images.first_bad_ns
-        found.append(severity("undecodable", where, text, remedy, value=images.num_bad, stamp_ns=at))
+        found.append(severity("undecodable", where, text, value=images.num_bad, stamp_ns=at))
     if len(images.sizes) > 1:
         sizes = ", ".join(f"{w}x{h} ({n})" for (w, h), n in images.sizes.most_common(4))
-        remedy = "record one size; frames of another than the camera's are left out"
-        found.append(warning("image-size", where, f"the size of the images changes: {sizes}", remedy))
+        found.append(warning("image-size", where, f"the size of the images changes: {sizes}"))
     if len(images.encodings) > 1:
         kinds = ", ".join(f"{name} ({n})" for name, n in images.encodings.most_common(4))
         text = f"the encoding of the images changes: {kinds}"
@@ -193,16 +191,14 @@ def depth_findings(images: ImageWatch) -> list[Finding]:
         num = "all" if every else str(images.num_without_depth)
         text = f"{num} of {images.num_decoded} depth images hold no depth at all"
         severity = error if every else warning
-        remedy = "is the projector on, and the scene within its range?"
-        found.append(severity("depth-empty", where, text, remedy, value=images.num_without_depth))
+        found.append(severity("depth-empty", where, text, value=images.num_without_depth))
         if every:
             return found
     share = float(np.median(list(images.shares)))
     if share < limits.SOME_DEPTH:
         severity = warning if share < limits.LITTLE_DEPTH else note
         text = f"{100 * share:.0f} % of the pixels have depth (median of the images)"
-        remedy = "the rest stays unseen: dark or shiny things, too near, or warped depth with holes"
-        found.append(severity("depth-share", where, text, remedy, value=share))
+        found.append(severity("depth-share", where, text, value=share))
     if images.num_invalid:
         text = f"{images.num_invalid} depth pixels of {images.num_decoded} images are NaN, infinite or negative"
         text += ": they count as none"

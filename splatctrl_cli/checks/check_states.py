@@ -328,8 +328,7 @@ def stream_findings(where: str, stream: JointStream) -> list[Finding]:
     if num_bad:
         text = f"{num_bad} of {at} states hold a position that is NaN or infinite; the first: {stream.names[joint]}"
         stamp = int(stream.stamp_ns[first_bad])
-        remedy = "they are left out; look at the driver"
-        found.append(warning("joints-nan", where, text, remedy, value=num_bad, stamp_ns=stamp))
+        found.append(warning("joints-nan", where, text, value=num_bad, stamp_ns=stamp))
     widest = np.maximum(np.abs(lowest), np.abs(highest))
     if np.isfinite(widest).any() and float(widest[np.isfinite(widest)].max()) > DEGREES:
         worst = int(np.argmax(np.where(np.isfinite(widest), widest, 0)))
@@ -384,5 +383,4 @@ def _limits(model: RobotModel, states: Sequence[JointState], where: str) -> list
     joint = int(np.argmax(worst))
     text = f"{num} of {len(states)} states are beyond the URDF's limits"
     text += f", {model.joint_names[joint]} by {worst[joint]:.3g}"
-    remedy = "is it the right URDF, are the joints in its units, or were its limits lowered?"
-    return [warning("joints-limits", where, text, remedy, value=worst[joint], unit="rad", stamp_ns=first)]
+    return [warning("joints-limits", where, text, value=worst[joint], unit="rad", stamp_ns=first)]

@@ -142,29 +142,25 @@ def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
     where = times.topic
     if times.num_zero:
         text = f"{times.num_zero} of {times.count} header stamps are 0"
-        remedy = "give --stamps log to take the times of logging, and let the driver stamp the next recording"
         make = error if times.num_zero == times.count and what != "states" else warning
         if what == "states":
             text = f"{text}; the times of logging are taken where all are"
-        return [make("stamp-zero", where, text, remedy, value=times.num_zero)]
+        return [make("stamp-zero", where, text, value=times.num_zero)]
     gaps = times.gaps()
     if gaps and times.median_interval is not None:
         longest, at = max(gaps)
         lost = sum(round(interval / times.median_interval) - 1 for interval, _ in gaps)
         gaps_of = f"a gap of {longest:.3g} s" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest {longest:.3g} s"
         text = f"{gaps_of}; about {lost} {what} are missing"
-        remedy = "record fewer topics or to a faster disk; what moved meanwhile is unknown"
-        found.append(warning("gap", where, text, remedy, value=longest, unit="s", stamp_ns=at))
+        found.append(warning("gap", where, text, value=longest, unit="s", stamp_ns=at))
     if times.num_duplicates:
         text = f"{times.num_duplicates} of {times.count} stamps repeat the one before"
-        remedy = "look for a driver that publishes twice, or a topic recorded twice"
         first = times.first_duplicate_ns
-        found.append(warning("stamp-repeats", where, text, remedy, value=times.num_duplicates, stamp_ns=first))
+        found.append(warning("stamp-repeats", where, text, value=times.num_duplicates, stamp_ns=first))
     if times.num_back:
         text = f"stamps go back {times.num_back} times, by up to {times.furthest_back:.3g} s"
-        remedy = "two publishers on one topic, a clock that was set, or a loop of a played log: record again"
         first = times.first_back_ns
-        found.append(warning("stamp-back", where, text, remedy, value=times.furthest_back, unit="s", stamp_ns=first))
+        found.append(warning("stamp-back", where, text, value=times.furthest_back, unit="s", stamp_ns=first))
     return found
 
 
@@ -202,8 +198,7 @@ def file_findings(spans: Mapping[str, tuple[int, int]]) -> list[Finding]:
         pause = (after[0] - before[1]) * _NS
         if pause > limits.FILES_APART:
             text = f"between {name} and {other} nothing was logged for {pause:.4g} s"
-            remedy = "are they one recording? if not, give each alone"
-            found.append(warning("files-apart", "files", text, remedy, value=pause, unit="s", stamp_ns=before[1]))
+            found.append(warning("files-apart", "files", text, value=pause, unit="s", stamp_ns=before[1]))
     return found
 
 
@@ -219,8 +214,7 @@ def ending_findings(edges: list[TimesWatch], last_ns: int) -> list[Finding]:
     early = (last_ns - first.last_ns) * _NS
     more = f" and {len(ended) - 1} more" if len(ended) > 1 else ""
     text = f"ends {early:.3g} s before the last image: frames below it have no pose from then on"
-    remedy = "record /tf to the end; if it stands still, publish it on /tf_static or give --camera-pose"
-    return [warning("tf-ends", f"{first.topic}{more}", text, remedy, value=early, unit="s", stamp_ns=first.last_ns)]
+    return [warning("tf-ends", f"{first.topic}{more}", text, value=early, unit="s", stamp_ns=first.last_ns)]
 
 
 def part_findings(topics: list[TimesWatch]) -> list[Finding]:
@@ -236,8 +230,7 @@ def part_findings(topics: list[TimesWatch]) -> list[Finding]:
                 side = "after the first" if words == "begins" else "before the last"
                 text = f"{words} {seconds:.3g} s {side} of the other topics"
                 make = warning if seconds > limits.ENDS_MUCH * (last - first) * _NS else note
-                remedy = "start and stop all drivers with the recorder, or cut the log there"
-                found.append(make("part", times.topic, text, remedy, value=seconds, unit="s", stamp_ns=at))
+                found.append(make("part", times.topic, text, value=seconds, unit="s", stamp_ns=at))
     return found
 
 
@@ -304,8 +297,7 @@ def _drift(times: TimesWatch) -> Finding | None:
     if abs(change) < max(limits.DELAYS_DRIFT, 6.0 * spread):
         return None
     text = f"header stamps drift against the log's times by {1e3 * change:+.0f} ms ({1e6 * slope:+.0f} ppm)"
-    remedy = "synchronise the clocks (chrony, PTP) and record again"
-    return warning("clock-drift", times.topic, text, remedy, value=change, unit="s", stamp_ns=times.first_ns)
+    return warning("clock-drift", times.topic, text, value=change, unit="s", stamp_ns=times.first_ns)
 
 
 def _slope(at: Float64, delay: Float64) -> float:

@@ -25,14 +25,15 @@ ALL = ("ingest", *LATER)
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One kind of finding: what it says, how bad it can be, and the commands that refuse a recording with an error of
-    it, or whose result would be wrong.
+    """One kind of finding: what it says, how bad it can be, the commands that refuse a recording with an error of it,
+    or whose result would be wrong, and what to do where the finding does not say.
     """
 
     code: str
     severities: tuple[Severity, ...]
     meaning: str
     blocked: tuple[str, ...] = ()
+    remedy: str = ""
 
     @property
     def docs(self) -> str:
@@ -41,54 +42,72 @@ class Check:
 
 
 _TABLE = """
-# code | severities | commands that an error blocks | meaning
-damaged | warning |  | a part of the file cannot be read; the rest is judged
+# code | severities | commands that an error blocks | meaning | what to do, where a finding does not say
+damaged | warning |  | a part of the file cannot be read; the rest is judged | copy the file again; if it stays,
+    look at what wrote these messages
 loss | note |  | topics and frames that the source leaves out
 missing | error | all | what `ingest` needs is not there, or cannot be joined (depth, CameraInfo, tf)
 refused | error | all | the capture or folder cannot be read as described
 gap | warning |  | an image or state topic pauses for over 0.1 s and three median intervals; topics and transforms
-    that pause together are one finding
-part | note, warning |  | a topic begins or ends over 1 s inside the others; a warning from a tenth of the log
-files-apart | warning |  | over 60 s between two files of one recording
-stamp-repeats | warning |  | header stamps that repeat the one before
-stamp-back | warning |  | header stamps that go back
-stamp-zero | warning, error | all | header stamps of 0 (use `--stamps log`); an error where all of an image topic are
+    that pause together are one finding | record fewer topics or to a faster disk; what moved meanwhile is unknown
+part | note, warning |  | a topic begins or ends over 1 s inside the others; a warning from a tenth of the log |
+    start and stop all drivers with the recorder, or cut the log there
+files-apart | warning |  | over 60 s between two files of one recording | are they one recording? if not, give each
+    alone
+stamp-repeats | warning |  | header stamps that repeat the one before | look for a driver that publishes twice, or a
+    topic recorded twice
+stamp-back | warning |  | header stamps that go back | two publishers on one topic, a clock that was set, or a loop
+    of a played log: record again
+stamp-zero | warning, error | all | header stamps of 0 (use `--stamps log`); an error where all of an image topic
+    are | give --stamps log to take the times of logging, and let the driver stamp the next recording
 clock | note |  | the stamps of all topics are shifted alike against the log's clock (a played log)
 clock-offset | warning |  | stamps over 20 ms after or 1 s before their log time, or whose shift against it differs by
     over 0.2 s from most topics, or by over 60 ms from the other cameras (three or more)
 clock-drift | warning |  | the time from stamp to log changes by over 20 ms (and six times its spread) over the log
+    | synchronise the clocks (chrony, PTP) and record again
 robot-clock | note, warning |  | the offset of cameras and robot: with `--urdf` from where depth shows the arm (a
     warning beyond 40 ms, for one camera if only it is off), else from when both show motion (beyond 30 ms plus twice
     its uncertainty)
 sampled | note |  | not every image was decoded
-undecodable | note, warning, error | all | images that do not decode; an error where none does
+undecodable | note, warning, error | all | images that do not decode; an error where none does | they are left out;
+    copy the file again, or look at the recorder
 encoding | note, warning |  | an encoding that is not read, or that changes
-image-size | note, warning |  | images of one topic of several sizes
+image-size | note, warning |  | images of one topic of several sizes | record one size; frames of another than the
+    camera's are left out
 pairing | warning, error | all | less than 95 % of the images of colour or depth find a partner; an error where none
     is found
-rates-differ | note |  | one of colour and depth has 1.5 times as many images as the other
-pair-offset | note |  | depth over 10 ms from its colour image
+rates-differ | note |  | one of colour and depth has 1.5 times as many images as the other | record both at one
+    rate; more frames show more, and what moves is seen sooner
+pair-offset | note |  | depth over 10 ms from its colour image | let the driver synchronise colour and depth: what
+    moves is in two places
 depth-scale | note, error | all | median depth outside 0.05 to 20 m (metres stored as integers, millimetres as floats,
     another unit); a note outside 0.15 to 8 m
-depth-share | note, warning |  | less than half of the pixels have depth; a warning below a tenth
-depth-empty | warning, error | later | depth images without any depth; an error where all are
+depth-share | note, warning |  | less than half of the pixels have depth; a warning below a tenth | the rest stays
+    unseen: dark or shiny things, too near, or warped depth with holes
+depth-empty | warning, error | later | depth images without any depth; an error where all are | is the projector on,
+    and the scene within its range?
 depth-invalid | note |  | pixels that are NaN, infinite or negative
 principal-point | warning, error | later | cx or cy over 15 % of the size off the middle; an error, naming the size,
     where both fit another image size
 focal-ratio | warning |  | fx and fy differ by over 5 %
 field-of-view | warning |  | horizontal field of view outside 20 to 140 degrees
-uncalibrated | note, warning |  | a CameraInfo whose K is zero
-camera-info-size | error | all | a CameraInfo of another size than its images
-camera-info-changes | warning |  | a CameraInfo that changes within the log
+uncalibrated | note, warning |  | a CameraInfo whose K is zero | calibrate it, or record the driver's factory values
+camera-info-size | error | all | a CameraInfo of another size than its images | record the CameraInfo of this
+    stream, or name it with --camera
+camera-info-changes | warning |  | a CameraInfo that changes within the log | split the log there, or record with
+    one setting
 camera-info-two | warning |  | a second CameraInfo for the same frame and size, with another K
 distortion | note, warning, error | all | distorted images (note); a wrong number of coefficients (warning); a number
     that cannot be read, or a model that is not known (error)
 tf-gap | warning |  | a moving transform pauses
-tf-ends | warning |  | a moving transform ends over 1 s before the last image
+tf-ends | warning |  | a moving transform ends over 1 s before the last image | record /tf to the end; if it stands
+    still, publish it on /tf_static or give --camera-pose
 tf-roots | note, error | all | separate trees; an error where the cameras are in several
 tf-parents | warning |  | a frame with two parents
-pose-missing | warning, error | all | images without a known pose; an error where all are
-pose-jump | error | later | a camera moves over 0.2 m, and ten times its median step, from one frame to the next
+pose-missing | warning, error | all | images without a known pose; an error where all are | tf starts late, ends
+    early, or has a gap of more than 1 s; if it stands still give --camera-pose
+pose-jump | error | later | a camera moves over 0.2 m, and ten times its median step, from one frame to the next |
+    two publishers of one frame, or a localisation that was corrected; reconstruct refuses it
 alignment | error | later | edges of depth are over 1.5 % of the width from those of colour, or match another camera's
     colour
 views-scale | warning, error | later | the factor on depths (of all cameras or one) that makes views fit together; a
@@ -100,11 +119,12 @@ agreement | note, error | later | how far apart views place a surface that both 
 exposure | note |  | one surface is over 5 % brighter or more coloured in one image of a camera than in another
 exposure-rows | note |  | rows of one image are over 20 % brighter than others, unlike in the camera's other images
 joints | note, error | replay | which topics and velocities are used; an error where the robot's joints are missing
-joints-nan | warning |  | positions that are not finite
+joints-nan | warning |  | positions that are not finite | they are left out; look at the driver
 joints-degrees | error | replay | positions that no joint can reach in radians
 joints-velocity | note, warning |  | velocities that are missing (note) or zero throughout
 joints-still | note |  | no joint moves
-joints-limits | warning |  | states beyond the URDF's limits
+joints-limits | warning |  | states beyond the URDF's limits | is it the right URDF, are the joints in its units, or
+    were its limits lowered?
 end-effector | note, error | replay | logged end-effector poses against the robot's kinematics
 arm | note, warning |  | measured minus rendered depth of the robot's surface, per camera [mm]; a warning beyond 30
     mm, beyond 25 mm in the mean, where a quarter of the pixels show the background, or where depth is 4 % off
@@ -118,9 +138,9 @@ _BLOCKED = {"": (), "all": ALL, "later": LATER, "replay": ("replay",)}
 def _checks() -> Iterator[Check]:
     """The entries of `_TABLE`, whose rows go on in lines that are indented."""
     for row in re.findall(r"^[a-z].*(?:\n +.*)*", _TABLE, flags=re.MULTILINE):
-        code, severities, blocked, meaning = (cell.strip() for cell in " ".join(row.split()).split("|"))
+        code, severities, blocked, meaning, *remedy = (cell.strip() for cell in " ".join(row.split()).split("|"))
         words = tuple(Severity(word) for word in severities.split(", "))
-        yield Check(code=code, severities=words, meaning=meaning, blocked=_BLOCKED[blocked])
+        yield Check(code=code, severities=words, meaning=meaning, blocked=_BLOCKED[blocked], remedy="".join(remedy))
 
 
 CHECKS: Mapping[str, Check] = {check.code: check for check in _checks()}
@@ -148,7 +168,7 @@ def _finding(
     code: str,
     where: str,
     what: str,
-    remedy: str = "",
+    remedy: str | None = None,
     *,
     value: float | None = None,
     unit: str = "",
@@ -159,7 +179,7 @@ def _finding(
         code=code,
         where=where,
         what=what,
-        remedy=remedy,
+        remedy=CHECKS[code].remedy if remedy is None else remedy,
         value=None if value is None else round(float(value), 6),
         unit=unit,
         stamp_ns=None if stamp_ns is None else int(stamp_ns),
@@ -273,8 +293,7 @@ def needs(*, num_cameras: int, num_frames: int, states_lack: str) -> list[Need]:
 
 def damage_findings(where: str, notes: Sequence[str]) -> list[Finding]:
     """One for each kind of damage, with how often it is met."""
-    remedy = "copy the file again; if it stays, look at what wrote these messages"
     return [
-        warning("damaged", where, text if num == 1 else f"{text} ({num} times)", remedy, value=num)
+        warning("damaged", where, text if num == 1 else f"{text} ({num} times)", value=num)
         for text, num in Counter(notes).items()
     ]
