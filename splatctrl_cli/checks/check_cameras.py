@@ -59,9 +59,8 @@ def calibration_findings(found: Survey, cameras: Sequence[CameraTopics], changed
     for entry in found.of_type(CAMERA_INFO):
         name, calibration = entry.topic.name, entry.calibration
         if calibration is None:
-            text = "K is zero: the camera was never calibrated"
             make = note if cameras and all(camera.info for camera in cameras) else warning
-            findings.append(make("uncalibrated", name, text))
+            findings.append(make("uncalibrated", name, "K is zero: the camera was never calibrated"))
             continue
         if name in changed:
             text = "the CameraInfo changes within the log; the first is used for all frames"

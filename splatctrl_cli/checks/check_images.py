@@ -160,8 +160,7 @@ def image_findings(images: ImageWatch) -> list[Finding]:
     if images.num_bad:
         text = f"{images.num_bad} of {images.count} images do not decode; the first: {images.first_bad}"
         severity = error if images.num_bad == images.count else warning
-        at = images.first_bad_ns
-        found.append(severity("undecodable", where, text, value=images.num_bad, stamp_ns=at))
+        found.append(severity("undecodable", where, text, value=images.num_bad, stamp_ns=images.first_bad_ns))
     if len(images.sizes) > 1:
         sizes = ", ".join(f"{w}x{h} ({n})" for (w, h), n in images.sizes.most_common(4))
         found.append(warning("image-size", where, f"the size of the images changes: {sizes}"))
@@ -218,8 +217,7 @@ def _scale(images: ImageWatch) -> list[Finding]:
         if near <= median <= far:
             return []
         text = f"median depth {median:.3g} m, read as {used:g} m per count: unusual for a robot's table"
-        remedy = "if it is wrong, give --depth-scale"
-        return [note("depth-scale", images.where, text, remedy, value=median, unit="m")]
+        return [note("depth-scale", images.where, text, "if it is wrong, give --depth-scale", value=median, unit="m")]
     counts = median / used
     fits = [s for s in SCALES if limits.TABLE_DEPTH[0] <= counts * s <= limits.TABLE_DEPTH[1]]
     guess = "millimetres stored as floats" if images.is_float and counts > high else ""

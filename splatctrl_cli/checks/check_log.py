@@ -159,10 +159,9 @@ def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics]) -> list[Fi
         kinds = set(images.encodings)
         unread = sorted(kinds - set(DEPTH_ENCODINGS) - set(COLOR_CONVERSIONS))
         if unread:
-            text = f"encoding {unread[0]!r} is not read"
             known = ", ".join((*COLOR_CONVERSIONS, *DEPTH_ENCODINGS))
             remedy = f"record another topic of this camera, or convert it; read: {known}"
-            its.append(warning("encoding", name, text, remedy))
+            its.append(warning("encoding", name, f"encoding {unread[0]!r} is not read", remedy))
         if _is_beside(watch, name, cameras):
             its = [replace(f, severity=Severity.NOTE, what=f"{f.what}; no camera uses the topic") for f in its]
         elif kinds & set(DEPTH_ENCODINGS) and images.num_decoded:

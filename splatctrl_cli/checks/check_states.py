@@ -248,8 +248,7 @@ def _cost(spread: Spread) -> float:
 
 
 def _travel(poses: Float64) -> float:
-    first = np.broadcast_to(poses[0], poses.shape)
-    spread = _spread(first, poses)
+    spread = _spread(np.broadcast_to(poses[0], poses.shape), poses)
     return max(spread.max_position, spread.max_rotation)
 
 
@@ -327,8 +326,7 @@ def stream_findings(where: str, stream: JointStream) -> list[Finding]:
         at += len(block)
     if num_bad:
         text = f"{num_bad} of {at} states hold a position that is NaN or infinite; the first: {stream.names[joint]}"
-        stamp = int(stream.stamp_ns[first_bad])
-        found.append(warning("joints-nan", where, text, value=num_bad, stamp_ns=stamp))
+        found.append(warning("joints-nan", where, text, value=num_bad, stamp_ns=int(stream.stamp_ns[first_bad])))
     widest = np.maximum(np.abs(lowest), np.abs(highest))
     if np.isfinite(widest).any() and float(widest[np.isfinite(widest)].max()) > DEGREES:
         worst = int(np.argmax(np.where(np.isfinite(widest), widest, 0)))
@@ -344,8 +342,7 @@ def _velocities(where: str, stream: JointStream, is_moving: bool) -> list[Findin
         return [note("joints-still", where, "no joint moves")]
     velocity = stream.columns().get("velocity")
     if velocity is None:
-        text = "no velocities were recorded: the change of the positions is taken"
-        return [note("joints-velocity", where, text)]
+        return [note("joints-velocity", where, "no velocities were recorded: the change of the positions is taken")]
     if all(not np.any(np.nan_to_num(block)) for block in blocks_of(velocity)):
         text = "all velocities are zero while joints move: the change of the positions is taken"
         return [warning("joints-velocity", where, text, "let the driver fill them in")]

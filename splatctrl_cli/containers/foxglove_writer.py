@@ -122,8 +122,7 @@ class FoxgloveLog:
 
     def add_line(self, topic: str, stamp_ns: int, level: str, text: str) -> None:
         """A Log of one of `LEVELS`."""
-        message = _new("Log", level=LEVELS.index(level), message=text, name="splatctrl")
-        self._add(topic, stamp_ns, message)
+        self._add(topic, stamp_ns, _new("Log", level=LEVELS.index(level), message=text, name="splatctrl"))
 
     def add_numbers(self, topic: str, stamp_ns: int, values: Mapping[str, float | None]) -> None:
         """An object of numbers, in JSON."""

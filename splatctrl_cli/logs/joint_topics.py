@@ -130,8 +130,7 @@ def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSur
 def _write_rows(path: Path, rows: Rows) -> None:
     """A .npy file, a block at a time."""
     with path.open("wb") as stream:
-        header = {"descr": "<f8", "fortran_order": False, "shape": rows.shape}
-        np.lib.format.write_array_header_1_0(stream, header)
+        np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": rows.shape})
         for block in blocks_of(rows):
             stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())
 

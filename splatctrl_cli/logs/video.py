@@ -254,8 +254,7 @@ class VideoFileLog:
 
     def _message(self, frame: Any, stamp_ns: int) -> RawMessage:
         stamp = SimpleNamespace(sec=stamp_ns // SECOND_NS, nanosec=stamp_ns % SECOND_NS)
-        header = SimpleNamespace(stamp=stamp, frame_id="")
-        data = pack_image(header, frame.to_ndarray(format="rgb24"))
+        data = pack_image(SimpleNamespace(stamp=stamp, frame_id=""), frame.to_ndarray(format="rgb24"))
         return RawMessage(topic=self._topic, log_time_ns=stamp_ns, data=data, file=self.path.name)
 
 

@@ -232,9 +232,8 @@ def _limit_axis(axes: Any, joint: str, limit: float, peak: float, beneath: float
             axes.axhline(side, color=KIND_COLORS["in-collision"], linewidth=1.0, linestyle=(0, (6, 3)))
     axes.axhline(0.0, color="#cccccc", linewidth=0.8, zorder=0)
     axes.set_ylabel(joint, rotation=0, ha="right", va="center")
-    words = f"limit {limit:.3g}\npeak {peak:.3g}, {100 * peak / limit:.0f} %"
     axes.annotate(
-        words,
+        f"limit {limit:.3g}\npeak {peak:.3g}, {100 * peak / limit:.0f} %",
         (1.0, 0.5),
         xycoords="axes fraction",
         xytext=(8, 0),
