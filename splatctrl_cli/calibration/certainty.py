@@ -146,8 +146,7 @@ def plane_of(view: DepthView, T_world_camera: Float64) -> Plane | None:
 
 def unobserved(certainty: Certainty, camera: str, T_world_camera: Float64, plane: Plane | None) -> tuple[str, ...]:
     """The directions of a camera that are not known within `CALIBRATION_SIGMA`, in words."""
-    spread = certainty.displacement(camera)
-    values, vectors = np.linalg.eigh(spread)
+    values, vectors = np.linalg.eigh(certainty.displacement(camera))
     unknown = vectors[:, values > fixed.CALIBRATION_SIGMA**2]
     if not unknown.shape[1]:
         return ()

@@ -82,8 +82,7 @@ class Unknowns:
         """The estimate after a step (P,)."""
         corrections, depth = dict(estimate.corrections), dict(estimate.depth)
         for camera in self.poses:
-            own = step[self.columns(camera)[:POSE]]
-            corrections[camera] = corrections[camera] @ transform_of(own)
+            corrections[camera] = corrections[camera] @ transform_of(step[self.columns(camera)[:POSE]])
         for camera in dict.fromkeys((*self.scales, *self.biases)):
             columns = self.columns(camera)[POSE:]
             scale, bias = np.where(columns < 0, 0.0, step[columns])
@@ -253,8 +252,7 @@ def _inside_links(link: NDArray[np.int16], depth: Float32) -> Bool:
     inside = np.zeros(link.shape, np.bool_)
     middle = link[1:-1, 1:-1]
     around = (link[1:-1, 2:], link[1:-1, :-2], link[2:, 1:-1], link[:-2, 1:-1])
-    is_same = np.logical_and.reduce([middle == other for other in around])
-    inside[1:-1, 1:-1] = (middle >= 0) & is_same
+    inside[1:-1, 1:-1] = (middle >= 0) & np.logical_and.reduce([middle == other for other in around])
     return np.asarray(inside & (bend(depth) < fixed.CALIBRATION_BEND * depth))
 
 

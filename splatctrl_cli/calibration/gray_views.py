@@ -263,8 +263,7 @@ def _median_ratio(ratios: Float64) -> tuple[float, float]:
 
 def exposed(frame: RgbdFrame, gain: Float64) -> RgbdFrame:
     """The frame with its colours divided by a gain (3,)."""
-    levels = np.rint(np.arange(256)[:, None] / gain)
-    table = np.clip(levels, 0, 255).astype(np.uint8)
+    table = np.clip(np.rint(np.arange(256)[:, None] / gain), 0, 255).astype(np.uint8)
     return replace(frame, color=np.stack([table[frame.color[..., k], k] for k in range(3)], axis=-1))
 
 

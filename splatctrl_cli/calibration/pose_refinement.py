@@ -94,8 +94,7 @@ class BentViews:
 
     def __post_init__(self) -> None:
         self.now = list(self.recorded)
-        shapes = {view.gray.shape for view in self.recorded}
-        self._weights = {shape: _weights(shape) for shape in shapes}
+        self._weights = {shape: _weights(shape) for shape in {view.gray.shape for view in self.recorded}}
         self._pixels = [_pixels(view) for view in self.recorded]
         self._basis, self._num = bends_alone(), max(self.cameras) + 1
         prior = (_roughness() + np.eye(len(self._basis))) / fixed.BEND_PRIOR**2

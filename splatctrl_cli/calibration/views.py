@@ -169,8 +169,7 @@ def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
     depth = np.stack([frame.depth for frame in frames]).astype(np.float64)
     inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1.0), np.inf)
     num = (depth > 0).sum(axis=0)
-    ordered = np.sort(inverse, axis=0)
-    median = np.take_along_axis(ordered, np.maximum((num - 1) // 2, 0)[None], axis=0)[0]
+    median = np.take_along_axis(np.sort(inverse, axis=0), np.maximum((num - 1) // 2, 0)[None], axis=0)[0]
     is_seen = num > 0
     middle = np.where(is_seen, median, 1.0)
     near = np.abs(inverse - middle) < 3 * depth_sigma(1 / middle) * np.square(middle)

@@ -7,7 +7,7 @@ import hashlib
 import json
 import shutil
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from io import BytesIO
@@ -42,11 +42,6 @@ class Entry:
     provenance: Mapping[str, str]
 
 
-def _entry(line: Mapping[str, Any]) -> Entry:
-    sums = [(digest, name) for digest, name in line["sums"]]
-    return Entry(row=line["row"], sums=sums, provenance=line["provenance"])
-
-
 class Journal:
     """The journal of a partial folder; entries of an earlier run come back one by one, then new ones are added."""
 
@@ -76,21 +71,21 @@ class Journal:
         found = next(self._kept, None)
         if found is None:
             return None
-        entry = _entry(found)
+        entry = Entry(**found)
         self._count(entry)
         return entry
 
     def add(self, entry: Entry) -> None:
         """A frame whose files are written."""
         self._count(entry)
-        self._stream.write(json.dumps({"row": entry.row, "sums": entry.sums, "provenance": entry.provenance}) + "\n")
+        self._stream.write(json.dumps(vars(entry)) + "\n")
         self._stream.flush()
 
     def entries(self) -> Iterator[Entry]:
         """All so far, in their order."""
         lines = _lines(self._path)
         next(lines, None)
-        yield from map(_entry, lines)
+        yield from (Entry(**line) for line in lines)
 
     def remove(self) -> None:
         """Once everything is written."""
@@ -236,16 +231,10 @@ def _write_index(
         (folder / ROBOT).write_text(robot, encoding="utf-8", newline="")
         names.append(ROBOT)
     columns = (*COLUMNS, *(name for name in MASKS if name in journal.masks))
-    with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(entry.row for entry in journal.entries())
+    _write_table(folder / "frames.csv", columns, (entry.row for entry in journal.entries()))
     if journal.has_provenance:
         names.append(PROVENANCE)
-        with (folder / PROVENANCE).open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.DictWriter(stream, PROVENANCE_COLUMNS, restval="", lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(entry.provenance for entry in journal.entries())
+        _write_table(folder / PROVENANCE, PROVENANCE_COLUMNS, (entry.provenance for entry in journal.entries()))
     if topics is not None and topics.topics:
         shutil.rmtree(folder / FOLDER, ignore_errors=True)  # what an interrupted run left
         header = header | {"joint_topics": write_topics(folder, topics, names.append)}
@@ -260,6 +249,13 @@ def _write_index(
     for name in [*names, "capture.json"]:
         sums.add_other(sha256(folder / name), name)
     sums.write(folder / "SHA256SUMS")
+
+
+def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:

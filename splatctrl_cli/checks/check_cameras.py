@@ -107,7 +107,6 @@ def _rivals(found: Survey, camera: CameraTopics) -> list[Finding]:
     chosen = found.topics[camera.info].calibration if camera.info else None
     if chosen is None:
         return []
-    rivals = [t for t in found.of_type(CAMERA_INFO) if _is_rival(t, camera, chosen)]
     return [
         warning(
             "camera-info-two",
@@ -115,7 +114,8 @@ def _rivals(found: Survey, camera: CameraTopics) -> list[Finding]:
             f"{rival.topic.name} has the frame and size of {camera.info}, but another K: the latter is used",
             "name the right one with --camera NAME=COLOR,DEPTH,INFO",
         )
-        for rival in rivals
+        for rival in found.of_type(CAMERA_INFO)
+        if _is_rival(rival, camera, chosen)
     ]
 
 

@@ -58,8 +58,7 @@ def check_log(
         findings += camera_findings(found, topics, camera, options)
     if any(finding.code == "pose-missing" for finding in findings):
         findings = [finding for finding in findings if finding.code != "tf-ends"]  # the same, from its cause
-    lacks = _lacks(log, found, options)
-    findings += [error("missing", log.path.name, *_parted(lack)) for lack in lacks]
+    findings += [error("missing", log.path.name, *_parted(lack)) for lack in _lacks(log, found, options)]
     correction = correction_of(options, log.path.name)
     late_ns = {c.name: correction.late_ns(c.name) for _, c in rig if correction is not None and c is not None}
     checked = [checked_camera(t, c, watch.images, found.tf, options, late_ns) for t, c in rig if c is not None]

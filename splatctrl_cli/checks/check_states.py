@@ -173,7 +173,8 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
     bases = {link: _explained(_inverse(poses), _inverse(logged)) for link, poses in links.items()}
     tool = min(tools, key=lambda link: (round(_cost(tools[link][1]), 6), _cost(_spread(links[link], logged))))
     base = min(bases, key=lambda link: _cost(bases[link][1]))
-    if _travel(logged) < limits.LINK_TRAVEL:
+    travel = _spread(np.broadcast_to(logged[0], logged.shape), logged)
+    if max(travel.max_position, travel.max_rotation) < limits.LINK_TRAVEL:
         return _agreement(PoseVerdict.STILL, near, len(chosen), difference, np.eye(4), difference)
     if tools[tool][1].is_small:
         return _agreement(PoseVerdict.TOOL, tool, len(chosen), _spread(links[tool], logged), *tools[tool])
@@ -245,11 +246,6 @@ def _angle(R: Float64) -> float:
 
 def _cost(spread: Spread) -> float:
     return spread.median_position + limits.POSES_LEVER * spread.median_rotation
-
-
-def _travel(poses: Float64) -> float:
-    spread = _spread(np.broadcast_to(poses[0], poses.shape), poses)
-    return max(spread.max_position, spread.max_rotation)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -206,8 +206,7 @@ def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
     each = max(2, min(8, limits.VIEWS // max(len(cameras), 1)))
     chosen: list[RgbdFrame] = []
     for camera in cameras:
-        its = [frame for frame in frames if frame.camera == camera]
-        chosen += spread(its, each)
+        chosen += spread([frame for frame in frames if frame.camera == camera], each)
     return chosen
 
 

@@ -296,10 +296,9 @@ def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: floa
     if reason:
         return _unknown(num, reason, top, runner_up)
     single = np.array([_vertex(offsets, row, int(np.argmax(row))) for row in scores])
-    disagreement = float(single.std() / np.sqrt(len(single)))
     return ClockOffset(
         offset_s=_vertex(offsets, score, best),
-        uncertainty_s=max(disagreement, error),
+        uncertainty_s=max(float(single.std() / np.sqrt(len(single))), error),
         correlation=top,
         runner_up=runner_up,
         num_intervals=num,

@@ -180,8 +180,7 @@ def checked_camera(
         is_near = near is not None and abs(near - kept.stamp_ns) <= options.pairing_tolerance_s * 1e9
         color = kept_colors[near] if near is not None and is_near else None
         stamp_ns = kept.stamp_ns if color is None else color.stamp_ns
-        at_ns = stamp_ns - late_ns.get(camera.name, 0)
-        T = camera.pose_at(tf, at_ns, round(options.pose_tolerance_s * 1e9))
+        T = camera.pose_at(tf, stamp_ns - late_ns.get(camera.name, 0), round(options.pose_tolerance_s * 1e9))
         if T is not None:
             frames.append(_frame(camera, kept, color, stamp_ns, T))
     return CheckedCamera(topics=topics, camera=camera, frames=tuple(frames))

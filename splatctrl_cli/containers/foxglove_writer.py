@@ -85,8 +85,7 @@ class FoxgloveLog:
             slice_stride=size * columns * rows,
             data=np.ascontiguousarray(values.T).tobytes(),
         )
-        corner = np.asarray(origin) - 0.5 * voxel
-        for axis, value in zip("xyz", corner, strict=True):
+        for axis, value in zip("xyz", np.asarray(origin) - 0.5 * voxel, strict=True):
             setattr(message.pose.position, axis, float(value))
             setattr(message.cell_size, axis, voxel)
         message.pose.orientation.w = 1.0
@@ -127,8 +126,7 @@ class FoxgloveLog:
     def add_numbers(self, topic: str, stamp_ns: int, values: Mapping[str, float | None]) -> None:
         """An object of numbers, in JSON."""
         if topic not in self._channels:
-            number = {"type": ["number", "null"]}
-            schema = {"type": "object", "properties": dict.fromkeys(values, number)}
+            schema = {"type": "object", "properties": {name: {"type": ["number", "null"]} for name in values}}
             made = self._writer.register_schema(f"splatctrl{topic}", "jsonschema", json.dumps(schema).encode())
             self._channels[topic] = self._writer.register_channel(topic, "json", made)
         self._write(topic, stamp_ns, json.dumps(dict(values), allow_nan=False).encode())
@@ -155,8 +153,7 @@ def _new(schema: str, **values: Any) -> Any:
 
 def _fields(kind: np.dtype[Any]) -> Sequence[Any]:
     """A PackedElementField for each of a structure."""
-    module = import_module(f"{SCHEMAS}.PackedElementField_pb2")
-    field = module.PackedElementField
+    field = import_module(f"{SCHEMAS}.PackedElementField_pb2").PackedElementField
     assert kind.names is not None and kind.fields is not None
     return [
         field(

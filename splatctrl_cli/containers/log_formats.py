@@ -76,8 +76,7 @@ def _unpacked_message(data: bytes, budget: Budget) -> bytes:
         raise BadBlockError("is not a zstd frame") from None
     if size >= 0:
         return budget.unpacked(data, "zstd", size)
-    content = unpacked_start(data, "zstd", MAX_BLOCK)
-    return budget.unpacked(data, "zstd", len(content))
+    return budget.unpacked(data, "zstd", len(unpacked_start(data, "zstd", MAX_BLOCK)))
 
 
 _ZSTD = b"\x28\xb5\x2f\xfd"

@@ -182,11 +182,9 @@ def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
     cameras.joinpath("pair.txt").write_text(_pairs(views), encoding="utf-8")
     for number, view in enumerate(views):
         cameras.joinpath(f"{number:08d}_cam.txt").write_text(_camera_text(view), encoding="utf-8")
-        image = rectified / f"rect_{number + 1:03d}_{LIGHT}_r5000.png"
-        write_png(image, view.color[:, :, ::-1])
+        write_png(rectified / f"rect_{number + 1:03d}_{LIGHT}_r5000.png", view.color[:, :, ::-1])
         write_pfm(depths / f"depth_map_{number:04d}.pfm", view.depth * np.float32(MILLIMETRES))
-        visual = np.where(view.depth > 0, 255, 0).astype(np.uint8)
-        write_png(depths / f"depth_visual_{number:04d}.png", visual)
+        write_png(depths / f"depth_visual_{number:04d}.png", np.where(view.depth > 0, 255, 0).astype(np.uint8))
 
 
 def write_png(path: Path, image: UInt8) -> None:

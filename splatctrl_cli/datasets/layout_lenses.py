@@ -268,9 +268,8 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
         lens = CameraTable(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
         lens = lenses.named(lens, str(files[stem]))
         views.append(ListedView(name=stem, color=color, depth=depth, matrix=matrix, camera=lens))
-    pairs = Pairs(path=folder, views=views, unpaired=(len(colors) - len(views), len(depths) - len(views)))
     return described(
-        pairs,
+        Pairs(path=folder, views=views, unpaired=(len(colors) - len(views), len(depths) - len(views))),
         folder,
         options,
         poses=PosesTable(format="matrix-files", file=_CAMERAS, convention="world_to_camera"),

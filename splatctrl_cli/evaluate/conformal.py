@@ -45,8 +45,7 @@ def conformal_bound(misses: Float64, confidence: float) -> ConformalBound | None
     if not np.isfinite(misses).any():
         return None
     length = autocorrelation_time(misses)
-    stretch = stretches(len(misses), length)
-    scores, deciding = stretch_scores(misses, stretch)
+    scores, deciding = stretch_scores(misses, stretches(len(misses), length))
     if len(scores) < FEWEST_STRETCHES:
         return None
     allowed = min(confidence, len(scores) / (len(scores) + 1))

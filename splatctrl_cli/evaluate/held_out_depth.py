@@ -177,8 +177,7 @@ def thinned(points: Float64, spacing: float) -> Float64:
     cells -= cells.min(axis=0)
     counts = cells.max(axis=0) + 1
     keys = (cells[:, 0] * counts[1] + cells[:, 1]) * counts[2] + cells[:, 2]
-    first = np.sort(np.unique(keys, return_index=True)[1])
-    return points[first]
+    return points[np.sort(np.unique(keys, return_index=True)[1])]
 
 
 def _check_spacing(spacing: float) -> None:

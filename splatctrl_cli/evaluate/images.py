@@ -194,8 +194,7 @@ class Lpips:
         for layers, linear in zip(self._convolutions, self._linear, strict=True):
             for layer, weight, bias in layers:
                 one, other = (_convolved(x, layer, weight, bias) for x in (one, other))
-            squared = np.square(_unit(one) - _unit(other))
-            total += float(np.tensordot(linear, squared, axes=(0, 0)).mean())
+            total += float(np.tensordot(linear, np.square(_unit(one) - _unit(other)), axes=(0, 0)).mean())
         return total
 
     def _start(self, image: Float64) -> Float32:

@@ -5,6 +5,7 @@ two runs are compared by it, or two of each of many recordings, by a confidence 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -105,28 +106,21 @@ class Fold:
     accumulate: Callable[[Float64], Float64] | None = None
 
 
+def _of_known(fold: Callable[[Float64], np.floating], values: Float64) -> float | None:
+    """A fold of the values that are not NaN; None without one."""
+    there = values[~np.isnan(values)]
+    return float(fold(there)) if len(there) else None
+
+
 def lowest(values: Float64) -> float | None:
     """The least value that is not NaN, which may be infinite; None without one."""
-    there = values[~np.isnan(values)]
-    return float(np.min(there)) if len(there) else None
+    return _of_known(np.min, values)
 
 
 def largest(values: Float64) -> float | None:
     """The largest value; None where one is infinite or none is there."""
     there = values[~np.isnan(values)]
     return float(np.max(there)) if len(there) and np.isfinite(there).all() else None
-
-
-def mean(values: Float64) -> float | None:
-    """Over the values that are not NaN; None without one."""
-    there = values[~np.isnan(values)]
-    return float(np.mean(there)) if len(there) else None
-
-
-def p95(values: Float64) -> float | None:
-    """The 95th percentile of the values that are not NaN; None without one."""
-    there = values[~np.isnan(values)]
-    return float(np.percentile(there, 95)) if len(there) else None
 
 
 def last(values: Float64) -> float | None:
@@ -138,7 +132,8 @@ def last(values: Float64) -> float | None:
 LEAST = Fold(of=least, start=np.inf, accumulate=np.fmin.accumulate)
 LOWEST = Fold(of=lowest, start=np.inf, accumulate=np.fmin.accumulate)
 LARGEST = Fold(of=largest, start=-np.inf, accumulate=np.fmax.accumulate)
-MEAN, P95, LAST = Fold(of=mean), Fold(of=p95), Fold(of=last)
+MEAN, P95 = (Fold(of=partial(_of_known, fold)) for fold in (np.mean, partial(np.percentile, q=95)))
+LAST = Fold(of=last)
 TOTAL = Fold(of=lambda values: int(np.nansum(values)))
 
 

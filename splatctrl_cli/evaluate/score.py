@@ -107,24 +107,27 @@ class ViewScore:
 
     def figures(self) -> dict[str, float]:
         """The view's figures by flat name, ``psnr_seen``, ``depth_median_all`` [m], …"""
-        figures = {"valid_share": self.valid_share, "seen_share": self.seen.share}
-        regions = {"seen": self.seen, "all": self.all}
-        if self.masked is not None:
-            figures["mask_share"] = self.masked.share
-            regions["masked"] = self.masked
-        if self.ssim_published is not None:
-            figures["ssim_published"] = self.ssim_published
-        if self.lpips is not None:
-            figures["lpips"] = self.lpips
-        if self.lpips_published is not None:
-            figures["lpips_published"] = self.lpips_published
-        for name, region in regions.items():
-            figures |= {f"psnr_{name}": region.psnr, f"ssim_{name}": region.ssim}
+        found = {
+            "valid_share": self.valid_share,
+            "seen_share": self.seen.share,
+            "mask_share": None if self.masked is None else self.masked.share,
+            "ssim_published": self.ssim_published,
+            "lpips": self.lpips,
+            "lpips_published": self.lpips_published,
+        }
+        figures = {name: value for name, value in found.items() if value is not None}
+        for name, region in {"seen": self.seen, "all": self.all, "masked": self.masked}.items():
+            if region is None:
+                continue
             depth = asdict(region.depth)
-            figures[f"depth_pixels_{name}"] = depth.pop("num_pixels")
-            figures |= {f"depth_{key}_{name}": value for key, value in depth.items()}
-            figures[f"depth_coverage_{name}"] = region.depth_coverage
-            figures[f"in_front_{name}"] = region.in_front
+            figures |= {
+                f"psnr_{name}": region.psnr,
+                f"ssim_{name}": region.ssim,
+                f"depth_pixels_{name}": depth.pop("num_pixels"),
+                **{f"depth_{key}_{name}": value for key, value in depth.items()},
+                f"depth_coverage_{name}": region.depth_coverage,
+                f"in_front_{name}": region.in_front,
+            }
         if self.corrected is not None:
             figures |= {
                 f"{name}{CORRECTED}": value for name, value in self.corrected.figures().items() if name in CORRECTABLE

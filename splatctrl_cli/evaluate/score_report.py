@@ -160,8 +160,7 @@ def judged(
         threshold=1.0,
         count=int(num_views),
     )
-    notes = [noted("score", line) for line in warnings]
-    reasons = [compared, *notes, *gate_reasons(require, metrics, counts)]
+    reasons = [compared, *(noted("score", line) for line in warnings), *gate_reasons(require, metrics, counts)]
     return verdict_of("score", reasons, scope=scope, is_damaged=is_damaged, counts=counts)
 
 

@@ -129,8 +129,7 @@ def _view(moment: Moment, frame: RgbdFrame) -> tuple[int, int, float]:
     cell = _cell(sphere, frame.intrinsics)
     if cell is None:
         return 0, 0, 0.0
-    depth = float(frame.depth[cell])
-    is_hidden = 0.0 < depth < sphere[2] - radius - HIDDEN
+    is_hidden = 0.0 < float(frame.depth[cell]) < sphere[2] - radius - HIDDEN
     return sum(is_in), int(not is_hidden), frame.intrinsics.fx * radius / float(sphere[2])
 
 
@@ -196,6 +195,5 @@ def _captioned(lines: Sequence[str], width: int) -> UInt8:
     for number, line in enumerate(lines):
         (length, _), _ = cv2.getTextSize(line, FONT, FONT_SCALE, 1)
         scale = FONT_SCALE * min(1.0, (width - 2 * EDGE) / max(length, 1))
-        place = (EDGE, EDGE + LINE_HEIGHT * number + 16)
-        cv2.putText(strip, line, place, FONT, scale, INK, 1, cv2.LINE_AA)
+        cv2.putText(strip, line, (EDGE, EDGE + LINE_HEIGHT * number + 16), FONT, scale, INK, 1, cv2.LINE_AA)
     return strip

@@ -186,8 +186,7 @@ class ArrayFile(ABC):
         self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
     ) -> tuple[Stamps, dict[str, Rows]]:
         """`stamps`, and of each group of names its `columns`."""
-        found = {key: self.columns(names) for key, names in groups.items()}
-        return self.stamps(time, unit_ns, epoch_ns), found
+        return self.stamps(time, unit_ns, epoch_ns), {key: self.columns(names) for key, names in groups.items()}
 
     def numbers(self, names: Sequence[str]) -> Float64:
         """`columns`, all rows at once."""

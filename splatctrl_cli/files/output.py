@@ -253,8 +253,7 @@ def partial_path(path: Path) -> Path:
 def check_can_be_written(path: Path) -> None:
     """Raise UsageError for an output that no command can write, before any work: its nearest folder says so."""
     try:
-        target = followed(path).absolute()
-        above = next(folder for folder in target.parents if folder.exists())
+        above = next(folder for folder in followed(path).absolute().parents if folder.exists())
         is_good = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
         reason = "" if is_good else f"{above} is {'read-only' if above.is_dir() else 'no folder'}"
     except OSError as error:

@@ -161,8 +161,7 @@ def _read_ascii(path: Path, content: bytes, header: _Header) -> dict[str, NDArra
     for found in header.elements:
         rows = lines[start : start + found.count]
         start += found.count
-        dtype = dtypes[found.name]
-        table = np.zeros(found.count, dtype=dtype)
+        table = np.zeros(found.count, dtype=dtypes[found.name])
         bad = next((i for i, row in enumerate(rows) if len(row) != len(found.properties)), None)
         if bad is not None:
             raise InputError(
@@ -186,8 +185,7 @@ def _parse_header(path: Path, content: bytes) -> _Header:
         raise InputError(f"{path}: cut short: its header has no end_header line")
     form, elements, comments = "", list[_Element](), list[str]()
     for line in content[:end].decode("utf-8", "backslashreplace").splitlines()[1:]:
-        words = line.split()
-        match words:
+        match line.split():
             case ["format", name, "1.0"] if name in BYTE_ORDERS:
                 form = name
             case ["comment" | "obj_info", *_]:

@@ -67,8 +67,7 @@ def _numbers(name: str, block: Sequence[_Line], columns: Sequence[int], num_colu
         points = np.array([(float(row[i]), float(row[j]), float(row[k])) for _, row in block])
     except (ValueError, IndexError):
         raise _first_wrong(name, block, columns, num_columns) from None
-    is_ragged = any(len(row) != num_columns for _, row in block)
-    if is_ragged or not (np.abs(points) <= MAX_PLACE).all():
+    if any(len(row) != num_columns for _, row in block) or not (np.abs(points) <= MAX_PLACE).all():
         raise _first_wrong(name, block, columns, num_columns)
     return points
 

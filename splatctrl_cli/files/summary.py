@@ -34,12 +34,11 @@ class Summary:
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON: facts, each table as a list of objects, `missing` and `notes`."""
-        grids = {g.name: [dict(zip(g.header, row, strict=True)) for row in g.rows] for g in self.grids}
         return {
             "path": self.path,
             "kind": self.kind,
             **self.facts,
-            **grids,
+            **{g.name: [dict(zip(g.header, row, strict=True)) for row in g.rows] for g in self.grids},
             "missing": list(self.missing),
             "notes": list(self.notes),
             "damaged": self.damaged,

@@ -159,8 +159,7 @@ def _parsed(path: Path, image: Element, piece: Element, begin: int) -> tuple[Gri
     voxel = spacing.pop()
     if origin.shape != (3,) or not np.isfinite(origin).all() or not 0.0 < voxel < np.inf:
         raise ValueError(f"expected a place and a size above 0, got {image.attrib['Origin']}, {voxel}")
-    head = GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header)
-    return head, blocks
+    return GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header), blocks
 
 
 def _values(path: Path, stream: BinaryIO, head: GridHead, block: _Block) -> NDArray[np.generic]:

@@ -76,9 +76,8 @@ def _camera(
     survey: Survey, namespace: tuple[str, ...], color: TopicSurvey, depths: list[TopicSurvey]
 ) -> CameraTopics:
     info = find_info(survey, color, namespace)
-    with_info = [(depth, find_info(survey, depth, namespace)) for depth in depths]
     depth, depth_info = min(
-        with_info,
+        [(depth, find_info(survey, depth, namespace)) for depth in depths],
         key=lambda item: (
             not is_registered(survey, color.topic.name, item[0].topic.name, info, item[1]),
             not _says_registered(item[0].topic.name),

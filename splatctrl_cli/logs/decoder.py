@@ -159,8 +159,7 @@ def _store_of(definition: str, form: str, type_name: str) -> Any:
     """The types of a definition; kept, as to compile them takes some ten milliseconds."""
     store = get_typestore(Stores.EMPTY)
     if form == "idl":
-        separator = "=" * 80 + "\n"
-        parts = [part for part in definition.split(separator) if part.strip()]
+        parts = [part for part in definition.split("=" * 80 + "\n") if part.strip()]
         for part in parts:
             body = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
             store.register(get_types_from_idl(body))

@@ -121,8 +121,7 @@ class TfTree:
         Raises ValueError for a rotation or position that is not one (a zero quaternion, NaN).
         """
         parent, child = parent.strip("/"), child.strip("/")
-        norm = float(np.linalg.norm(quat_xyzw))
-        if not (np.isfinite(position).all() and 0.5 < norm < 2.0):
+        if not (np.isfinite(position).all() and 0.5 < float(np.linalg.norm(quat_xyzw)) < 2.0):
             raise ValueError(f"transform {parent} -> {child} is not a rigid transform")
         if child not in self._edges and child in self._ancestors(parent):
             self.note(f"tf: {parent} -> {child} would close a loop, as {child} is above {parent}; it is left out")

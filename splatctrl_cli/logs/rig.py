@@ -104,8 +104,7 @@ def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
         if options.cameras is not None and topics.name not in options.cameras:
             continue
         lacks.extend(_Builder(log, survey, options, topics).problems())
-        stamps = [survey.topics[name].stamps_ns for name in (topics.color, topics.depth)]
-        gap = nearest_gap_ns(*stamps) * 1e-9
+        gap = nearest_gap_ns(*[survey.topics[name].stamps_ns for name in (topics.color, topics.depth)]) * 1e-9
         if gap > options.pairing_tolerance_s:
             lacks.append(
                 f"camera {topics.name}: colour and depth are never closer than {gap * 1e3:.4g} ms; give "
@@ -171,13 +170,12 @@ class _Builder:
         intrinsics = intrinsics_of(calibration)
         undistortion = self._undistortion(calibration, topics.info)
         fixed = self._options.camera_poses.get(topics.name)
-        world = self._check_world()
         return Camera(
             name=topics.name,
             color_topic=topics.color,
             depth_topic=topics.depth,
             frame_id=self._frame_id,
-            world_frame=world,
+            world_frame=self._check_world(),
             intrinsics=intrinsics,
             undistortion=undistortion,
             valid=calibration.valid if undistortion is None else undistortion.valid,

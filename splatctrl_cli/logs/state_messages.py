@@ -70,8 +70,7 @@ def pose_of_columns(values: Float64) -> Float64 | None:
 
 def pose_of_quat(position: Float64, quat_xyzw: Float64) -> Float64 | None:
     """T (4, 4) of a position [m] and a quaternion, None where its length is not one."""
-    length = float(np.linalg.norm(quat_xyzw))
-    if not (np.isfinite(position).all() and abs(length - 1.0) < _MAX_SKEW):
+    if not (np.isfinite(position).all() and abs(float(np.linalg.norm(quat_xyzw)) - 1.0) < _MAX_SKEW):
         return None
     return transform_from(position, quat_xyzw)
 

@@ -74,8 +74,7 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
                 remedy=f"use one of: {', '.join(t.topic.name for t in found) or 'none there'}",
             )
         return chosen
-    measured = [t for t in found if t.topic.type_name != TRAJECTORY]
-    return measured or found
+    return [t for t in found if t.topic.type_name != TRAJECTORY] or found
 
 
 def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
@@ -94,8 +93,7 @@ def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
 
 def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
     """The states of a topic that name the most joints; others (a gripper that publishes alone) are noted."""
-    streams = _streams([topic])
-    chosen = max(streams, key=lambda s: (len(s.names), len(s.states), sorted(s.names)))
+    chosen = max(_streams([topic]), key=lambda s: (len(s.names), len(s.states), sorted(s.names)))
     others = len(topic.joints) - len(chosen.states)
     if others:
         loss.notes.append(f"{chosen.where}: {others} of {len(topic.joints)} states name other joints: left out")

@@ -111,8 +111,7 @@ def differentiated(stamp_ns: Stamps, position: Float64) -> Float64:
 
 def slopes_by_block(stamp_ns: Stamps, position: Table) -> Iterator[tuple[int, Float64]]:
     """`differentiated` a block at a time: the first state of each and the velocities (K, J) there."""
-    borders = [0, *(gaps_of(stamp_ns) + 1).tolist(), len(stamp_ns)]
-    for start, end in pairwise(borders):
+    for start, end in pairwise([0, *(gaps_of(stamp_ns) + 1).tolist(), len(stamp_ns)]):
         if end - start == 1:
             yield start, np.zeros((1, *position.shape[1:]))
             continue

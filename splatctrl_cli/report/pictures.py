@@ -125,8 +125,7 @@ def drawn_figure(height: float) -> Iterator["mpl.figure.Figure"]:
     """A figure of the house style, 1200 pixels wide."""
     with mpl.rc_context(STYLE):
         layout = mpl.layout_engine.ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08)
-        figure = mpl.figure.Figure(figsize=(WIDTH, height), dpi=DPI, layout=layout)
-        yield figure
+        yield mpl.figure.Figure(figsize=(WIDTH, height), dpi=DPI, layout=layout)
 
 
 def save_figure(figure: "mpl.figure.Figure", path: Path, told: str = "") -> None:

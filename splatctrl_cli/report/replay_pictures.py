@@ -68,8 +68,7 @@ def clearance_picture(
     shown = {kind: intervals for kind, intervals in events.items() if intervals}
     with drawn_figure(4.8 + _strip_height(shown)) as figure:
         axes, strip = figure.subplots(2, 1, sharex=True, height_ratios=[4.4, max(_strip_height(shown), 0.05)])
-        found = [_clearance_curve(axes, seconds, values, name) for name, values in curves.items()]
-        lowest = min(0.0, *found)
+        lowest = min(0.0, *[_clearance_curve(axes, seconds, values, name) for name, values in curves.items()])
         bottom = lowest * 1.15 - 0.2 if lowest < 0 else 0.0
         axes.axhspan(bottom, 100 * margin, color="#000000", alpha=0.06, linewidth=0)
         axes.axhline(100 * margin, color=INK, linewidth=1.0, linestyle=(0, (6, 3)))
@@ -322,8 +321,7 @@ def envelope(seconds: Float64, values: Float64, columns: int = 1000) -> Envelope
         return Envelope(seconds=seconds, lowest=values, highest=values)
     edges = np.linspace(seconds[0], seconds[-1], columns + 1)
     first = np.searchsorted(seconds, edges[:-1], side="left")
-    ends = np.append(first[1:], len(values))
-    is_filled = ends > first
+    is_filled = np.append(first[1:], len(values)) > first
     starts = first[is_filled]
     lowest, highest = np.full(columns, np.nan), np.full(columns, np.nan)
     lowest[is_filled], highest[is_filled] = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)

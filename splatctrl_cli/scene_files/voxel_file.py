@@ -267,12 +267,11 @@ def known_space(grid: OccupancyGrid, thresholds: OccupancyConfig) -> dict[str, o
     """
     states = grid.states(thresholds.free_below, thresholds.occupied_above)
     counts = np.bincount(states.ravel(), minlength=len(VoxelState))
-    shares = {state.name.lower(): round(float(counts[state] / states.size), 6) for state in VoxelState}
     return {
         "extent_m": [round(grid.voxel * count, 6) for count in states.shape],
         "free_below": thresholds.free_below,
         "occupied_above": thresholds.occupied_above,
-        "share": shares,
+        "share": {state.name.lower(): round(float(counts[state] / states.size), 6) for state in VoxelState},
         "robot_voxels": int(np.count_nonzero(grid.entity & Label.ROBOT)),
         "human_voxels": int(np.count_nonzero(grid.entity & Label.HUMAN)),
     }

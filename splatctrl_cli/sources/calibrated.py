@@ -78,8 +78,7 @@ class Correction:
         camera = self.camera(name)
         if (camera.scale, camera.bias) == (1.0, 0.0):
             return depth
-        true = np.where(depth > 0, camera.scale * depth + camera.bias, 0.0)
-        return np.maximum(true, 0.0).astype(np.float32)
+        return np.maximum(np.where(depth > 0, camera.scale * depth + camera.bias, 0.0), 0.0).astype(np.float32)
 
     def states(self, states: StateColumns) -> StateColumns:
         """Joint states on the clock of the frames."""

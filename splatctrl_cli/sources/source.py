@@ -169,13 +169,12 @@ _TOPIC_COLUMNS = ("topic", "type", "encoding", "count", "hz", "first message")
 
 def _topic_row(entry: TopicSurvey) -> list[object]:
     span = (entry.last_log_ns - entry.first_log_ns) * 1e-9
-    rate = f"{(entry.count - 1) / span:.2f}" if entry.count > 1 and span > 0 else "-"
     return [
         entry.topic.name,
         entry.topic.schema or entry.topic.type_name or "-",
         entry.topic.encoding or "-",
         entry.count,
-        rate,
+        f"{(entry.count - 1) / span:.2f}" if entry.count > 1 and span > 0 else "-",
         _first(entry),
     ]
 

@@ -61,8 +61,7 @@ def check_finite(where: str, num: int, groups: Mapping[str, NDArray[Any]]) -> No
     for name, values in groups.items():
         if len(values) != num:
             raise InputError(f"{where}: {name}: expected {num} values, got {len(values)}")
-        is_finite = np.isfinite(values.reshape(num, -1 if num else 1)).all(axis=1)
-        refuse(where, name, values, ~is_finite, "finite")
+        refuse(where, name, values, ~np.isfinite(values.reshape(num, -1 if num else 1)).all(axis=1), "finite")
 
 
 @dataclass(frozen=True, kw_only=True)
