@@ -1,9 +1,8 @@
 """``X.capture/``: a recording as a plain folder of images, poses and joints (docs/capture.md)."""
 
-import dataclasses
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,19 @@ from splatctrl_cli.files.arrays import DAMAGE, NpzFile, npy_of
 from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.logs.joint_topics import AGAIN, joints_again, read_topics, with_joints, without_joints
 from splatctrl_cli.logs.messages import metres
 from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB, SourceOptions
 from splatctrl_cli.logs.state_columns import NO_STATES, StateColumns
-from splatctrl_cli.logs.stored_frame import StoredFrame, decoded, human_mask
+from splatctrl_cli.logs.stored_frame import (
+    AGAIN,
+    StoredFrame,
+    decoded,
+    human_mask,
+    joints_again,
+    read_topics,
+    with_joints,
+    without_joints,
+)
 from splatctrl_cli.logs.survey import RobotDescription
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, UInt8, by_stamp
 
@@ -127,7 +134,7 @@ class CaptureSource:
             size = f"{camera['width']}x{camera['height']}"
             self._damaged.append(f"{row['color']}, {row['depth']}: expected images of {size} as capture.json says")
             return None
-        intrinsics = Intrinsics(**{f.name: camera[f.name] for f in dataclasses.fields(Intrinsics)})
+        intrinsics = Intrinsics(**{f.name: camera[f.name] for f in fields(Intrinsics)})
         return StoredFrame(
             stamp_ns=int(row["stamp_ns"]),
             camera=row["camera"],

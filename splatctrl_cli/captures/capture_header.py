@@ -19,7 +19,7 @@ import numpy as np
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.files.spilled_rows import scratch_folder
-from splatctrl_cli.logs.joint_topics import AGAIN
+from splatctrl_cli.logs.stored_frame import AGAIN
 from splatctrl_cli.records import LossReport
 
 FORMAT, VERSION = "splatctrl-capture", 1

@@ -26,10 +26,9 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.image_file import PNG
 from splatctrl_cli.files.unpacking import PIECE
 from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
-from splatctrl_cli.logs.joint_topics import AGAIN
 from splatctrl_cli.logs.mcap_writer import McapLog, mcap_log
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.stored_frame import StoredFrame
+from splatctrl_cli.logs.stored_frame import AGAIN, StoredFrame
 from splatctrl_cli.records import MILLIMETRES, JointState, RgbdFrame, by_stamp
 
 MOST_FILES = 1 << 20  # an empty file takes a disk's block, its name in an archive thirty bytes

@@ -24,10 +24,9 @@ from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.files.output import sha256, write_json
 from splatctrl_cli.files.spilled_rows import Table, blocks_of
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.logs.joint_topics import FOLDER, JointTopics, write_topics
 from splatctrl_cli.logs.messages import metres
 from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
-from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame, is_png
+from splatctrl_cli.logs.stored_frame import FOLDER, FrameSource, JointTopics, StoredFrame, is_png, write_topics
 from splatctrl_cli.records import Float32, JointState, LossReport
 
 JOURNAL = "ingest.jsonl"  # in the folder while it is partial

@@ -17,7 +17,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.field.grid_cells import check_room
 from splatctrl_cli.field.obstacles import DEFAULT_LABELS, obstacle_spheres
 from splatctrl_cli.files.output import Parts, Stopwatch, output_path
-from splatctrl_cli.files.point_table import point_blocks
+from splatctrl_cli.files.ply import point_blocks
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.bakes.request import BakeSource, read_bake_source, source_of_grid
 from splatctrl_cli.jobs.device import CUDA, TO_CPU, Device, chosen, named

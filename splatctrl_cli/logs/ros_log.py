@@ -16,12 +16,20 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.logs.frame_plan import FramePlan, Planned, PlannedImages
-from splatctrl_cli.logs.joint_topics import topics_of, with_joints
 from splatctrl_cli.logs.messages import ImageMessage, color_of, depth_of, num_invalid, read_image
 from splatctrl_cli.logs.rig import Camera, build_cameras, nearest_gap_ns
 from splatctrl_cli.logs.source_options import SourceOptions, still_note
 from splatctrl_cli.logs.state_topics import joint_records
-from splatctrl_cli.logs.stored_frame import StoredFrame, check_depth, decoded, human_mask, is_kept, is_png
+from splatctrl_cli.logs.stored_frame import (
+    StoredFrame,
+    check_depth,
+    decoded,
+    human_mask,
+    is_kept,
+    is_png,
+    topics_of,
+    with_joints,
+)
 from splatctrl_cli.logs.survey import Survey, dropped, first_of_each, pair_by_stamp, paired, survey
 from splatctrl_cli.records import SECOND_NS, Float32, Float64, Index, JointState, LossReport, Record, UInt8, by_stamp
 

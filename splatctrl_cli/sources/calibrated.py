@@ -17,12 +17,11 @@ from splatctrl_cli.datasets.folder_views import HOLDOUT
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.geometry import interpolate_transform, invert_transform, transform_from
-from splatctrl_cli.logs.joint_topics import JointTopics
 from splatctrl_cli.logs.messages import metres
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB, SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame, decoded
+from splatctrl_cli.logs.stored_frame import FrameSource, JointTopics, StoredFrame, decoded
 from splatctrl_cli.records import SECOND_NS, Float32, Float64, JointState, LossReport, Record, RgbdFrame, by_stamp
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files import point_table
-from splatctrl_cli.files.point_table import point_blocks
+from splatctrl_cli.files import ply
+from splatctrl_cli.files.ply import point_blocks
 
 
 def points_in(text: str) -> list[list[float]]:
@@ -28,7 +28,7 @@ def test_columns_are_found_with_a_header_and_without(text: str) -> None:
 
 
 def test_a_table_comes_in_blocks_that_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(point_table, "POINTS_PER_BLOCK", 4)
+    monkeypatch.setattr(ply, "POINTS_PER_BLOCK", 4)
     blocks = [*point_blocks(io.StringIO("x,y,z\n" + "1,2,3\n" * 10), "a.csv")]
     assert [len(block) for block in blocks] == [4, 4, 2]
     assert all(block.dtype == np.float64 for block in blocks)

@@ -13,7 +13,7 @@ from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.field.distance import SphereField, make_field, march
 from splatctrl_cli.field.grid_field import GridField
-from splatctrl_cli.files import point_table
+from splatctrl_cli.files import ply
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.point_answers import TITLES
 from splatctrl_cli.jobs.query import QueryRequest, QueryResult, query
@@ -131,7 +131,7 @@ def test_a_field_and_another_scene_do_not_go_together(scene: Path, tmp_path: Pat
 def test_blocks_change_no_answer(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
     whole = asked(scene, points)
-    monkeypatch.setattr(point_table, "POINTS_PER_BLOCK", 7)
+    monkeypatch.setattr(ply, "POINTS_PER_BLOCK", 7)
     parts = asked(scene, points)
     assert parts[1] == whole[1]
     assert parts[0].metrics == pytest.approx(whole[0].metrics)
@@ -145,7 +145,7 @@ def test_a_bare_splat_file_knows_nothing_of_space(tmp_path: Path) -> None:
 
 
 def test_a_wrong_line_after_many_right_ones_leaves_no_file(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(point_table, "POINTS_PER_BLOCK", 2)
+    monkeypatch.setattr(ply, "POINTS_PER_BLOCK", 2)
     out = scene.parent / "none.csv"
     table = io.StringIO("1,2,3\n" * 5 + "1,2\n")
     with pytest.raises(InputError, match="standard input: line 6: expected 3 columns, got 2"):
