@@ -56,6 +56,7 @@ from splatctrl_cli.scene.self_mask import (
     of_label,
     self_mask,
     settled,
+    voted,
     without_mixed,
 )
 from splatctrl_cli.scene.shell import Shell
@@ -113,6 +114,7 @@ class SceneFitter:
             seen = list(zip(frames, self._each(lambda f: self_mask(f, robot, config), frames), strict=True))
             others = [[*(other for other in seen if other is not one), *self.seen] for one in seen]
             masks = [settled(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
+            masks = voted(list(zip(frames, masks, strict=True)), config.voxel)
         frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
         views = list(self._each(self.view, frames, masks))
         seen = self.seen = list(zip(frames, masks, strict=True))

@@ -23,6 +23,7 @@ from splatctrl_cli.config.fixed import (
     MASK_SPECK,
     MASK_STEP,
     MASK_SURE,
+    VOTE_SHARE,
 )
 from splatctrl_cli.geometry import back_project_pixels, invert_transform, project, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
@@ -179,6 +180,37 @@ def settled(
     kinds = mask.kinds.copy()
     kinds[v, u] = np.where(is_object[owner], np.uint8(PixelKind.OBJECT), np.uint8(PixelKind.MIXED))
     return replace(mask, kinds=kinds)
+
+
+def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], voxel: float) -> list[SelfMask]:
+    """The masks of frames of one time step without the object pixels that the robot's outvote, which become mixed.
+
+    All frames vote together, in cells with edges of `voxel` [m]: where fewer than `VOTE_SHARE` of the robot's pixels
+    show an object, these are the robot's outline or noise of its surface.
+    """
+    parts = []
+    for number, (frame, mask) in enumerate(seen):
+        is_robot, is_object = mask.kinds == PixelKind.ROBOT, mask.kinds == PixelKind.OBJECT
+        beside = cv2.dilate(is_robot.view(np.uint8), _window(pixels_of(voxel, frame, mask.robot_depth)))
+        v, u = np.nonzero(is_robot | (is_object & (beside > 0)))
+        points = back_project_pixels(frame.intrinsics, u, v, frame.depth[v, u])
+        cells = np.floor(transform_points(frame.T_world_camera, points) / voxel).astype(np.int64)
+        parts.append(np.column_stack([cells, np.full(len(u), number), v, u, is_object[v, u]]))
+    rows = np.concatenate(parts)
+    of_robot = rows[rows[:, 6] == 0, :3]
+    if not len(of_robot):
+        return [mask for _, mask in seen]
+    low, high = of_robot.min(axis=0), of_robot.max(axis=0)
+    rows = rows[np.all((rows[:, :3] >= low) & (rows[:, :3] <= high), axis=1)]
+    cell = np.ravel_multi_index(tuple((rows[:, :3] - low).T), tuple(high - low + 1))
+    num_robot, num_object = (np.bincount(cell, weights=rows[:, 6] == own) for own in (0, 1))
+    lost = rows[(rows[:, 6] == 1) & (num_object < VOTE_SHARE * num_robot)[cell]]
+    found = []
+    for number, (_, mask) in enumerate(seen):
+        kinds = mask.kinds.copy()
+        kinds[tuple(lost[lost[:, 3] == number, 4:6].T)] = PixelKind.MIXED
+        found.append(replace(mask, kinds=kinds))
+    return found
 
 
 def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float32]:
@@ -348,4 +380,6 @@ def pixels_of(length: float, frame: RgbdFrame, rendered: Float32) -> int:
     """Pixels that a length [m] spans at the median depth of the rendered robot, at least 1."""
     some = rendered[::4, ::4]
     depths = some[some > 0] if some.any() else rendered[rendered > 0]
+    if not len(depths):
+        return 1
     return max(1, int(np.ceil(length * frame.intrinsics.fx / float(np.median(depths)))))
