@@ -114,7 +114,7 @@ class SceneFitter:
             seen = list(zip(frames, self._each(lambda f: self_mask(f, robot, config), frames), strict=True))
             others = [[*(other for other in seen if other is not one), *self.seen] for one in seen]
             masks = [settled(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
-            masks = voted(list(zip(frames, masks, strict=True)), config.voxel)
+            masks = voted(list(zip(frames, masks, strict=True)), self.occupancy.origin, config.voxel)
         frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
         views = list(self._each(self.view, frames, masks))
         seen = self.seen = list(zip(frames, masks, strict=True))

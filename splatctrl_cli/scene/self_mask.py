@@ -182,11 +182,11 @@ def settled(
     return replace(mask, kinds=kinds)
 
 
-def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], voxel: float) -> list[SelfMask]:
+def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: float) -> list[SelfMask]:
     """The masks of frames of one time step without the object pixels that the robot's outvote, which become mixed.
 
-    All frames vote together, in cells with edges of `voxel` [m]: where fewer than `VOTE_SHARE` of the robot's pixels
-    show an object, these are the robot's outline or noise of its surface.
+    All frames vote together, in voxels of a grid with its first centre at `origin` (3,) [m]: where fewer than
+    `VOTE_SHARE` of the robot's pixels show an object, these are the robot's outline or noise of its surface.
     """
     parts = []
     for number, (frame, mask) in enumerate(seen):
@@ -194,7 +194,7 @@ def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], voxel: float) -> list[Self
         beside = cv2.dilate(is_robot.view(np.uint8), _window(pixels_of(voxel, frame, mask.robot_depth)))
         v, u = np.nonzero(is_robot | (is_object & (beside > 0)))
         points = back_project_pixels(frame.intrinsics, u, v, frame.depth[v, u])
-        cells = np.floor(transform_points(frame.T_world_camera, points) / voxel).astype(np.int64)
+        cells = np.floor((transform_points(frame.T_world_camera, points) - origin) / voxel + 0.5).astype(np.int64)
         parts.append(np.column_stack([cells, np.full(len(u), number), v, u, is_object[v, u]]))
     rows = np.concatenate(parts)
     of_robot = rows[rows[:, 6] == 0, :3]

@@ -13,7 +13,16 @@ from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, RgbdFrame, 
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.scene.posture import RobotPosture
-from splatctrl_cli.scene.self_mask import PixelKind, audited, link_residuals, self_mask, settled, without_mixed
+from splatctrl_cli.scene.self_mask import (
+    PixelKind,
+    SelfMask,
+    audited,
+    link_residuals,
+    self_mask,
+    settled,
+    voted,
+    without_mixed,
+)
 from tests.plain import plain_frame
 
 K = Intrinsics(fx=160.0, fy=160.0, cx=79.5, cy=59.5, width=160, height=120)
@@ -167,6 +176,42 @@ def test_the_tip_of_a_surface_that_comes_from_elsewhere_is_no_speck(others: list
     tip[rows, column] = whole[rows, : column + 1] = CENTER[2]
     assert (kinds(tip, others=others)[rows, column] == PixelKind.MIXED).all()
     assert (kinds(whole, others=others)[rows, column] == PixelKind.OBJECT).all()
+
+
+def shown(own: Sequence[int], depth: float = 1.0) -> tuple[RgbdFrame, SelfMask]:
+    """A frame of one surface; the kinds, in order, of 16 pixels about its middle, which lie in one voxel of 10 cm."""
+    pixels = np.full((K.height, K.width), PixelKind.NOTHING, np.uint8)
+    pixels[58:62, 78:82] = np.reshape(own, (4, 4))
+    rendered = np.where(pixels == PixelKind.ROBOT, np.float32(depth), np.float32(0.0))
+    view = frame(np.full((K.height, K.width), depth))
+    return view, SelfMask(kinds=pixels, robot_depth=rendered, residuals={}, num_inside={})
+
+
+ROBOT, OBJECT = [PixelKind.ROBOT], [PixelKind.OBJECT]
+
+
+@pytest.mark.parametrize(
+    ("frames", "num_objects"),
+    [
+        pytest.param([14 * ROBOT + 2 * OBJECT], 0, id="2 of 14"),
+        pytest.param([13 * ROBOT + 3 * OBJECT], 3, id="3 of 13: a rod of 6 mm has more"),
+        pytest.param([12 * ROBOT + 4 * OBJECT, 16 * ROBOT], 0, id="two cameras vote together"),
+        pytest.param([16 * OBJECT], 16, id="no robot"),
+    ],
+)
+def test_few_object_pixels_in_a_voxel_of_the_robot_are_outvoted(frames: list[list[int]], num_objects: int) -> None:
+    seen = [shown(own) for own in frames]
+    found = voted(seen, np.array([0.0, 0.0, 1.0]), 0.1)
+    assert sum((mask.kinds == PixelKind.OBJECT).sum() for mask in found) == num_objects
+    lost = [(mask.kinds == PixelKind.MIXED) != ((own.kinds == PixelKind.OBJECT) & (num_objects == 0))
+            for mask, (_, own) in zip(found, seen, strict=True)]  # fmt: skip
+    assert not np.any(lost)
+
+
+def test_the_robots_votes_count_in_their_own_voxel_alone() -> None:
+    robot, beside = shown(16 * ROBOT), shown(16 * OBJECT, depth=1.11)
+    assert (voted([robot, beside], np.array([0.0, 0.0, 1.0]), 0.1)[1].kinds == beside[1].kinds).all()
+    assert not (voted([robot, beside], np.array([0.0, 0.0, 1.1]), 0.3)[1].kinds == PixelKind.MIXED).any()  # 16 to 16
 
 
 def drawn() -> RobotPosture:

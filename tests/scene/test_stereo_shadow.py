@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.records import Bool, Float32
+from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.records import Bool, Float32, Intrinsics
+from splatctrl_cli.scene.depth_holes import unanswered_points
 from splatctrl_cli.scene.stereo_shadow import shadowed
+from tests.plain import plain_frame
 
 FOCAL, BASELINE = 400.0, 0.05  # [px], [m]
 WALL, PLATE = 2.0, 1.0  # [m]; the shadow is 10 px wide
@@ -70,3 +73,13 @@ def test_a_baseline_is_that_of_a_camera() -> None:
 @pytest.mark.parametrize("depth", [np.zeros((4, 6), np.float32), np.ones((4, 6), np.float32)])
 def test_an_image_without_steps_has_none(depth: Float32) -> None:
     assert not shadowed(depth, FOCAL).any()
+
+
+@pytest.mark.parametrize("is_dark", [False, True])
+def test_a_shadow_is_no_place_without_an_answer(is_dark: bool) -> None:
+    depth = as_stereo(plates(slice(60, 90)))
+    depth[12:32, 15:40] = np.where(is_dark, 0.0, depth[12:32, 15:40])
+    lens = Intrinsics(fx=FOCAL, fy=FOCAL, cx=80.0, cy=20.0, width=WIDTH, height=HEIGHT)
+    nobody = np.zeros((HEIGHT, WIDTH), np.float32)
+    found = list(unanswered_points(plain_frame(depth, lens), nobody, OccupancyConfig(voxel=0.01)))
+    assert (sum(map(len, found)) > 0) == is_dark
