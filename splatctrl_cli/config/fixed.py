@@ -156,6 +156,7 @@ COMPARED_CELLS = 200_000  # a larger grid is compared with the truth at this man
 
 # Control (III-E): barriers, limits and what is known of the space about the arm
 IMMOVABLE_ROW = 1e-9  # [m/s] a row that the fastest allowed motion changes by less cannot be acted on
+SURFACE_STEP = 1e-6  # [rad or m] between the postures that say how a link's surface gap changes with a joint
 BRAKING_SHARE = 0.5  # of what a row alone could brake with; 1 lost up to 6 mm where several rows brake at once
 STEP_SCALES = (0.5, 0.25, 0.125, 0.0625)  # of a step that turns out worse than its rows promised; then none
 WITHIN_SHARE = 0.01  # of `promise_tolerance`, for a sphere that is within its margin

@@ -4,19 +4,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.config.fixed import BRAKING_SHARE, IMMOVABLE_ROW
+from splatctrl_cli.config.fixed import BRAKING_SHARE, IMMOVABLE_ROW, SURFACE_STEP
 from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.limits import braking_speed
 from splatctrl_cli.control.terms import Barrier, BarrierTerm, RowKind, State
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.kernels.chain import pair_gaps
-from splatctrl_cli.records import DistanceField, Float64
+from splatctrl_cli.records import Bool, DistanceField, Float64
 
 MARGIN = "margin"
 
 
 class SceneRows(BarrierTerm):
-    """A row for each moving sphere against the nearest surface of a distance field."""
+    """A row for each moving sphere against the nearest surface of a distance field; those `State.by_surface` count
+    their link's own surface, where that is farther away.
+    """
 
     kind = RowKind.SCENE
 
@@ -24,28 +27,50 @@ class SceneRows(BarrierTerm):
         self, model: ArmModel, config: ControlConfig, field: DistanceField, acceleration: Float64 | None
     ) -> None:
         """acceleration (J,) [rad/s^2]: what joints can brake with; None: they stop at once."""
-        self._config, self._field, self._acceleration = config, field, acceleration
+        self._model, self._config, self._field, self._acceleration = model, config, field, acceleration
+        self._balls: BallDistance | None = None
         self._moving = np.flatnonzero(model.moving_spheres)
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)[self._moving]
         self._margin = scene_margin(model, config)[self._moving]
         names = sphere_names(model.sphere_set)
         self.names = tuple(names[s] for s in self._moving)
+        self._links = np.array(model.sphere_set.links)[self._moving]
 
     @property
     def margin(self) -> Float64:
         return self._margin
 
-    def in_field(self, field: DistanceField) -> "SceneRows":
-        """The same rows in another field."""
+    def in_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
+        """The same rows in another field, which is of `balls` (None: links' surfaces are not measured)."""
         other = object.__new__(SceneRows)
-        other.__dict__.update(self.__dict__, _field=field)
+        other.__dict__.update(self.__dict__, _field=field, _balls=balls)
         return other
+
+    def by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
+        """The distances (M,) [m] of the spheres at q (J,), those `chosen` (M,) at least the gap of their link's
+        surface; the rows G (M, J), where given, become rows of that gap where it is larger.
+
+        Such a row asks of the surface what it asks of any sphere, `config.margin`, wherever the sphere moves on to.
+        """
+        if self._balls is None or not chosen.any():
+            return distance
+        postures = q[None] if G is None else q + SURFACE_STEP * np.eye(len(q) + 1, len(q), -1)
+        links = set(self._links[chosen].tolist())
+        gaps = self._model.surface_gaps(postures, self._balls.centers, self._balls.radii, links)
+        for link, gap in gaps.items():
+            raised = gap[0] + self._margin - self._config.margin
+            is_raised = chosen & (self._links == link) & (raised > distance)
+            distance = np.where(is_raised, raised, distance)
+            if G is not None:
+                G[is_raised] = (gap[0] - gap[1:]) / SURFACE_STEP
+        return distance
 
     def rows(self, state: State) -> Barrier:
         """See `BarrierTerm`: gradient and distance come from one query of one function."""
         centers, jacobians = state.spheres
         distance, gradient = self._queried(centers)
         G = -external_gradient(gradient, jacobians[self._moving])
+        distance = self.by_surfaces(state.q, distance, state.by_surface, G)
         h = distance_bound(self._config, self._acceleration, distance, self._margin, G, state.distance_rate)
         return self._barrier(self._moving, G, h, distance)
 
@@ -56,20 +81,16 @@ class SceneRows(BarrierTerm):
         That surface's distance is taken as linear about the place where it was met. Where it is convex seen from
         there, as a ball is, it is farther than that in truth; and now it is no nearer than what is nearest now.
         """
-        period, spheres = self._config.period, self._moving[chosen]
-        centers, jacobians = state.model.spheres_at(state.q + period * velocity)
-        later, gradient = self._field.query(np.ascontiguousarray(centers[spheres]))
-        G = -external_gradient(gradient, jacobians[spheres])
-        now = np.maximum(later - self._radii[chosen] + period * (G @ velocity), distance[chosen])
+        period = self._config.period
+        q = state.q + period * velocity
+        centers, jacobians = state.model.spheres_at(q)
+        later, gradient = self._field.query(np.ascontiguousarray(centers[self._moving]))
+        G = -external_gradient(gradient, jacobians[self._moving])
+        later = self.by_surfaces(q, later - self._radii, state.by_surface, G)
+        now, G = np.maximum(later + period * (G @ velocity), distance)[chosen], G[chosen]
         rate = np.broadcast_to(state.distance_rate, len(self.names))[chosen]
         h = distance_bound(self._config, self._acceleration, now, self._margin[chosen], G, rate)
         return self._barrier(chosen, G, h, now)
-
-    def room(self, state: State, velocity: Float64) -> Float64:
-        centers, jacobians = state.spheres
-        distance, gradient = self._queried(centers)
-        h = distance_bound(self._config, None, distance, self._margin, None, state.distance_rate)
-        return np.asarray(h + np.sum(gradient * (jacobians @ velocity)[self._moving], axis=1))
 
     def distances(self, centers: Float64) -> Float64:
         """See `BarrierTerm`; NaN where the field has none, which keeps no promise."""

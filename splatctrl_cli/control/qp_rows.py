@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.barriers import SceneRows, SelfRows, can_bind, is_immovable
 from splatctrl_cli.control.fallbacks import Choice, Rung, held, is_usable
 from splatctrl_cli.control.limits import box_rows
 from splatctrl_cli.control.qp import QpSolver, QuadraticProgram
-from splatctrl_cli.control.terms import Barrier, BarrierTerm, Cost, State, configured_weights
+from splatctrl_cli.control.terms import NO_SPHERE, Barrier, BarrierTerm, Cost, State, configured_weights
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
 
@@ -69,7 +70,7 @@ class Rows:
 
 
 class RowBuilder:
-    """Builds the rows of an arm in a distance field; names and kinds (M,) say what a row guards."""
+    """Builds the rows of an arm in a distance field; names and kinds (M,) say what a row guards; scene: its rows."""
 
     def __init__(
         self,
@@ -81,7 +82,7 @@ class RowBuilder:
     ) -> None:
         """acceleration (J,) [rad/s^2]: what joints can brake with; None: they stop at once."""
         self._model, self._acceleration = model, acceleration
-        self._scene = SceneRows(model, config, field, acceleration)
+        self.scene = SceneRows(model, config, field, acceleration)
         self._others: tuple[BarrierTerm, ...] = (SelfRows(model, config, acceleration), *further)
         self._margin = np.concatenate([term.margin for term in self._terms])
         self.names = tuple(name for term in self._terms for name in term.names)
@@ -89,17 +90,17 @@ class RowBuilder:
 
     @property
     def _terms(self) -> tuple[BarrierTerm, ...]:
-        return (self._scene, *self._others)
+        return (self.scene, *self._others)
 
     @property
     def num_external(self) -> int:
         """Rows against the scene; they come first."""
-        return len(self._scene.names)
+        return len(self.scene.names)
 
-    def with_field(self, field: DistanceField) -> "RowBuilder":
-        """The same rows in another field."""
+    def with_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
+        """The same rows in another field; see `SceneRows.in_field`."""
         other = object.__new__(RowBuilder)
-        other.__dict__.update(self.__dict__, _scene=self._scene.in_field(field))
+        other.__dict__.update(self.__dict__, scene=self.scene.in_field(field, balls))
         return other
 
     def at(self, state: State) -> Rows:
@@ -111,7 +112,7 @@ class RowBuilder:
 
     def cut(self, rows: Rows, state: State, velocity: Float64, chosen: NDArray[np.integer]) -> Rows:
         """The rows with one more for each of the `chosen` rows against the scene (`SceneRows.cut`)."""
-        cut = self._scene.cut(state, velocity, chosen, rows.external.distance)
+        cut = self.scene.cut(state, velocity, chosen, rows.external.distance)
         return replace(rows, cuts=cut if rows.cuts is None else rows.cuts.joined(cut))
 
     def room(self, state: State, velocity: Float64) -> Float64:
@@ -121,10 +122,11 @@ class RowBuilder:
         rows = [term.rows(state) for term in self._terms]
         return np.concatenate([b.h for b in rows]) - np.concatenate([b.G for b in rows]) @ velocity
 
-    def distances(self, q: Float64) -> Float64:
-        """Every row's distance (M,) [m] at q."""
+    def distances(self, q: Float64, by_surface: Bool = NO_SPHERE) -> Float64:
+        """Every row's distance (M,) [m] at q, of spheres `by_surface` as `State` has it."""
         centers = self._model.sphere_centers(q)
-        return np.concatenate([term.distances(centers) for term in self._terms])
+        scene = self.scene.by_surfaces(q, self.scene.distances(centers), by_surface)
+        return np.concatenate([scene, *(term.distances(centers) for term in self._others)])
 
 
 PRINTED = "printed"

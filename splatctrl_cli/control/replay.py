@@ -9,7 +9,7 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.audit import DistanceFunction
+from splatctrl_cli.control.audit import BallDistance, DistanceFunction
 from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, pose_error
@@ -99,7 +99,8 @@ class ReplayTrace:
     """T steps: stamp_ns (T,), position (T, J) [rad] at which each step was taken, and the steps themselves.
 
     anchored: indices of the steps before which the arm was put back into the logged posture; num_reached: goals;
-    detours: indices of the steps after which a planned way out of a local minimum was taken.
+    detours: indices of the steps after which a planned way out of a local minimum was taken; by_surface: names of the
+    spheres that counted by their link's surface in the end.
     """
 
     stamp_ns: Stamps
@@ -111,6 +112,7 @@ class ReplayTrace:
     anchored: tuple[int, ...] = ()
     num_reached: int = 0
     detours: tuple[int, ...] = ()
+    by_surface: tuple[str, ...] = ()
 
 
 class StepRecord(Protocol):
@@ -165,17 +167,21 @@ def closed_loop(
     record: StepRecord | None = None,
     commander: Commander = OURS,
     distance_to: DistanceFunction | None = None,
+    balls_at: Callable[[int], BallDistance | None] = lambda stamp_ns: None,
 ) -> ReplayTrace:
     """Integrate the commander's velocities at `config.period` until the goal, a stall or `config.max_time`.
 
     field_at gives the field known at a stamp [ns], the same object for the same scene; scene_step_at the two newest
     scenes, for `config.distance_rate`. At a stall plan_detour is asked for a way out, `config.max_detours` times.
     record: where the steps are kept, None for memory; commander: who gives the velocities; distance_to: the exact
-    distance at the start, for `check_free`. Raises InputError for a start outside the limits or a goal out of reach,
-    NotEvaluableError for a start in collision or outside the field.
+    distance at the start, for `check_free`; balls_at: the balls that the field of a stamp is of, None where links'
+    surfaces do not count. Raises InputError for a start outside the limits or a goal out of reach, NotEvaluableError
+    for a start in collision or outside the field.
     """
     field = field_at(task.stamp_ns)
     q, controller = _ready(model, config, task, field, distance_to)
+    controller = controller.with_field(field, balls_at(task.stamp_ns))
+    by_surface: tuple[str, ...] = ()
     statics = static_violations(model, field, q, scene_margin(model, config))
     course, last_velocity = _Course(model, config, task, plan_detour), np.zeros(len(q))
     kept: StepRecord = InMemory() if record is None else record
@@ -189,13 +195,20 @@ def closed_loop(
         if field_at(stamp) is not field:
             changes.append(scene_change(model, stamp, q, field, field_at(stamp)))
             field = field_at(stamp)
-            controller = controller.with_field(field)
+            controller = controller.with_field(field, balls_at(stamp))
         rate = rate_of(config, model, scene_step_at, stamp, q)
         goal, guide = course.goal(stamp, q)
         moment = Moment(
-            stamp_ns=stamp, q=q, T_world_goal=goal, guide=guide, last_velocity=last_velocity, distance_rate=rate
+            stamp_ns=stamp,
+            q=q,
+            T_world_goal=goal,
+            guide=guide,
+            last_velocity=last_velocity,
+            distance_rate=rate,
+            by_surface=by_surface,
         )
         step = commander.step(controller, moment)
+        by_surface = step.by_surface
         kept.add(stamp, q, step)
         if commander.is_over:
             outcome = Outcome.CONTROLLER_FAILED
@@ -217,6 +230,7 @@ def closed_loop(
         anchored=tuple(anchored),
         num_reached=course.num_reached,
         detours=tuple(course.detours),
+        by_surface=by_surface,
     )
 
 

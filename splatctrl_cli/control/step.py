@@ -1,6 +1,6 @@
 """One step of the QP-IK controller of III-E: query the field, build the rows, solve, look at the field again."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -9,6 +9,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import MULTIPLIER, STEP_SCALES, WITHIN_SHARE
 from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.fallbacks import Choice, Rung, descend, held
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.limits import JointLimits
@@ -58,7 +59,7 @@ class ControlStep:
     names; violated_fixed the violated rows that no joint velocity changes here, and fixed_distance [m] the least
     distance of theirs (inf without any); num_rows went into the QP; residual
     is the worst KKT residual of the last solution and status the solver's word for it; num_refused solutions did not
-    check.
+    check; by_surface names the spheres that count by their link's surface, from this step on.
     """
 
     velocity: Float64
@@ -76,6 +77,7 @@ class ControlStep:
     status: str
     num_refused: int
     fixed_distance: float = np.inf
+    by_surface: tuple[str, ...] = ()
 
     @property
     def intervening(self) -> tuple[str, ...]:
@@ -84,7 +86,9 @@ class ControlStep:
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """What a controller is told at a step: the stamp [ns], and the rest as `QpIkController.step` takes it."""
+    """What a controller is told at a step: the stamp [ns], and the rest as `QpIkController.step` takes it; by_surface
+    is that of the step before.
+    """
 
     stamp_ns: int
     q: Float64
@@ -92,6 +96,7 @@ class Moment:
     guide: Guide | None
     last_velocity: Float64
     distance_rate: float | Float64
+    by_surface: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,10 +141,10 @@ class QpIkController:
         self._costs: tuple[CostTerm, ...] = (*standard_costs(config, home), *costs)
         self._reach = ReachGoal.of(config)
 
-    def with_field(self, field: DistanceField) -> "QpIkController":
-        """The same controller on another field (a newer scene)."""
+    def with_field(self, field: DistanceField, balls: BallDistance | None = None) -> "QpIkController":
+        """The same controller on another field (a newer scene); see `SceneRows.in_field`."""
         other = object.__new__(QpIkController)
-        other.__dict__.update(self.__dict__, _builder=self._builder.with_field(field))
+        other.__dict__.update(self.__dict__, _builder=self._builder.with_field(field, balls))
         return other
 
     def step(
@@ -150,29 +155,43 @@ class QpIkController:
         distance_rate: float | Float64 = 0.0,
         guide: Guide | None = None,
         last_velocity: Float64 | None = None,
+        by_surface: Collection[str] = (),
     ) -> ControlStep:
         """The joint velocity at q (J,) [rad] towards a goal pose (4, 4) of the controlled frame.
 
         distance_rate is dd/dt [m/s] of the moving spheres' distances, (M,) or one number, for a field that changes
         with time; guide says how the goal moves, None that it stands still; last_velocity (J,) [rad/s] is the one
-        held until now, from which accelerations and smoothness count (None: they do not). Raises InputError for a q
-        that is not finite, NotEvaluableError where the field has no distance.
+        held until now, from which accelerations and smoothness count (None: they do not); by_surface names spheres
+        that count by their link's surface. Before the row of another gives way, that one does, too, if its surface is
+        farther away. Raises InputError for a q that is not finite, NotEvaluableError where the field has no distance.
         """
         config = self._config
         rest = self._limits.rest(last_velocity)
-        view = self._viewed(q, T_world_goal, distance_rate, guide, last_velocity)
+        view = self._viewed(q, T_world_goal, distance_rate, guide, last_velocity, by_surface)
         error, state, rows = view.error, view.state, view.rows
         costs = [term.rows(state) for term in self._costs]
         if config.program == PRINTED:
             printed = solve_printed(self._solver, state, summed(costs), rows.for_qp, config)
             return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
-        rows, choice, is_kept = self._descended(state, [*costs, self._reach.rows(state)], rows)
-        scale = 1.0 if is_kept else self._kept_scale(q, choice, rows, rest)
-        return self._reported(error, rows, choice, rest, scale)
+        costs.append(self._reach.rows(state))
+        rows, choice, is_kept = self._descended(state, costs, rows)
+        while np.any(newly := self._sticking_out(state, rows, choice)):
+            state = replace(state, by_surface=state.by_surface | newly)
+            rows, choice, is_kept = self._descended(state, costs, self._builder.at(state))
+        scale = 1.0 if is_kept else self._kept_scale(state, choice, rows, rest)
+        by_surface = self._named(state.by_surface)
+        return replace(self._reported(error, rows, choice, rest, scale), by_surface=by_surface)
 
     def view(self, moment: Moment) -> View:
         """What a step at a moment would go by. Raises as `step`."""
-        return self._viewed(moment.q, moment.T_world_goal, moment.distance_rate, moment.guide, moment.last_velocity)
+        return self._viewed(
+            moment.q,
+            moment.T_world_goal,
+            moment.distance_rate,
+            moment.guide,
+            moment.last_velocity,
+            moment.by_surface,
+        )
 
     def _viewed(
         self,
@@ -181,6 +200,7 @@ class QpIkController:
         distance_rate: float | Float64,
         guide: Guide | None,
         last_velocity: Float64 | None,
+        by_surface: Collection[str],
     ) -> View:
         q = checked_posture(self._model, q)
         error = pose_error(self._model.frame_pose(q, self._frame), T_world_goal)
@@ -193,6 +213,7 @@ class QpIkController:
             guide=guide,
             last_velocity=last_velocity,
             distance_rate=distance_rate,
+            by_surface=np.array([name in by_surface for name in self._builder.scene.names]),
         )
         return View(error=error, state=state, rows=self._builder.at(state))
 
@@ -258,7 +279,7 @@ class QpIkController:
             choice = descend(self._solver, costs, state.box, rows.for_qp, self._config)
             if choice.rung is Rung.HOLD:
                 break
-            later = self._builder.distances(state.q + self._config.period * choice.velocity)
+            later = self._builder.distances(state.q + self._config.period * choice.velocity, state.by_surface)
             broken = self._broken(choice, rows, later)
             if not np.any(broken):
                 return rows, choice, True
@@ -267,6 +288,13 @@ class QpIkController:
                 break
             rows = self._builder.cut(rows, state, choice.velocity, np.flatnonzero(can_be_cut))
         return rows, choice, False
+
+    def _sticking_out(self, state: State, rows: Rows, choice: Choice) -> Bool:
+        """The spheres (M,) whose rows gave way, though the surfaces of their links are farther away."""
+        distance, scene = rows.external.distance, self._builder.scene
+        has_given_way = rows.spread(choice.slack)[: len(distance)] > self._config.slack_tolerance
+        raised = scene.by_surfaces(state.q, distance, has_given_way & ~state.by_surface)
+        return np.asarray(raised > distance)
 
     def _broken(self, choice: Choice, rows: Rows, later: Float64) -> Bool:
         """The rows (M,) whose distance after a period, `later` (M,), is worse than they promise.
@@ -287,14 +315,15 @@ class QpIkController:
                 return np.zeros_like(broken)
         return np.asarray(broken)
 
-    def _kept_scale(self, q: Float64, choice: Choice, rows: Rows, rest: Float64) -> float:
+    def _kept_scale(self, state: State, choice: Choice, rows: Rows, rest: Float64) -> float:
         """The largest of STEP_SCALES whose next distances are no worse than the rows promised, else 0: how much of a
         velocity that breaks a promise there is, the remainder being `rest` (J,).
         """
         if choice.rung is Rung.HOLD:
             return 0.0
         for scale in STEP_SCALES:
-            later = self._builder.distances(q + self._config.period * _blend(choice.velocity, rest, scale))
+            q = state.q + self._config.period * _blend(choice.velocity, rest, scale)
+            later = self._builder.distances(q, state.by_surface)
             if not np.any(self._broken(choice, rows, later)):
                 return scale
         return 0.0
@@ -366,6 +395,7 @@ class Ours:
             distance_rate=moment.distance_rate,
             guide=moment.guide,
             last_velocity=moment.last_velocity,
+            by_surface=moment.by_surface,
         )
 
 

@@ -17,18 +17,20 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.goals import Guide
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Bool, Float64
 
 Cost = tuple[Float64, Float64]
 """H (J, J) and c (J,) of a cost ``1/2 v' H v + c' v`` over joint velocities v (J,)."""
+
+NO_SPHERE: Bool = np.zeros(1, dtype=np.bool_)  # of the moving ones
 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
     """What a term sees of a step: the configuration q (J,) [rad], the box of velocities (J,), (J,) [rad/s] that the
     limits allow, the velocity (6,) [m/s, rad/s] that `frame` should reach, how its goal moves (None: it stands
-    still), the last velocity (J,) [rad/s] (None: not known), and dd/dt [m/s] of the moving spheres' distances, (M,)
-    or one number.
+    still), the last velocity (J,) [rad/s] (None: not known), dd/dt [m/s] of the moving spheres' distances, (M,) or
+    one number, and which (M,) of them count by their link's surface.
     """
 
     model: ArmModel
@@ -39,6 +41,7 @@ class State:
     guide: Guide | None = None
     last_velocity: Float64 | None = None
     distance_rate: float | Float64 = 0.0
+    by_surface: Bool = field(default_factory=lambda: NO_SPHERE)
 
     @cached_property
     def jacobian(self) -> Float64:

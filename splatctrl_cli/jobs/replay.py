@@ -96,7 +96,8 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         with stopwatch.stage("worst_frames"):
             unseen = draw_worst_frames(folder, found, sights)
         write_json(folder / "states.json", logged.as_dict())
-        of_robot = words_of(robot, config.control)
+        by_surface = () if found.closed_loop is None else found.closed_loop.by_surface
+        of_robot = words_of(robot, config.control, by_surface)
         write_replay(
             folder, found, metrics, verdict, of_robot, config=config, inputs=inputs.digests, stopwatch=stopwatch
         )

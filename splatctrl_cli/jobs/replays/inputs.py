@@ -133,12 +133,17 @@ def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfi
     ]
 
 
-def words_of(robot: MeasuredRobot, config: ControlConfig) -> dict[str, str]:
-    """What the robot's spheres stand for, by subject, a sentence each."""
+def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[str] = ()) -> dict[str, str]:
+    """What the robot's spheres stand for, by subject, a sentence each. by_surface: as of `ReplayTrace`."""
     words = {"coverage": coverage_words(robot.model, config)}
     kept = [pair for pair in robot.kept if pair.margin is not None]
     if kept:
         words["self_margins"] = _self_margin_words(robot, kept, config)
+    if by_surface:
+        links = ", ".join(dict.fromkeys(name.partition("[")[0] for name in by_surface))
+        words["by_surface"] = (
+            f"spheres that keep less than the margin, as their links' surfaces keep it: {len(by_surface)} of {links}"
+        )
     if robot.surfaces is not None and robot.surfaces.fused:
         pairs = ", ".join(" and ".join(pair) for pair in robot.surfaces.fused)
         words["fused"] = (

@@ -38,6 +38,7 @@ class KnownFields:
 
     obstacles: points (Q, 3) [m], world -> what is nearest to each. human: its people alone, None without any.
     splats_alone: the exact distance without voxels that no splat represents, None where there are no such voxels.
+    balls: those of the barrier, None for a grid and where people count nearer than they are.
     """
 
     barrier: DistanceField
@@ -46,6 +47,7 @@ class KnownFields:
     obstacles: Callable[[Float64], tuple[Obstacle, ...]]
     human: DistanceField | None = None
     splats_alone: DistanceFunction | None = None
+    balls: BallDistance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,16 +244,18 @@ def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: 
     human = SphereField(chosen.centers[people], chosen.radii[people], threads=threads) if people.any() else None
     barrier = guarded(field_over(spheres, config.field, threads=threads), human, config.control)
     exact = SphereField.over(spheres, threads=threads)
+    balls = BallDistance(of_points=_distance(exact), centers=chosen.centers, radii=chosen.radii)
     return KnownFields(
         barrier=barrier,
         distances={
-            "exact": BallDistance(of_points=_distance(exact), centers=chosen.centers, radii=chosen.radii),
+            "exact": balls,
             "barrier": _distance(barrier),
         },
         median_radius=float(np.median(chosen.radii)),
         obstacles=lambda points: _nearest_spheres(obstacles, exact.nearest(points), points),
         human=human,
         splats_alone=_splats_alone(obstacles, threads),
+        balls=balls if human is None or config.control.human_margin <= config.control.margin else None,
     )
 
 

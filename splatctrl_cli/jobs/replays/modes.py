@@ -150,6 +150,7 @@ def _trace(
         record=record,
         commander=commander,
         distance_to=scene.at(task.stamp_ns).distances["exact"],
+        balls_at=lambda stamp: scene.at(stamp).balls,
     )
 
 

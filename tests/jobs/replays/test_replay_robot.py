@@ -1,12 +1,14 @@
 """What a replay says of the robot it was given, and that the size of its blocks of states changes nothing."""
 
 import json
+import re
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.events import EventFold, EventKind, Signal, events_of
@@ -23,7 +25,7 @@ from splatctrl_cli.robot.coverage import coverage_deficit, refined
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import spheres_yaml
-from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, scene_of, splats_of, write_scene
+from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, scene_of, splats_of, write_field, write_scene
 from tests.control.fakes import Balls
 from tests.robot.shapes import arm_of, l_shape, written
 
@@ -122,6 +124,28 @@ def test_with_the_deficit_in_the_rows_the_surface_keeps_the_margin(arm: RobotMod
         kept[coverage] = surface_clearance(model, trace.position[:: len(trace.position) // 4], ball)
     assert kept["margin"] >= 0.02 - 1e-3
     assert kept["report"] < 0.02 - 3e-3
+
+
+def test_spheres_that_stick_out_of_a_drawn_link_into_the_margin_are_named(desk: Desk, arm: RobotModel) -> None:
+    drawn, place = desk.folder / "drawn.urdf", arm.frame_pose(START, "hand")
+    trimesh.creation.icosphere(radius=0.01).export(desk.folder / "palm.stl")
+    before, name, after = Path(desk.robot[1]).read_text().partition('<link name="hand">')
+    own, end, rest = after.partition("</link>")
+    own = re.sub("<visual>.*?</visual>", "", own, flags=re.DOTALL)
+    palm = '<visual><geometry><mesh filename="palm.stl"/></geometry></visual>'
+    text = before + name + palm + own + end + rest
+    drawn.write_text(re.sub('velocity="[0-9.]*"', 'velocity="0.001"', text))  # too slow to retreat
+    desk.robot[1] = str(drawn)
+    mine = np.array([link == "hand" for link in arm.sphere_set.links])
+    tips = arm.sphere_set.centers[mine, 2] + arm.sphere_set.radii[mine]
+    ball = (tuple((place @ [*arm.sphere_set.centers[mine][tips.argmax()][:2], tips.max() + 0.06, 1.0])[:3]), 0.05)
+    assert desk.replay(*scene_of(desk, ball), "--mode", "closed-loop", "-q") == 0  # type: ignore[arg-type]
+    told = json.loads((desk.folder / "out" / "summary.json").read_text())["about"]["by_surface"]
+    assert re.fullmatch(r"spheres that keep less than the margin, .* surfaces keep it: [1-9] of hand", told)
+    assert desk.metrics()["num_relaxed"] == 0
+    field = write_field(desk.folder / "field", ball)  # type: ignore[arg-type]
+    assert desk.replay("--field", str(field), "--mode", "closed-loop", "-q", out="grid") == 0
+    assert "by_surface" not in json.loads((desk.folder / "grid" / "summary.json").read_text())["about"]
 
 
 def test_pairs_that_an_srdf_disables_have_no_row(desk: Desk, arm: RobotModel) -> None:

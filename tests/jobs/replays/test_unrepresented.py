@@ -50,6 +50,9 @@ def test_a_persons_voxels_count_as_people() -> None:
     assert fields.human is not None
     assert fields.human.query(POINTS)[0][0] == pytest.approx(0.3 - RADIUS, abs=1e-6)
     assert fields.barrier.query(POINTS)[0][0] == pytest.approx(0.3 - RADIUS - 0.1, abs=1e-3)
+    assert fields.balls is None  # the spheres keep the margin of people
+    plain = splat_fields(splats_of(((0.0, 0.0, 0.0), 0.05)), Config(), 1, balls)
+    assert plain.balls is plain.distances["exact"]
 
 
 @pytest.mark.parametrize("at", [None, "0"])
