@@ -6,7 +6,6 @@ Projective signed distances (Curless and Levoy, A volumetric method for building
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,18 +16,25 @@ from splatctrl_cli.config.fixed import MASK_SIGMAS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import back_project, invert_transform, project, strided_lens, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, Intrinsics, RgbdFrame
+from splatctrl_cli.robot.self_intervals import (
+    LEAST_CELLS,
+    NUM_CONFIGURATIONS,
+    TRUNCATION,
+    VOXEL,
+    Fused,
+    choose_intervals,
+    find_intervals,
+    spread_cells,
+)
 from splatctrl_cli.robot.self_model import LearnedLink, SelfModel, surface_digest
 from splatctrl_cli.robot.surface import RobotSurface
 
-VOXEL = 0.004  # [m]
-TRUNCATION = 3 * VOXEL  # [m] before and behind a measured surface
 REACH = 0.06  # [m] outside of a link's visual surface, in which its parts are looked for
+MOST_REACH = 0.24  # [m], to which it grows with parts that go as far
 STEP = 0.03  # [m] by which some corner of a link's box moves between clearly different configurations
 SAME = 0.01  # [m] within which cameras of one moment see a link in one configuration
-NUM_CONFIGURATIONS = 5  # that a cell has to be a surface in
-FREE_SHARE = 0.3  # of the configurations that see a cell; where more see through it, it is no robot
+PATH_SHARE = 0.5  # of how far a link went between two moments, that parts them where it came back
 TURN = 0.97  # mean length of a surface's normals in world, below which they turn by 15 degrees or more
-LEAST_CELLS = 24  # of a part, 1.5 cm^3
 MOST_LOST = 0.5  # of a piece, which more cells that belong elsewhere make no part
 MOST_SETS = 40  # frame sets
 WIDE = 320  # pixels of an image across, to which it is thinned
@@ -40,13 +46,16 @@ BLOCK = 3  # cells along an edge
 
 def choose_moments(surface: RobotSurface, T_world_link: Float64, most: int = MOST_SETS) -> list[int]:
     """Numbers of at most `most` of M moments, in order, between which the links moved farthest (farthest-point
-    sampling). T_world_link: (M, L, 4, 4).
+    sampling), by where they are and the way in between. T_world_link: (M, L, 4, 4).
     """
     corners = _boxes(surface)[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
     placed = _moved(T_world_link, corners).reshape(len(T_world_link), -1, 3)
+    steps = np.linalg.norm(np.diff(placed, axis=0), axis=2).max(axis=1)
+    path = PATH_SHARE * np.append(0.0, np.cumsum(steps))
     chosen, gap = [0], np.full(len(placed), np.inf)
     while len(chosen) < most:
-        gap = np.minimum(gap, np.linalg.norm(placed - placed[chosen[-1]], axis=2).max(axis=1))
+        apart = np.linalg.norm(placed - placed[chosen[-1]], axis=2).max(axis=1)
+        gap = np.minimum(gap, apart + np.abs(path - path[chosen[-1]]))
         if gap.max() < STEP:
             break
         chosen.append(int(gap.argmax()))
@@ -64,26 +73,34 @@ def learn(
 ) -> SelfModel:
     """The self-model that V frames of a robot show, with the links of its surface at T_world_link (V, L, 4, 4).
 
-    links: all of the robot's. reach [m]: how far outside a link's visual surface its parts are looked for. A cell of
-    a link's grid is robot where it is a surface in `NUM_CONFIGURATIONS` of the link, no more than `FREE_SHARE` of
-    those that see it see through it, no plane that stays in the world explains it, and it moves against each nearer
-    link. Raises InputError where no link can be learned.
+    links: all of the robot's. reach [m]: how far outside a link's visual surface its parts are looked for; it grows
+    to `MOST_REACH` with parts that go as far. A cell of a link's grid is robot in a run of the link's configurations
+    where it is a surface in `NUM_CONFIGURATIONS` of them, no more than `FREE_SHARE` of those that see it see through
+    it, no plane that stays in the world explains it, and it moves against each nearer link. Frames are in order of
+    time. Raises InputError where no link can be learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
     placed = _moved(T_world_link, corners)
-    views = _views(surface, frames, T_world_link, np.stack([placed.min(axis=2), placed.max(axis=2)], axis=2), reach)
-    learned, unknown = [], {}
+    views = _views(
+        surface,
+        frames,
+        T_world_link,
+        np.stack([placed.min(axis=2), placed.max(axis=2)], axis=2),
+        max(reach, MOST_REACH),
+    )
+    learned: list[LearnedLink] = []
+    unknown = {}
     for number, link in enumerate(surface.links):
         configurations = _configurations(placed[:, number])
         num = int(configurations.max(initial=-1)) + 1
         used = [(view, int(k)) for view, k in zip(views, configurations, strict=True) if k >= 0]
         if num < NUM_CONFIGURATIONS:
             unknown[link] = f"moves too little ({num} of {NUM_CONFIGURATIONS} configurations)"
-        elif (found := _learn_link(surface, number, boxes[number], used, reach)) is None:
-            unknown[link] = f"no camera sees it in {NUM_CONFIGURATIONS} configurations"
+        elif found := _grow_link(surface, number, boxes[number], used, reach):
+            learned += found
         else:
-            learned.append(found)
+            unknown[link] = f"no camera sees it in {NUM_CONFIGURATIONS} configurations"
     if not learned:
         reasons = {why: ", ".join(link for link in unknown if unknown[link] == why) for why in unknown.values()}
         raise InputError(
@@ -142,11 +159,21 @@ def _views(
     return views
 
 
+def _grow_link(
+    surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
+) -> list[LearnedLink]:
+    """`_learn_link`, with twice the reach as long as its parts go as far as the reach."""
+    found = _learn_link(surface, number, box, used, reach)
+    if 2 * reach <= MOST_REACH and any(part.outside_most > reach - VOXEL for part in found):
+        return _grow_link(surface, number, box, used, 2 * reach)
+    return found
+
+
 def _learn_link(
     surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
-) -> LearnedLink | None:
-    """A link with its box (2, 3) by the views that see it, each with its configuration; None where it is seen in too
-    few.
+) -> list[LearnedLink]:
+    """A link with its box (2, 3) by the views that see it, each with its configuration, once for each interval in
+    which it has parts; empty where it is seen in too few.
     """
     points = [transform_points(invert_transform(v.T_world_link[number]), v.points_world) for v, _ in used]
     points = [part[_is_in(box, part, reach)] for part in points]
@@ -157,52 +184,55 @@ def _learn_link(
     is_near = (gap <= reach) & (gap > -TRUNCATION)
     mask[mask], cells, gap = is_near, cells[is_near], gap[is_near]
     in_order = [used[int(np.argmax(at == k))][0] for k in range(at.max() + 1)]
-    measured, seen, free = _fuse(cells, number, used, len(in_order))
-    counts, num_free = np.sum(seen & ~free, axis=0), np.sum(free, axis=0)
-    is_robot = np.isfinite(measured) & (counts >= NUM_CONFIGURATIONS) & (num_free <= FREE_SHARE * (counts + num_free))
-    solid = np.where(is_robot, np.maximum(measured, VOXEL - gap), TRUNCATION)
-    is_solid = solid < 0
-    poses = np.array([view.T_world_link for view in in_order])
-    normals = _normals(_spread(mask, measured, np.nan))[mask][is_solid]
-    its = (cells[is_solid], seen[:, is_solid])
-    is_else = np.zeros(len(cells), bool)
-    is_else[is_solid] = _stays_in_world(*its, normals, poses[:, number])
-    is_else[is_solid] |= _is_on_other_link(surface, number, *its, gap[is_solid], poses)
-    distance = _without_others(_spread(mask, solid, TRUNCATION), _spread(mask, is_else, 0) > 0)
-    is_part = (distance < 0)[mask]
+    fused = _fuse(cells, number, used, len(in_order))
     num_own = np.array([np.count_nonzero(view.links == number) for view, _ in used])
-    if not is_part.any() and len(np.unique(at[num_own >= LEAST_CELLS])) < NUM_CONFIGURATIONS:
-        return None
-    place, since, heights = np.full(3, np.nan), np.nan, np.append(gap[is_part], [] if is_part.any() else [0.0])
-    if is_part.any():
-        place = cells[is_part][heights.argmax()]
-        first = np.argmax(np.cumsum(seen[:, is_part], axis=0) >= NUM_CONFIGURATIONS, axis=0)
-        stamps = np.array([view.stamp_ns for view in in_order])
-        since = 1e-9 * float(np.median(stamps[first]) - stamps.min())
-    return LearnedLink(
-        link=surface.links[number],
-        origin=origin,
-        voxel=VOXEL,
-        distance=np.where(_spread(mask, counts + num_free, 0) > 0, distance, np.float32(np.nan)),
-        configurations=_spread(mask, counts, 0).astype(np.uint8),
-        triangles=_triangles(distance, origin),
-        outside_95=float(np.quantile(heights, 0.95)),
-        outside_most=float(heights.max()),
-        place=place,
-        since=since,
-        num_pixels=int(num_own.sum()) + sum(map(len, points)),
-        num_configurations=len(in_order),
-    )
+    stamps, poses = np.array([v.stamp_ns for v in in_order]), np.array([view.T_world_link for view in in_order])
+    intervals = find_intervals(fused, mask, gap, stamps)
+    owner = choose_intervals(fused, mask, gap, intervals)
+    found = []
+    for index, interval in enumerate(intervals):
+        run = slice(interval.first, interval.last + 1)
+        distance, seen, free = fused.within(run)
+        solid = np.where(owner == index, np.maximum(distance, VOXEL - gap), TRUNCATION)
+        is_solid = solid < 0
+        normals = _normals(spread_cells(mask, distance, np.nan))[mask][is_solid]
+        its = (cells[is_solid], seen[:, is_solid])
+        is_else = np.zeros(len(cells), bool)
+        is_else[is_solid] = _stays_in_world(*its, normals, poses[run, number])
+        is_else[is_solid] |= _is_on_other_link(surface, number, *its, gap[is_solid], poses[run], reach)
+        grid = _without_others(spread_cells(mask, solid, TRUNCATION), spread_cells(mask, is_else, 0) > 0)
+        is_part = (grid < 0)[mask]
+        if not is_part.any() and (index or len(np.unique(at[num_own >= LEAST_CELLS])) < NUM_CONFIGURATIONS):
+            continue
+        place, since, heights = np.full(3, np.nan), np.nan, np.append(gap[is_part], [] if is_part.any() else [0.0])
+        if is_part.any():
+            place = cells[is_part][heights.argmax()]
+            known = np.argmax(np.cumsum(seen[:, is_part], axis=0) >= NUM_CONFIGURATIONS, axis=0)
+            since = 1e-9 * float(np.median(stamps[run][known]) - stamps.min())
+        part = LearnedLink(
+            link=surface.links[number],
+            origin=origin,
+            voxel=VOXEL,
+            distance=np.where(spread_cells(mask, (seen | free).sum(axis=0), 0) > 0, grid, np.float32(np.nan)),
+            configurations=spread_cells(mask, seen.sum(axis=0), 0).astype(np.uint8),
+            triangles=_triangles(grid, origin),
+            outside_95=float(np.quantile(heights, 0.95)),
+            outside_most=float(heights.max()),
+            place=place,
+            since=since,
+            num_pixels=int(num_own.sum()) + sum(map(len, points)),
+            num_configurations=len(in_order),
+            start_ns=interval.start_ns,
+            end_ns=interval.end_ns,
+        )
+        found.append(part)
+    return found
 
 
-def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: int) -> tuple[Float64, Bool, Bool]:
-    """Where depth puts the surface beside each of cells (N, 3) [m] in a link's frame.
-
-    Returned are their mean distance (N,) [m] before it, positive outside; whether each configuration (K, N) sees a
-    surface there; and whether it sees through the cell.
-    """
-    total, weight = np.zeros(len(cells)), np.full(len(cells), 1e-9)
-    seen, free = np.zeros((num, len(cells)), bool), np.zeros((num, len(cells)), bool)
+def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: int) -> Fused:
+    """Where depth puts the surface beside each of cells (N, 3) [m] in a link's frame, in each configuration."""
+    total, weight = (np.zeros((num, len(cells)), np.float32) for _ in range(2))
+    seen, free = (np.zeros((num, len(cells)), bool) for _ in range(2))
     for view, k in used:
         points = transform_points(view.T_camera_world @ view.T_world_link[number], cells)
         ahead = np.flatnonzero(points[:, 2] > TRUNCATION)
@@ -214,11 +244,11 @@ def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: i
         is_seen = (np.abs(before) <= TRUNCATION) & ((link == UNEXPLAINED) | (link == number))
         is_known = (is_free | is_seen) & (view.depth[v, u] > 0)
         share = np.clip((before + TRUNCATION) / (TRUNCATION - VOXEL), 0.0, 1.0) * is_known
-        total[ahead] += share * np.minimum(before, TRUNCATION)
-        weight[ahead] += share
+        total[k, ahead] += share * np.minimum(before, TRUNCATION)
+        weight[k, ahead] += share
         seen[k, ahead] |= is_seen & is_known
         free[k, ahead] |= is_free & is_known
-    return np.where(weight > 0.5, total / weight, np.nan), seen, free
+    return Fused(total=total, weight=weight, seen=seen, free=free)
 
 
 def _stays_in_world(cells: Float64, seen: Bool, normals: Float64, poses: Float64) -> Bool:
@@ -233,7 +263,7 @@ def _stays_in_world(cells: Float64, seen: Bool, normals: Float64, poses: Float64
 
 
 def _is_on_other_link(
-    surface: RobotSurface, number: int, cells: Float64, seen: Bool, gap: Float64, poses: Float64
+    surface: RobotSurface, number: int, cells: Float64, seen: Bool, gap: Float64, poses: Float64, reach: float
 ) -> Bool:
     """Cells (N,) that lie nearer to a link against which they do not move by `STEP`; T_world_link (K, L, 4, 4)."""
     found = np.zeros(len(cells), bool)
@@ -243,7 +273,7 @@ def _is_on_other_link(
         if other != number and len(cells):
             is_still = _span(places, seen) < STEP
             at = places[seen.argmax(axis=0), np.arange(len(cells))]
-            found |= is_still & (_own_distance(surface, other, at, REACH) < gap)
+            found |= is_still & (_own_distance(surface, other, at, reach) < gap)
     return found
 
 
@@ -275,13 +305,6 @@ def _candidates(points: Float64, configurations: Index) -> tuple[Float64, Bool]:
     mask[tuple((blocks - first).T)] = True
     mask = ndimage.binary_dilation(mask, np.ones((3, 3, 3), bool))
     return edge * first + VOXEL / 2, mask.repeat(BLOCK, 0).repeat(BLOCK, 1).repeat(BLOCK, 2)
-
-
-def _spread(mask: Bool, values: NDArray[Any], rest: float) -> Float32:
-    """Values (N,) of the cells of a mask (X, Y, Z), in a grid (X, Y, Z) with the rest."""
-    grid = np.full(mask.shape, np.float32(rest))
-    grid[mask] = values
-    return grid
 
 
 def _normals(distance: Float32) -> Float64:
@@ -336,14 +359,15 @@ def _is_in(box: Float64, points: Float64, reach: float) -> Bool:
 
 
 def _configurations(placed: Float64) -> Index:
-    """Which of a link's clearly different configurations each view has (V,), -1: none; corners (V, 8, 3) [m]."""
-    keys: list[Float64] = []
+    """Which of a link's configurations each view has (V,), -1: none; corners (V, 8, 3) [m], in order of time. Each is
+    clearly different from the one before.
+    """
+    newest, num = np.full((8, 3), np.inf), 0
     found = np.full(len(placed), -1)
     for number, corners in enumerate(placed):
-        gaps = np.array([np.linalg.norm(corners - key, axis=1).max() for key in keys])
-        if len(keys) < 255 and gaps.min(initial=np.inf) >= STEP:
-            keys.append(corners)
-            found[number] = len(keys) - 1
-        elif keys and gaps.min() <= SAME:
-            found[number] = int(gaps.argmin())
+        gap = np.linalg.norm(corners - newest, axis=1).max()
+        if num < 255 and gap >= STEP:
+            newest, num = corners, num + 1
+        if gap >= STEP or gap <= SAME:
+            found[number] = num - 1
     return found

@@ -14,16 +14,20 @@ from splatctrl_cli.records import Float32, Float64
 from splatctrl_cli.robot.coverage import areas
 from splatctrl_cli.robot.surface import RobotSurface
 
+ALWAYS = (int(np.iinfo(np.int64).min), int(np.iinfo(np.int64).max))  # [ns]
+BOUNDS = ("start_ns", "end_ns")  # that files of earlier versions lack
+
 
 @dataclass(frozen=True, kw_only=True)
 class LearnedLink:
-    """A link that was seen in clearly different configurations.
+    """A link that was seen in clearly different configurations, or what it has for a time alone: a grasped object.
 
-    origin (3,) [m], link frame: of the first cell's centre; voxel [m]; distance (X, Y, Z) float32 [m], NaN where
-    nothing is known; configurations (X, Y, Z) uint8 in which a cell was a surface; triangles (F, 3, 3) [m], link
-    frame: closed surfaces of the parts that the visual surface lacks. Of these parts: outside_95, outside_most [m],
-    how far their cells lie outside the visual surface; place (3,) [m], link frame, where most; since [s] from the
-    first frame, when they could be known. Without parts 0 and NaN.
+    The robot has its parts from start_ns to end_ns [ns], `ALWAYS` where neither is known. origin (3,) [m], link
+    frame: of the first cell's centre; voxel [m]; distance (X, Y, Z) float32 [m], NaN where nothing is known;
+    configurations (X, Y, Z) uint8 in which a cell was a surface; triangles (F, 3, 3) [m], link frame: closed surfaces
+    of the parts that the visual surface lacks. Of these parts: outside_95, outside_most [m], how far their cells lie
+    outside the visual surface; place (3,) [m], link frame, where most; since [s] from the first frame, when they
+    could be known. Without parts 0 and NaN.
     """
 
     link: str
@@ -38,6 +42,13 @@ class LearnedLink:
     since: float
     num_pixels: int
     num_configurations: int
+    start_ns: int = ALWAYS[0]
+    end_ns: int = ALWAYS[1]
+
+    @property
+    def is_always(self) -> bool:
+        """Whether the robot has its parts at all times."""
+        return (self.start_ns, self.end_ns) == ALWAYS
 
     @property
     def area(self) -> float:
@@ -55,24 +66,46 @@ class SelfModel:
     unknown: Mapping[str, str]
 
     def pieces(self) -> list[tuple[str, Float64]]:
-        """Links and the triangles (F, 3, 3) [m], in their frame, that belong to the robot's surface as well."""
-        return [(part.link, part.triangles) for part in self.learned if len(part.triangles)]
+        """Links and the triangles (F, 3, 3) [m], in their frame, that belong to the robot's surface at all times."""
+        return [(part.link, part.triangles) for part in self.learned if part.is_always and len(part.triangles)]
+
+    @property
+    def held(self) -> list[LearnedLink]:
+        """Parts that the robot has for a time alone."""
+        return [part for part in self.learned if not part.is_always and len(part.triangles)]
+
+    def held_at(self, stamp_ns: int) -> list[tuple[str, Float64]]:
+        """Those that the robot has at a stamp [ns], and not always."""
+        return [(part.link, part.triangles) for part in self.held if part.start_ns <= stamp_ns < part.end_ns]
+
+    def pieces_at(self, stamp_ns: int) -> list[tuple[str, Float64]]:
+        """`pieces` and `held_at` of a stamp [ns]."""
+        return self.pieces() + self.held_at(stamp_ns)
+
+    def changes(self) -> list[int]:
+        """Stamps [ns], in order, from each of which on `pieces_at` may differ."""
+        return sorted({stamp for part in self.held for stamp in (part.start_ns, part.end_ns)} - set(ALWAYS))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All of it by name, for a file."""
+        keys = [f"{part.link} {number}" for number, part in enumerate(self.learned)]
+        rows = zip(keys, self.learned, strict=True)
         return {
             "links": np.array(self.links),
             "digest": np.array(self.digest),
-            "learned": np.array([part.link for part in self.learned], dtype=np.str_),
+            "learned": np.array(keys, dtype=np.str_),
             "unknown": np.array(list(self.unknown.items()), dtype=np.str_).reshape(-1, 2),
-            **{f"{p.link}.{f.name}": np.array(getattr(p, f.name)) for p in self.learned for f in fields(p)},
+            **{f"{key}.{f.name}": np.array(getattr(part, f.name)) for key, part in rows for f in fields(part)},
         }
 
     @classmethod
     def from_arrays(cls, found: Mapping[str, Any]) -> Self:
         """The self-model that `arrays` wrote. Raises KeyError, TypeError or ValueError for other arrays."""
         names = [field.name for field in fields(LearnedLink)]
-        rows = [{name: found[f"{link}.{name}"] for name in names} for link in found["learned"]]
+        rows = [
+            {name: found[f"{key}.{name}"] for name in names if f"{key}.{name}" in found or name not in BOUNDS}
+            for key in found["learned"]
+        ]
         learned = [LearnedLink(**{k: v if v.ndim else v.item() for k, v in row.items()}) for row in rows]
         for part in learned:
             if part.triangles.shape[1:] != (3, 3) or not np.isfinite(part.triangles).all():

@@ -1,0 +1,151 @@
+"""The intervals of a recording in which cells of a link's grid are robot: all of it, or while the link holds a thing.
+
+K configurations of a link in order of time, N cells.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from splatctrl_cli.records import Bool, Float32, Float64, Index, Stamps
+from splatctrl_cli.robot.self_model import ALWAYS
+
+VOXEL = 0.004  # [m]
+TRUNCATION = 3 * VOXEL  # [m] before and behind a measured surface
+LEAST_CELLS = 24  # of a part, 1.5 cm^3
+NUM_CONFIGURATIONS = 5  # that a cell has to be a surface in
+FREE_SHARE = 0.3  # of the configurations that see a cell; where more see through it, it is no robot
+FREE_WEIGHT = (1 - FREE_SHARE) / FREE_SHARE  # votes of a configuration that sees through a cell
+AROUND = 7  # cells across, whose votes choose an interval
+GONE = 0.5  # share of a part's cells that a configuration before or after it sees through, more than see a surface
+MOST_INTERVALS = 6  # of a link
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fused:
+    """Depth beside cells (N,) of a link's grid in each of its configurations (K, N), in order of time.
+
+    total, weight float32: sum [m] and weight of the distances before the measured surface, positive outside; seen:
+    whether one sees a surface there; free: whether it sees through the cell.
+    """
+
+    total: Float32
+    weight: Float32
+    seen: Bool
+    free: Bool
+
+    def within(self, run: slice) -> tuple[Float64, Bool, Bool]:
+        """Mean distance (N,) [m], NaN where none; where a surface is seen and none through it, and where free (R, N),
+        by a run of R configurations.
+        """
+        total, weight = self.total[run].sum(axis=0), self.weight[run].sum(axis=0)
+        mean = np.where(weight > 0.5, total / np.maximum(weight, 1e-9), np.nan).astype(np.float64)
+        return mean, self.seen[run] & ~self.free[run], self.free[run]
+
+    def is_robot(self, gap: Float64, run: slice) -> Bool:
+        """Cells (N,) inside of a surface that a run shows, beside the link's own, which is `gap` (N,) [m] away."""
+        mean, seen, free = self.within(run)
+        num, num_free = seen.sum(axis=0), free.sum(axis=0)
+        is_robot = (num >= NUM_CONFIGURATIONS) & (num_free <= FREE_SHARE * (num + num_free))
+        return np.asarray(is_robot & (np.maximum(np.nan_to_num(mean, nan=TRUNCATION), VOXEL - gap) < 0))
+
+    def votes(self, run: slice) -> Float32:
+        """(N,): in how many configurations of a run a cell is a surface, less `FREE_WEIGHT` for each that is free."""
+        num, num_free = (self.seen[run] & ~self.free[run]).sum(axis=0), self.free[run].sum(axis=0)
+        return np.asarray(num - FREE_WEIGHT * num_free, np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interval:
+    """Configurations from `first` to `last` in which a link has something, and its bounds [ns]."""
+
+    first: int
+    last: int
+    start_ns: int = ALWAYS[0]
+    end_ns: int = ALWAYS[1]
+
+
+def _runs(fused: Fused) -> tuple[Index, Index]:
+    """First and last configuration (N,) of the run in which each cell has most `Fused.votes`, by one scan."""
+    num, N = fused.seen.shape
+    best, sums = np.zeros(N, np.float32), np.zeros(N, np.float32)
+    begun, first, last = (np.zeros(N, np.int64) for _ in range(3))
+    for k in range(num):
+        is_new = sums <= 0
+        begun[is_new], sums[is_new] = k, 0
+        sums += fused.votes(slice(k, k + 1))
+        is_best = sums > best
+        best[is_best], first[is_best], last[is_best] = sums[is_best], begun[is_best], k
+    return first, last
+
+
+def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> list[Interval]:
+    """All of a recording, and each interval that the runs of enough cells beside each other have in common.
+
+    A run begins after the last configuration before it that sees through the cell; without one nothing bounds it. It
+    ends likewise. Where a part begins or ends, some configuration sees through `GONE` of it: the edges of a thing
+    that stays are free in a few views, too. mask (X, Y, Z): of the cells; gap (N,) [m] from the link's own surface;
+    stamps (K,) [ns].
+    """
+    num, rows = len(stamps), np.arange(len(stamps))[:, None]
+    first, last = _runs(fused)
+    inside = (rows >= first) & (rows <= last)
+    before = np.where(fused.free & (rows < first), rows, -1).max(axis=0)
+    after = np.where(fused.free & (rows > last), rows, num).min(axis=0)
+    own = Fused(
+        total=fused.total * inside, weight=fused.weight * inside, seen=fused.seen & inside, free=fused.free & inside
+    )
+    left = own.is_robot(gap, slice(num)) & ((before >= 0) | (after < num))
+    first, last = np.where(before < 0, 0, first), np.where(after == num, num - 1, last)
+    found = [Interval(first=0, last=num - 1)]
+    while len(found) < MOST_INTERVALS and np.count_nonzero(left) >= LEAST_CELLS:
+        fits = np.zeros((num + 1, num + 1))
+        for start, sign in ((before + 1, 1), (first + 1, -1)):
+            np.add.at(fits, (start[left], last[left]), sign)
+            np.add.at(fits, (start[left], np.where(after < num, after, num)[left]), -sign)
+        start, end = np.unravel_index(np.argmax(fits.cumsum(axis=0).cumsum(axis=1)), fits.shape)
+        its = left & (before < start) & (start <= first) & (last <= end) & (end < after)
+        left &= ~its
+        if np.count_nonzero(its) < LEAST_CELLS:
+            break
+        pieces, _ = ndimage.label(spread_cells(mask, its, 0))
+        run = int(first[its].min()), int(last[its].max())
+        gone = (fused.free[:, its].astype(int) - fused.seen[:, its]).mean(axis=1)
+        sides = [gone[: run[0]]] * bool(start > 0) + [gone[run[1] + 1 :]] * bool(end < num - 1)
+        is_gone = min(side.max() for side in sides) >= GONE
+        if is_gone and np.bincount(pieces[pieces > 0]).max(initial=0) >= LEAST_CELLS:
+            found.append(_interval(int(before[its].max()), *run, int(after[its].min()), stamps))
+    return found
+
+
+def _interval(before: int, first: int, last: int, after: int, stamps: Stamps) -> Interval:
+    """The configurations from first to last, bounded in the middle to those before and after, where there are any."""
+    return Interval(
+        first=first,
+        last=last,
+        start_ns=ALWAYS[0] if before < 0 else int(stamps[before] + stamps[first]) // 2,
+        end_ns=ALWAYS[1] if after == len(stamps) else int(stamps[last] + stamps[after]) // 2,
+    )
+
+
+def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:
+    """The number (N,) of the interval in which each cell is robot, -1 for none: that with most votes of the robot's
+    cells around it.
+    """
+    runs = [slice(interval.first, interval.last + 1) for interval in intervals]
+    is_robot = np.array([fused.is_robot(gap, run) for run in runs])
+    votes = [np.where(is_robot.any(axis=0), fused.votes(run), 0) for run in runs]
+    around = [ndimage.uniform_filter(spread_cells(mask, each, 0), AROUND)[mask].round(3) for each in votes]
+    chosen = np.argmax(around, axis=0)
+    return np.where(is_robot[chosen, np.arange(len(chosen))], chosen, -1)
+
+
+def spread_cells(mask: Bool, values: NDArray[Any], rest: float) -> Float32:
+    """Values (N,) of the cells of a mask (X, Y, Z), in a grid (X, Y, Z) with the rest."""
+    grid = np.full(mask.shape, np.float32(rest))
+    grid[mask] = values
+    return grid
