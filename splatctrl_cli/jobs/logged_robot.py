@@ -12,10 +12,12 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.model_difference import model_difference
 from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
+from splatctrl_cli.scene_files.scene_folder import SELF_MODEL
 from splatctrl_cli.sources.calibrated import LOGGED
 from splatctrl_cli.sources.source import logged_descriptions
 from splatctrl_cli.states.state_source import StateSource
 
+NO_SELF_MODEL = Path("none")  # as --self-model: neither learned nor taken from the scene
 LARGEST_SELF_MODEL = 2**30  # bytes
 TAKE = "leave --urdf out to take the log's own, or correct the file"
 
@@ -43,12 +45,14 @@ def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILE
     return file
 
 
-def with_self_model(model: RobotModel, path: Path | None) -> RobotModel:
-    """The robot with the parts that a self-model (`robot learn`) adds to its surface; unchanged without a file.
+def with_self_model(model: RobotModel, given: Path | None, scene: Path | None = None) -> RobotModel:
+    """The robot with the parts that a self-model (`robot learn`) adds to its surface: the file given, else that of a
+    scene folder where it has one of this robot; unchanged without a file, or `NO_SELF_MODEL`.
 
-    Raises InputError for a file that cannot be read or belongs to another robot.
+    Raises InputError for a file that cannot be read, or one given that belongs to another robot.
     """
-    if path is None:
+    path = scene / SELF_MODEL if given is None and scene is not None else given
+    if path is None or path == NO_SELF_MODEL or (given is None and not path.is_file()):
         return model
     try:
         found = SelfModel.from_arrays(read_arrays(path, most=LARGEST_SELF_MODEL))
@@ -56,8 +60,13 @@ def with_self_model(model: RobotModel, path: Path | None) -> RobotModel:
         raise InputError(
             f"{path}: not a self-model: {error}", remedy="write it with: splatctrl robot learn"
         ) from None
-    found.check_robot(model.surface, model.urdf.links, path)
-    return model.with_pieces(found.pieces())
+    try:
+        found.check_robot(model.surface, model.urdf.links, path)
+    except InputError:
+        if given is None:  # that the scene is of another robot is what a replay says
+            return model
+        raise
+    return model.with_self_model(found)
 
 
 def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:

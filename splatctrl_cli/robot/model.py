@@ -3,6 +3,7 @@
 Only the kinematics of the URDF is built (Pinocchio), so meshes need not be there. S spheres, J joints, T postures.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.records import Bool, Box, Float64, Index, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
+from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.sphere_files import (
     RENAMED,
     are_links_renamed,
@@ -36,7 +38,8 @@ class RobotModel:
     links of the sphere file that the URDF does not have; bare_links: links with a body in the URDF and no sphere;
     coverage: how the spheres cover the collision surface, None where it was not measured, and then coverage_unknown
     says why; sphere_deficit (S,) [m]: how far outside the spheres a surface point of the sphere's rigid body may be,
-    NaN where that is not known; held: fingers that a log does not move, and where they are taken to be.
+    NaN where that is not known; held: fingers that a log does not move, and where they are taken to be; self_model:
+    what was learned of its surface, None where nothing was.
     """
 
     def __init__(
@@ -65,6 +68,8 @@ class RobotModel:
         self.coverage_unknown = "the collision geometry was not read"
         self.sphere_deficit: Float64 = np.full(len(spheres.radii), np.nan)
         self._surface: RobotSurface | None = None
+        self.self_model: SelfModel | None = None
+        self._surfaces: dict[int, RobotSurface] = {}  # by how many of `changes` were before
         self._packages = packages
         self.held = dict(held or {})
         self._chosen_pairs: Index | None = None
@@ -170,6 +175,28 @@ class RobotModel:
     def with_pieces(self, pieces: Sequence[tuple[str, Float64]]) -> "RobotModel":
         """The same robot, to whose surface triangles (F, 3, 3) [m] in the frames of links belong as well."""
         return self._changed(_surface=self.surface.joined(pieces))
+
+    def with_self_model(self, found: SelfModel) -> "RobotModel":
+        """The same robot with the parts that a self-model has always; `surface_at` has what it holds for a time."""
+        return self._changed(_surface=self.surface.joined(found.pieces()), self_model=found, _surfaces={})
+
+    @property
+    def changes(self) -> list[int]:
+        """Stamps [ns], in order, from each of which on the robot has another surface."""
+        return [] if self.self_model is None else self.self_model.changes()
+
+    def surface_at(self, stamp_ns: int) -> RobotSurface:
+        """`surface`, with what the robot holds at a stamp [ns]."""
+        if self.self_model is None or not self.changes:
+            return self.surface
+        number = bisect_right(self.changes, stamp_ns)
+        if number not in self._surfaces:
+            self._surfaces[number] = self.surface.joined(self.self_model.held_at(stamp_ns))
+        return self._surfaces[number]
+
+    def at(self, stamp_ns: int) -> "RobotModel":
+        """The robot with the surface of a stamp [ns] for all times."""
+        return self._changed(_surface=self.surface_at(stamp_ns), self_model=None) if self.changes else self
 
     def extents(self) -> dict[str, list[float]]:
         """Where `surface` has each link, in one posture: `RobotSurface.extents`."""

@@ -16,14 +16,16 @@ from splatctrl_cli.robot.surface import RobotSurface
 class RobotPosture:
     """Where the robot's spheres are: centers (S, 3) [m], world; radii (S,) [m]; T_world_link (S, 4, 4).
 
-    surface: the robot's collision geometry, None where its spheres are all that is known; T_world_surface: by frame
-    stamp [ns], the poses (L, 4, 4) of the surface's links. num_threads: that distances are computed on.
+    surface: the robot's collision geometry, None where its spheres are all that is known; surfaces: by frame stamp
+    [ns], where they differ; T_world_surface: likewise the poses (L, 4, 4) of the surface's links. num_threads: that
+    distances are computed on.
     """
 
     centers: Float64
     radii: Float64
     T_world_link: Float64
     surface: RobotSurface | None = None
+    surfaces: Mapping[int, RobotSurface] = field(default_factory=dict)
     T_world_surface: Mapping[int, Float64] = field(default_factory=dict)
     num_threads: int = 1
 
@@ -31,7 +33,7 @@ class RobotPosture:
         """The surface and the poses (L, 4, 4) of its links at a frame's stamp; of the spheres where there is none."""
         if self.surface is None:
             return RobotSurface.of_balls(self.centers, self.radii), np.eye(4)[None]
-        return self.surface, self.T_world_surface[stamp_ns]
+        return self.surfaces.get(stamp_ns, self.surface), self.T_world_surface[stamp_ns]
 
     def distance(self, points_world: NDArray[np.floating], without: Sequence[str] = ()) -> Float64:
         """Signed distance (N,) [m] of points (N, 3) to the robot's surface at the newest stamp, negative inside; not
@@ -59,12 +61,14 @@ def posture_of(
     carried: boxes in the frames of links, which count as the robot's own surface.
     """
     spheres, surface = robot.sphere_set, robot.surface.with_boxes(carried) if carried else robot.surface
+    surfaces = {stamp: robot.surface_at(stamp) for stamp in at_frames} if robot.changes else {}
     pose = {link: robot.frame_pose(q, link) for link in set(spheres.links)}
     return RobotPosture(
         centers=robot.sphere_centers(q),
         radii=spheres.radii,
         T_world_link=np.array([pose[link] for link in spheres.links]),
         surface=surface,
+        surfaces={stamp: its.with_boxes(carried) if carried else its for stamp, its in surfaces.items()},
         T_world_surface={
             stamp_ns: surface.poses({link: robot.frame_pose(there, link) for link in surface.links})
             for stamp_ns, there in at_frames.items()

@@ -32,6 +32,7 @@ from splatctrl_cli.splat_files.splats import check_world, read_shell, read_splat
 from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid, SeenVoxels
 
 FORMAT = "splatctrl-scene 1"
+SELF_MODEL = "self.npz"  # what `robot learn` finds in the recording
 SHELL_FILE = "shell.ply"
 
 

@@ -12,6 +12,7 @@ from splatctrl_cli.robot.coverage import coverage_of_solids
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import SelfSurfaces
+from splatctrl_cli.robot.self_model import LearnedLink, SelfModel
 from splatctrl_cli.robot.urdf import read_urdf
 
 BOX = '<box size="0.3 0.2 0.1"/>'
@@ -32,6 +33,27 @@ def written(folder: Path, text: str, name: str = "robot.urdf") -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     return path
+
+
+def held_part(link: str, triangles: Float64, start_ns: int, end_ns: int) -> SelfModel:
+    """A self-model of one link, which holds a closed surface (F, 3, 3) [m] for a time."""
+    part = LearnedLink(
+        link=link,
+        origin=np.zeros(3),
+        voxel=0.004,
+        distance=np.zeros((1, 1, 1), np.float32),
+        configurations=np.zeros((1, 1, 1), np.uint8),
+        triangles=triangles,
+        outside_95=0.04,
+        outside_most=0.05,
+        place=triangles[0, 0],
+        since=0.0,
+        num_pixels=100,
+        num_configurations=5,
+        start_ns=start_ns,
+        end_ns=end_ns,
+    )
+    return SelfModel(links=(link,), digest="", learned=(part,), unknown={})
 
 
 def l_shape() -> trimesh.Trimesh:

@@ -411,4 +411,4 @@ class Reconstruction:
         if self.declared.carried_at(seconds):
             for frame in step.frames:
                 mask = self_mask(frame, posture, self.config.occupancy)
-                count_carried(self.declared, frame, mask, posture, self.robot.surface, seconds)
+                count_carried(self.declared, frame, mask, posture, self.robot.surface_at(step.stamp_ns), seconds)

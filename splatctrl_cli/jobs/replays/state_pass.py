@@ -64,7 +64,8 @@ class ReplayRecord:
         self.audit, self.obstacles, self.ages = StoredAudit(), StoredObjects[str](), Figures()
         self.between, self.strain = Figures(), Figures()
         self.events = EventFold()
-        self._model, self._scene, self._max_map_age = model, scene, max_map_age
+        self._robot = self._model = model
+        self._scene, self._max_map_age = scene, max_map_age
         self._margin, self._longest = config.control.margin, config.verdict.longest_interval
         self._fixed = FixedParts(model, 2.0 * (self._margin - SLIGHTLY_UNDER))
         self._spheres = sphere_names(model.sphere_set)
@@ -89,11 +90,14 @@ class ReplayRecord:
         self._seen_before: Seen | None = None  # when the fixed spheres were last looked at
 
     def blocks(self, stamps: Stamps) -> Iterator[tuple[int, int]]:
-        """Ranges of at most BLOCK consecutive states of stamps (T,) that see the same scene."""
+        """Ranges of at most BLOCK consecutive states of stamps (T,) that see the same scene with one surface of the
+        robot.
+        """
         first = 0
         while first < len(stamps):
             scene, last = self._scene.at(int(stamps[first])), first + 1
-            end = min(first + BLOCK, len(stamps))
+            changes = [stamp for stamp in self._robot.changes if stamp > stamps[first]]
+            end = min(first + BLOCK, len(stamps), *np.searchsorted(stamps, changes).tolist())
             while last < end and self._scene.at(int(stamps[last])) is scene:
                 last += 1
             yield first, last
@@ -101,7 +105,7 @@ class ReplayRecord:
 
     def measured(self, stamps: Stamps, positions: Float64, velocities: Float64) -> AuditTrace:
         """The audit of the next block of states (T, J), which see one scene."""
-        scene = self._scene
+        scene, self._model = self._scene, self._robot.at(int(stamps[0]))
         part = audited(
             self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed
         )
@@ -162,9 +166,13 @@ class ReplayRecord:
 
     def _clearance_in(self, scene_ns: int, stamps: Stamps, positions: Float64) -> Float64:
         """Of states (T,), (T, J) in the scene that is known at another time than theirs (T,) [m]."""
-        known = self._scene.at(scene_ns)
-        each = moving_clearance(self._model, positions, known.distances["exact"])[1]
-        return np.asarray(self._unexpected(known, stamps, positions, each).min(axis=1))
+        known, found = self._scene.at(scene_ns), []
+        for its in np.split(np.arange(len(stamps)), np.searchsorted(stamps, self._robot.changes)):
+            if len(its):
+                robot = self._robot.at(int(stamps[its[0]]))
+                each = moving_clearance(robot, positions[its], known.distances["exact"])[1]
+                found.append(self._unexpected(known, stamps[its], positions[its], each).min(axis=1))
+        return np.concatenate(found)
 
     def _look_at_self(self, part: AuditTrace) -> AuditTrace:
         """The audit with how near the links' own surfaces come to each other, where they are known: spheres that

@@ -17,10 +17,12 @@ from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene, fiel
 from splatctrl_cli.jobs.replays.state_pass import ReplayRecord
 from splatctrl_cli.jobs.studies.problems import simulated_arm
 from splatctrl_cli.records import Float64
+from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.voxels import SWEPT, VoxelState
 from tests.cli.replay_desk import SECOND
 from tests.jobs.stage import FAR, Stage, decisive, passing
 from tests.plain import plain_grid
+from tests.robot.shapes import held_part
 
 
 def test_a_scene_is_known_from_its_latency_on_until_the_next_is() -> None:
@@ -97,6 +99,41 @@ def test_what_spheres_leave_uncovered_is_not_taken_from_a_surface_that_is_measur
     gap = model.surface_gaps(q, scene.centers, scene.radii)[link][0]
     assert record.audit.clearance["exact"].distance[0] == pytest.approx(gap)
     assert record.between["surface"][0] == pytest.approx(gap)
+
+
+def test_a_thing_that_the_hand_holds_for_a_time_counts_while_it_is_held() -> None:
+    """A ball 30 cm below the hand; from 0.25 to 0.55 s the hand holds one of 2 cm, 10 cm below its own."""
+    arm, q = simulated_arm(), np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785])
+    link = arm.sphere_set.links[-1]
+    hand = arm.sphere_centers(q)[-1]
+    place = np.linalg.inv(arm.frame_pose(q, link)) @ [*hand - [0.0, 0.0, 0.1], 1.0]
+    ball = trimesh.creation.icosphere(radius=0.02)
+    base = arm.with_pieces([(link, np.asarray(ball.triangles))])
+    model = base.with_self_model(held_part(link, ball.triangles + place[:3], SECOND // 4, 55 * SECOND // 100))
+    center = (hand - [0.0, 0.0, 0.3])[None]
+    scene = BallDistance(of_points=away, centers=center, radii=np.array([0.01]))
+    fields = KnownFields(
+        barrier=Away(),
+        distances={"exact": scene, "barrier": scene},
+        median_radius=0.01,
+        obstacles=lambda points: (Obstacle(distance=1.0, position=(np.nan, np.nan, np.nan)),) * len(points),
+    )
+    known = KnownScene(at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={})
+    stamps = np.arange(8) * SECOND // 10
+    record = ReplayRecord(model, known, config=Config(), max_map_age=1.0)
+    assert [*record.blocks(stamps)] == [(0, 3), (3, 6), (6, 8)]
+    for first, last in record.blocks(stamps):
+        record.measured(stamps[first:last], np.tile(q, (last - first, 1)), np.zeros((last - first, 7)))
+    robots = (base, model.at(SECOND // 2))
+    alone, holding = (robot.surface_gaps(q[None], scene.centers, scene.radii)[link][0] for robot in robots)
+    assert holding == pytest.approx(0.17, abs=2e-3) and alone > 0.2
+    assert record.audit.clearance["exact"].distance == pytest.approx([alone] * 3 + [holding] * 3 + [alone] * 2)
+    posture = posture_of(model, q, dict.fromkeys(stamps.tolist(), q))
+    counts = [len(posture.seen_at(stamp)[0].triangles) for stamp in stamps.tolist()]
+    faces = len(ball.triangles)
+    assert counts == [faces] * 3 + [2 * faces] * 3 + [faces] * 2
+    assert posture.seen_at(int(stamps[3]))[0] is posture.seen_at(int(stamps[5]))[0]
+    assert not posture_of(base, q, {0: q}).surfaces and base.at(0) is base
 
 
 class Away:
