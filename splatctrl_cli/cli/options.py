@@ -269,6 +269,10 @@ DECLARE = option("--declare FILE.toml", "what the robot carries, and contact tha
 PACKAGES = option(
     "--packages DIR ...", "where package:// paths of the URDF are found (default: the folders above it)", Path
 )
-SELF_MODEL = option("--self-model FILE.npz", "what robot learn found of its surface beside the URDF's", Path)
+SELF_MODEL = option(
+    "--self-model FILE.npz",
+    "what robot learn found of its surface beside the URDF's (none: learn and take nothing)",
+    Path,
+)
 LOCK = option("--lock JOINT=VALUE ...", "hold a joint, and what mimics it, at a value [rad or m]")
 BASE = option(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)

@@ -12,6 +12,7 @@ from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.evaluate.views import frames_of
 from splatctrl_cli.evaluate.worst_frames import Sight
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
+from splatctrl_cli.jobs.logged_robot import NO_SELF_MODEL
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstructions.reconstruct import declarations_of
 from splatctrl_cli.jobs.replays.criteria_input import Judged
@@ -169,7 +170,7 @@ def _read(
             motion.add(frame)
     scene = opened_scene(request, model, declared, folder, progress, source, observe)
     given = (request.urdf, request.spheres, request.self_model, request.srdf, request.truth, request.declare)
-    files = [path for path in given if path is not None]
+    files = [path for path in given if path not in (None, NO_SELF_MODEL)]
     digests = {**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}}
     inputs = ReplayInputs(
         source=source,

@@ -13,6 +13,7 @@ from splatctrl_cli.files.output import output_path
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.calibrate import depth_frame, frames_nearest, stamps_by_camera
 from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.jobs.reconstructions.reconstruction import training_cameras
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.records import Float64, RgbdFrame, SphereSet, spread
@@ -56,10 +57,17 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
         source = open_source(request.log, request.options)
         if not source.joint_names:
             raise InputError(f"{source.name}: expected joint states, got none", remedy="record /joint_states")
-        frames, T_world_link = _read(model.moved_by(source.joint_names), source, progress)
-        found = learn(model.surface, model.urdf.links, frames, T_world_link, name=source.name, reach=request.reach)
+        found = learn_from(model.moved_by(source.joint_names), source, progress, reach=request.reach)
         savez(partial, found.arrays())
     return found
+
+
+def learn_from(
+    model: RobotModel, source: FrameSource, progress: Progress = SILENT, *, reach: float = REACH
+) -> SelfModel:
+    """The self-model of a robot by a log that moves its joints. Raises InputError where no link can be learned."""
+    frames, T_world_link = _read(model, source, progress)
+    return learn(model.surface, model.urdf.links, frames, T_world_link, name=source.name, reach=reach)
 
 
 def _read(model: RobotModel, source: FrameSource, progress: Progress) -> tuple[list[RgbdFrame], Float64]:
@@ -68,6 +76,7 @@ def _read(model: RobotModel, source: FrameSource, progress: Progress) -> tuple[l
     """
     posture = source.states.of_joints(model.joint_order(source.joint_names)).postures(STATES_CLOSE_NS)
     surface, stamps = model.surface, stamps_by_camera(source)
+    stamps = {camera: its for camera, its in stamps.items() if camera in training_cameras(source)}
 
     def placed(stamp_ns: int) -> Float64 | None:
         q = posture(stamp_ns)

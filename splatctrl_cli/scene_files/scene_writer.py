@@ -16,7 +16,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
 from splatctrl_cli.files.output import Parts, flush, sha256, write_durably
 from splatctrl_cli.records import SplatSet, UInt8
-from splatctrl_cli.scene_files.scene_folder import SHELL_FILE, Snapshot
+from splatctrl_cli.scene_files.scene_folder import SELF_MODEL, SHELL_FILE, Snapshot
 from splatctrl_cli.scene_files.voxel_file import write_occupancy, write_states
 from splatctrl_cli.splat_files.splats import SHELL, write_ply
 from splatctrl_cli.voxels import KnownVoxels
@@ -60,7 +60,8 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 class SceneWriter:
-    """Writes a scene into a folder as the fitter goes: an empty folder, or one with the checkpoint to go on from.
+    """Writes a scene into a folder as the fitter goes: an empty folder, or one with `SELF_MODEL` or the
+    checkpoint to go on from.
 
     Snapshots are written while the fitter goes on; what goes wrong with one is raised by the next call.
     """
@@ -77,6 +78,7 @@ class SceneWriter:
             (folder / "snapshots").mkdir()
             (folder / CHECKPOINT).parent.mkdir()
             self._audit.touch()
+            self._digests |= {path.name: sha256(path) for path in [folder / SELF_MODEL] if path.is_file()}
         else:
             self._go_back_to(checkpoint)
 

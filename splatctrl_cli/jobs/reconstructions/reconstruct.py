@@ -9,19 +9,23 @@ from typing import Any
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.files.arrays import savez
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.device import FitDevice
-from splatctrl_cli.jobs.logged_robot import other_frame, urdf_of, with_self_model
+from splatctrl_cli.jobs.logged_robot import NO_SELF_MODEL, other_frame, urdf_of, with_self_model
 from splatctrl_cli.jobs.open_recording import guessed_unit
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstructions.reconstruction import Reconstruction, ReconstructRequest, training_cameras
 from splatctrl_cli.jobs.reconstructions.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
 from splatctrl_cli.jobs.reconstructions.verdict import GATED, Reconstructed, reconstruct_verdict
+from splatctrl_cli.jobs.self_model import learn_from
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.declared_contact import Declarations, read_declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
+from splatctrl_cli.scene_files.scene_folder import SELF_MODEL
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT
+from splatctrl_cli.sources.calibrated import LOGGED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +64,8 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         inputs = request.source.digests()
         run = _identity(request, inputs)
         checkpoint = checkpoint_to_go_on_from(partial, run) if goes_on else None
+        with stopwatch.stage("learn"):
+            robot = _learned(robot, request, partial, progress, is_new=not goes_on)
         fitted = Reconstruction(
             request, robot, partial, identity=run, declared=declared, checkpoint=checkpoint, device=device
         )
@@ -92,8 +98,31 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
 
 def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[str, Any]:
     files = {name: getattr(request, name) for name in ("urdf", "spheres", "points", "declare")}
-    files["self-model"] = request.self_model
-    return identity({"seed": request.seed, **request.options}, files, request.config, inputs)
+    is_off = request.self_model == NO_SELF_MODEL
+    files["self-model"] = None if is_off else request.self_model
+    off = {"learn": False} if is_off else {}
+    return identity({"seed": request.seed, **request.options, **off}, files, request.config, inputs)
+
+
+def _learned(
+    robot: RobotModel | None, request: ReconstructRequest, folder: Path, progress: Progress, *, is_new: bool
+) -> RobotModel | None:
+    """The robot with its self-model, which is kept in the scene's folder: the one given, or that of the run that goes
+    on, or what the recording shows where the robot's links have meshes.
+    """
+    source = request.source
+    if robot is None or request.self_model == NO_SELF_MODEL:
+        return robot
+    if not is_new:
+        return robot if request.self_model else with_self_model(robot, None, folder)
+    if request.self_model is None and isinstance(source, LOGGED) and source.joint_names and robot.surface.trees:
+        try:
+            robot = robot.with_self_model(learn_from(robot, source, progress))
+        except InputError as error:
+            progress.log(f"nothing is learned of the robot's own parts: {error.message}")
+    if robot.self_model is not None:
+        savez(folder / SELF_MODEL, robot.self_model.arrays())
+    return robot
 
 
 def written_run(
@@ -142,7 +171,7 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
     urdf = urdf_of(request.urdf, [request.recording] if request.recording else [], progress)
     if urdf is None:
         for option, path in (("spheres", request.spheres), ("self-model", request.self_model)):
-            if path is not None:
+            if path not in (None, NO_SELF_MODEL):
                 raise UsageError(f"--{option} {path}: needs the robot", remedy="give --urdf as well")
         return None
     if guess := guessed_unit(request.source):

@@ -1,0 +1,115 @@
+"""A reconstruction learns the robot's own parts first, keeps them in the scene's folder, and a replay takes them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import savez
+from splatctrl_cli.jobs.logged_robot import NO_SELF_MODEL
+from splatctrl_cli.jobs.reconstructions import reconstruct
+from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructRequest
+from splatctrl_cli.jobs.replays.inputs import open_log
+from splatctrl_cli.jobs.replays.request import ReplayRequest
+from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_model import SelfModel, surface_digest
+from splatctrl_cli.scene_files.scene_folder import SELF_MODEL
+from splatctrl_cli.scene_files.scene_writer import SceneWriter, read_checkpoint
+from splatctrl_cli.sources.source import open_source
+from tests.jobs.bakes.baked import Said
+from tests.robot.shapes import held_part
+
+PLATE: Float64 = np.asarray(trimesh.creation.box((0.05, 0.05, 0.05)).triangles)
+
+
+@pytest.fixture(scope="module")
+def drawn(sample_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tabletop's arm with a mesh at its hand."""
+    folder = tmp_path_factory.mktemp("drawn")
+    trimesh.creation.box((0.02, 0.02, 0.02)).export(folder / "box.stl")
+    text = (sample_data / "tabletop" / "robot.urdf").read_text()
+    mesh = '<visual><geometry><mesh filename="box.stl"/></geometry></visual>'
+    (folder / "robot.urdf").write_text(text.replace('<link name="hand">', f'<link name="hand">{mesh}'))
+    return folder / "robot.urdf"
+
+
+@pytest.fixture
+def request_(sample_data: Path, drawn: Path, tmp_path: Path) -> ReconstructRequest:
+    tabletop = sample_data / "tabletop"
+    source = open_source(tabletop / "log.mcap", SourceOptions())
+    spheres = tabletop / "robot_spheres.yaml"
+    return ReconstructRequest(source=source, out=tmp_path / "scene", urdf=drawn, spheres=spheres)
+
+
+def learned(request: ReconstructRequest, *, is_new: bool = True) -> tuple[RobotModel, list[str]]:
+    """The robot of a reconstruction whose folder is there already, and what was logged."""
+    heard, robot = Said(), RobotModel.from_urdf(request.urdf, request.spheres)  # type: ignore[arg-type]
+    request.out.mkdir(exist_ok=True)
+    found = reconstruct._learned(robot, request, request.out, heard, is_new=is_new)
+    assert found is not None
+    return found, heard.lines
+
+
+def holding(robot: RobotModel) -> SelfModel:
+    found = held_part("hand", PLATE, 10**9, 2 * 10**9)
+    return replace(found, links=tuple(robot.urdf.links), digest=surface_digest(robot.surface))
+
+
+def replayed(request: ReconstructRequest, sample_data: Path, **more: object) -> RobotModel:
+    log = sample_data / "tabletop" / "log.mcap"
+    asked = ReplayRequest(log=log, out=request.out / "audit", urdf=request.urdf, spheres=request.spheres)
+    return open_log(replace(asked, **more))[0]  # type: ignore[arg-type]
+
+
+def test_what_the_recording_shows_is_kept_and_a_replay_of_the_scene_takes_it(
+    request_: ReconstructRequest, sample_data: Path, drawn: Path
+) -> None:
+    robot, _ = learned(request_)
+    assert robot.self_model is not None and (request_.out / SELF_MODEL).is_file()
+    assert replayed(request_, sample_data, scene=request_.out).self_model is not None
+    assert replayed(request_, sample_data, scene=request_.out, self_model=NO_SELF_MODEL).self_model is None
+    other = sample_data / "tabletop" / "robot.urdf"
+    assert replayed(request_, sample_data, scene=request_.out, urdf=other).self_model is None
+    with pytest.raises(InputError, match="another robot"):
+        replayed(request_, sample_data, urdf=other, self_model=request_.out / SELF_MODEL)
+
+
+def test_in_lockstep_nothing_is_learned_ahead(
+    request_: ReconstructRequest, sample_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reconstruct, "learn_from", None)
+    assert replayed(request_, sample_data, lockstep=True).self_model is None
+
+
+def test_a_run_that_goes_on_takes_the_file_that_is_there(
+    request_: ReconstructRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reconstruct, "learn_from", None)
+    assert learned(request_, is_new=False)[0].self_model is None
+    savez(request_.out / SELF_MODEL, holding(RobotModel.from_urdf(request_.urdf, request_.spheres)).arrays())  # type: ignore[arg-type]
+    writer = SceneWriter(request_.out, {})
+    writer.checkpoint({}, {})
+    SceneWriter(request_.out, {}, read_checkpoint(request_.out)).close()
+    robot, _ = learned(request_, is_new=False)
+    assert robot.changes == [10**9, 2 * 10**9]
+
+
+def test_without_meshes_or_with_none_nothing_is_learned_and_where_nothing_can_be_the_log_says_so(
+    request_: ReconstructRequest, sample_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> SelfModel:
+        raise InputError("log.mcap: no link can be learned: hand moves too little")
+
+    monkeypatch.setattr(reconstruct, "learn_from", fails)
+    robot, lines = learned(request_)
+    assert robot.self_model is None and lines == [
+        "nothing is learned of the robot's own parts: log.mcap: no link can be learned: hand moves too little"
+    ]
+    for other in ({"self_model": NO_SELF_MODEL}, {"urdf": sample_data / "tabletop" / "robot.urdf"}):
+        assert learned(replace(request_, **other))[1] == []  # type: ignore[arg-type]
+    assert not (request_.out / SELF_MODEL).exists()
