@@ -76,22 +76,19 @@ def run_learn(args: argparse.Namespace) -> int:
     request = request_of(LearnRequest, args, options=source_options(args), locked=locked_joints(args))
     model = learn_robot(request, console)
     header = ("link", "pixels", "postures", "parts cm2", "outside 95 % mm", "most mm", "at x, y, z mm", "since s")
+    having, links = ({part.link for part in parts} for parts in (model.parts, model.learned))
     lines = [
-        f"{len(model.pieces())} of {len(model.learned)} learned links have parts that {args.urdf.name} does not have",
+        f"{len(having)} of {len(links)} learned links have parts that {args.urdf.name} does not have",
         "",
         *table(header, [_learned_row(part) for part in model.learned]),
         "",
+        *(part.words(part.first_ns) for part in model.parts),
         *(f"not learned (what is fixed to it is scene): {link} {why}" for link, why in model.unknown.items()),
-        *(
-            f"{part.link}: its parts go as far as --reach ({1e3 * args.reach:.0f} mm); a larger one may show more"
-            for part in model.learned
-            if part.outside_most > args.reach - part.voxel
-        ),
         f"written: {request.out}",
     ]
     found = [
         {name: finite(getattr(part, name)) for name in LEARNED}
-        | {"link": part.link, "place": [*map(finite, part.place)]}
+        | {"link": part.link, "words": part.words(part.first_ns), "place": [*map(finite, part.place)]}
         for part in model.learned
     ]
     return console.result({"out": str(request.out), "links": found, "unknown": dict(model.unknown)}, lines)

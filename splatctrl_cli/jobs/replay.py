@@ -25,6 +25,7 @@ from splatctrl_cli.jobs.replays.inputs import (
     MeasuredRobot,
     clock_of,
     doubts_of,
+    grasp_contacts,
     measured_robot,
     open_log,
     read_states,
@@ -162,6 +163,8 @@ def _read(
     if truth is not None and (other := truth_mismatch(truth, logged.states, model)) is not None:
         raise InputError(other.sentence, remedy=other.remedy)
     declared = declarations_of(request.declare, model)
+    meant = (*declared.expected_contact, *grasp_contacts(model, logged.states))
+    declared = replace(declared, expected_contact=meant)
     evidence = open_evidence(request, model)
     source = logged.source
     observe = motion.add if reads_whole_log(request, source) else None

@@ -31,13 +31,17 @@ class Carried:
 
 @dataclass(frozen=True, kw_only=True)
 class ExpectedContact:
-    """A contact of `link` within a box of the world [m], from `start` to `end` [s after the first state], and why."""
+    """A contact of `link` within a box of the world [m], from `start` to `end` [s after the first state], and why.
+
+    is_learned: of what the recording shows the robot to hold, not of a file.
+    """
 
     link: str
     box: Box
     start: float
     end: float
     reason: str
+    is_learned: bool = False
 
     def covers(self, link: str, point_world: NDArray[np.floating], time_s: float) -> bool:
         """Whether a contact of a link at a point (3,) [m] and time was declared."""

@@ -224,6 +224,7 @@ def _learn_link(
             num_configurations=len(in_order),
             start_ns=interval.start_ns,
             end_ns=interval.end_ns,
+            first_ns=int(stamps.min()),
         )
         found.append(part)
     return found

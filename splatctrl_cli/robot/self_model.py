@@ -15,7 +15,7 @@ from splatctrl_cli.robot.coverage import areas
 from splatctrl_cli.robot.surface import RobotSurface
 
 ALWAYS = (int(np.iinfo(np.int64).min), int(np.iinfo(np.int64).max))  # [ns]
-BOUNDS = ("start_ns", "end_ns")  # that files of earlier versions lack
+BOUNDS = ("start_ns", "end_ns", "first_ns")  # that files of earlier versions lack
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class LearnedLink:
     configurations (X, Y, Z) uint8 in which a cell was a surface; triangles (F, 3, 3) [m], link frame: closed surfaces
     of the parts that the visual surface lacks. Of these parts: outside_95, outside_most [m], how far their cells lie
     outside the visual surface; place (3,) [m], link frame, where most; since [s] from the first frame, when they
-    could be known. Without parts 0 and NaN.
+    could be known. Without parts 0 and NaN. first_ns [ns]: of the first frame.
     """
 
     link: str
@@ -44,6 +44,16 @@ class LearnedLink:
     num_configurations: int
     start_ns: int = ALWAYS[0]
     end_ns: int = ALWAYS[1]
+    first_ns: int = 0
+
+    def words(self, first_ns: int) -> str:
+        """What the link has, when, in seconds after a stamp [ns], and how far it stands out."""
+        start, end = (f"{1e-9 * (stamp - first_ns):.2f}" for stamp in (self.start_ns, self.end_ns))
+        until = f" until {end} s" if self.end_ns != ALWAYS[1] else ""
+        if self.start_ns != ALWAYS[0]:
+            until = f" from {start} to {end} s" if until else f" from {start} s on"
+        what = "has a part" if self.is_always else "holds a thing"
+        return f"{self.link} {what}{until} that stands out by {1e3 * self.outside_most:.0f} mm"
 
     @property
     def is_always(self) -> bool:
@@ -81,6 +91,11 @@ class SelfModel:
     def pieces_at(self, stamp_ns: int) -> list[tuple[str, Float64]]:
         """`pieces` and `held_at` of a stamp [ns]."""
         return self.pieces() + self.held_at(stamp_ns)
+
+    @property
+    def parts(self) -> list[LearnedLink]:
+        """What stands out at any time."""
+        return [part for part in self.learned if len(part.triangles)]
 
     def changes(self) -> list[int]:
         """Stamps [ns], in order, from each of which on `pieces_at` may differ."""

@@ -82,12 +82,14 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
                     f"warning: {request.declare}: [[carried]] {index + 1}: no pixel of any frame needed it; check its"
                     " link and box, or leave it out"
                 )
+        learned = [] if robot is None or robot.self_model is None else robot.self_model.parts
         made = Reconstructed(
             metrics=fitted.metrics(),
             rows=fitted.rows,
             config=fitted.config,
             loss=request.source.loss,
             is_seeded=request.points is not None,
+            learned=[part.words(fitted.rows[0].stamp_ns) for part in learned],
         )
         verdict = reconstruct_verdict(made, request.require)
         resolved = replace(request, config=fitted.config)

@@ -43,6 +43,7 @@ class Reconstructed:
     config: Config
     loss: LossReport
     is_seeded: bool = False
+    learned: Sequence[str] = ()
 
     def seconds(self, stamp_ns: int) -> float:
         """From the first time step [s]."""
@@ -63,7 +64,7 @@ def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
             *gate_reasons(require, {name: metrics[name] for name in GATED}, counts),
         ],
         scope=f"{metrics['time_steps']} time steps of {', '.join(metrics['cameras'])}, {metrics['splats']} splats",
-        notes=[carried_words(entry) for entry in metrics["carried"]],
+        notes=[*made.learned, *(carried_words(entry) for entry in metrics["carried"])],
         is_damaged=bool(made.loss.damaged),
         counts=counts,
     )

@@ -1,6 +1,6 @@
 """What a replay reads: the robot's model and what its spheres leave uncovered, and the states of a log."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import COVERED_COARSE, SELF_POSTURES
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
-from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.geometry import transform_from, transform_points
 from splatctrl_cli.jobs.logged_robot import other_frame, urdf_of, with_self_model
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.replays.request import ReplayRequest
@@ -26,6 +26,7 @@ from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.records import Box, Float64, RecordSource
 from splatctrl_cli.robot.coverage import LinkCoverage, coverage_of_solids
+from splatctrl_cli.robot.declared_contact import ExpectedContact
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import DisabledPair, read_srdf, without_disabled
@@ -36,9 +37,11 @@ from splatctrl_cli.robot.self_margins import (
     kept_margins,
     with_kept_margins,
 )
+from splatctrl_cli.robot.self_model import ALWAYS
 from splatctrl_cli.states.state_source import StateSource, open_states
 
 MAX_NOTES = 10  # printed
+GRASPING = 1.0  # [s] before a thing is held, and after, in which the hand may touch it
 ANGLE = Scale(unit="rad")
 LOG_FIGURES = {  # they describe the log
     "num_poses": DESCRIBES,
@@ -279,6 +282,27 @@ def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedS
     check_states(states, model.joint_names)
     check_angles(model, states, source.name)
     return LoggedStates(source=source, states=states, poses=pose_agreement(model, states))
+
+
+def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[ExpectedContact]:
+    """Where the links of a hand meet what it takes and leaves: at its place then, before and after.
+
+    Until `GRASPING` after it is taken, too: the map still has it at its place.
+    """
+    bodies = model.urdf.rigid_bodies(set(model.joint_names) - set(model.urdf.grippers))
+    first_ns = int(states.stamp_ns[0])
+    for part in [] if model.self_model is None else model.self_model.held:
+        for stamp, before in ((part.start_ns, GRASPING), (part.end_ns, 0.0)):
+            if stamp in ALWAYS:
+                continue
+            q = states.position[int(np.abs(states.stamp_ns - stamp).argmin())]
+            corners = transform_points(model.frame_pose(q, part.link), part.triangles.reshape(-1, 3))
+            box = Box(lower=corners.min(axis=0) - part.voxel, upper=corners.max(axis=0) + part.voxel)
+            time, reason = 1e-9 * (stamp - first_ns), part.words(first_ns)
+            for link in [link for link in bodies if bodies[link][0] == bodies[part.link][0]]:
+                yield ExpectedContact(
+                    link=link, box=box, start=time - before, end=time + GRASPING, reason=reason, is_learned=True
+                )
 
 
 def recorded_postures(states: StateColumns) -> Float64:

@@ -62,12 +62,17 @@ def _notes(judged: Judged) -> Iterator[str]:
 
 
 def _declared_notes(judged: Judged) -> Iterator[str]:
-    """Declared contact, what the map was told that the robot carries, and entries that nothing used."""
-    declared = judged.inputs.declared
+    """Parts that were learned, declared contact, what the map was told that the robot carries, and unused entries."""
+    declared, inputs = judged.inputs.declared, judged.inputs
+    if inputs.model.self_model is not None:
+        yield from (part.words(int(inputs.states.stamp_ns[0])) for part in inputs.model.self_model.parts)
     for index, entry in enumerate(declared.expected_contact):
         num = declared.num_uses.get(("expected_contact", index), 0)
+        if entry.is_learned and not num:
+            continue
         used = f"{num} times" if num else "warning: not used by any state; check its links and times, or leave it out"
-        yield f"contact of {entry.link} declared ({entry.reason}): {used}"
+        how = "meant" if entry.is_learned else "declared"
+        yield f"contact of {entry.link} {how} ({entry.reason}): {used}"
     of_map = judged.inputs.scene.figures().get("carried", [])
     yield from map(carried_words, of_map)
     for given in declared.carried_uses():

@@ -12,12 +12,13 @@ from splatctrl_cli.files.arrays import savez
 from splatctrl_cli.jobs.logged_robot import NO_SELF_MODEL
 from splatctrl_cli.jobs.reconstructions import reconstruct
 from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructRequest
-from splatctrl_cli.jobs.replays.inputs import open_log
+from splatctrl_cli.jobs.replays.inputs import grasp_contacts, open_log, read_states
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_model import SelfModel, surface_digest
+from splatctrl_cli.robot.self_model import ALWAYS, SelfModel, surface_digest
 from splatctrl_cli.scene_files.scene_folder import SELF_MODEL
 from splatctrl_cli.scene_files.scene_writer import SceneWriter, read_checkpoint
 from splatctrl_cli.sources.source import open_source
@@ -25,6 +26,7 @@ from tests.jobs.bakes.baked import Said
 from tests.robot.shapes import held_part
 
 PLATE: Float64 = np.asarray(trimesh.creation.box((0.05, 0.05, 0.05)).triangles)
+HELD = (10**9, 2 * 10**9)  # [ns]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +58,7 @@ def learned(request: ReconstructRequest, *, is_new: bool = True) -> tuple[RobotM
 
 
 def holding(robot: RobotModel) -> SelfModel:
-    found = held_part("hand", PLATE, 10**9, 2 * 10**9)
+    found = held_part("hand", PLATE, *HELD)
     return replace(found, links=tuple(robot.urdf.links), digest=surface_digest(robot.surface))
 
 
@@ -96,7 +98,7 @@ def test_a_run_that_goes_on_takes_the_file_that_is_there(
     writer.checkpoint({}, {})
     SceneWriter(request_.out, {}, read_checkpoint(request_.out)).close()
     robot, _ = learned(request_, is_new=False)
-    assert robot.changes == [10**9, 2 * 10**9]
+    assert robot.changes == [*HELD]
 
 
 def test_without_meshes_or_with_none_nothing_is_learned_and_where_nothing_can_be_the_log_says_so(
@@ -113,3 +115,31 @@ def test_without_meshes_or_with_none_nothing_is_learned_and_where_nothing_can_be
     for other in ({"self_model": NO_SELF_MODEL}, {"urdf": sample_data / "tabletop" / "robot.urdf"}):
         assert learned(replace(request_, **other))[1] == []  # type: ignore[arg-type]
     assert not (request_.out / SELF_MODEL).exists()
+
+
+def test_a_hand_may_touch_what_it_takes_and_leaves_at_its_place_and_no_other_link_may(
+    request_: ReconstructRequest, sample_data: Path
+) -> None:
+    log = sample_data / "tabletop" / "log.mcap"
+    asked = ReplayRequest(log=log, out=request_.out, urdf=request_.urdf, spheres=request_.spheres)
+    bare, source = open_log(asked)
+    states = read_states(source, bare).states
+    first_ns = int(states.stamp_ns[0])
+    found = holding(bare)
+    part = replace(found.learned[0], start_ns=first_ns + HELD[0], end_ns=first_ns + HELD[1])
+    assert part.words(first_ns) == "hand holds a thing from 1.00 to 2.00 s that stands out by 50 mm"
+    assert replace(part, end_ns=ALWAYS[1]).words(first_ns).startswith("hand holds a thing from 1.00 s on that")
+    assert replace(part, start_ns=ALWAYS[0]).words(first_ns).startswith("hand holds a thing until 2.00 s that")
+    assert replace(part, start_ns=ALWAYS[0], end_ns=ALWAYS[1]).words(0) == "hand has a part that stands out by 50 mm"
+    model = bare.with_self_model(replace(found, learned=(part,)))
+    contacts = [*grasp_contacts(model, states)]
+    assert {contact.link for contact in contacts} >= {"hand"} and "link0" not in {each.link for each in contacts}
+    taken, left = (
+        model.frame_pose(states.position[np.abs(states.stamp_ns - stamp).argmin()], "hand")[:3, 3]
+        for stamp in (part.start_ns, part.end_ns)
+    )
+    assert np.linalg.norm(taken - left) > 0.1
+    declared = Declarations(expected_contact=tuple(contacts))
+    times = [(taken, 0.5), (taken, 1.5), (left, 2.5), (taken, 2.5), (left, 1.5), (left, 3.5)]
+    assert [declared.expects("hand", place, time) is not None for place, time in times] == [True] * 3 + [False] * 3
+    assert [*grasp_contacts(bare, states)] == []
