@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from splatctrl_cli.config.fixed import SHADOW_BASELINE, SHADOW_STEP
-from splatctrl_cli.records import Bool, Float32, Index
+from splatctrl_cli.config.fixed import MASK_EDGE, SHADOW_BASELINE, SHADOW_STEP
+from splatctrl_cli.records import Bool, Float32, Float64, Index
 
 
 def shadowed(depth: Float32, focal: float) -> Bool:
@@ -14,7 +14,7 @@ def shadowed(depth: Float32, focal: float) -> Bool:
     B focal (1/z - 1/z_behind) pixels of what is behind it, always on the same side. Side and baseline are measured
     from the image (`_baseline`); z_behind is the largest depth around the pixels without depth that are connected.
     """
-    is_shadow = np.zeros(depth.shape, bool)
+    is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / MASK_EDGE, 1.0)
     for turn in (1, -1):  # what is nearer is at the right of its shadow, then at the left
         image = np.ascontiguousarray(depth[:, ::turn])
         column = np.arange(image.shape[1], dtype=np.int32)
@@ -25,17 +25,17 @@ def shadowed(depth: Float32, focal: float) -> Bool:
             rows, columns = np.nonzero((image <= 0) & (following < len(column)))
             nearer = following[rows, columns]
             inverse = 1.0 / image[rows, nearer] - 1.0 / _behind(image)[rows, columns]
-            is_beside = nearer - columns <= baseline * focal * inverse + 1.0
+            is_beside = nearer - columns <= baseline * focal * inverse + fattened
             is_shadow[:, ::turn][rows[is_beside], columns[is_beside]] = True
     return is_shadow
 
 
 def _baseline(depth: Float32, following: Index, focal: float) -> float:
-    """Baseline [m] of the shadows at the left of what is nearer, 0 where there are none: the median over the steps.
+    """Baseline [m] of the shadows at the left of what is nearer, 0 without any: the median over the higher steps.
 
     following (H, W): the column of the first depth from each pixel on, W = none. A step is a pixel and the next of
     its row with depth, nearer by `SHADOW_STEP`; it counts by its height. Between them B focal (1/z - 1/z_behind)
-    pixels are lost, or fewer where the outline is fattened.
+    pixels are lost, less those by which the outline is fattened: of the lower half that is most of them.
     """
     following = following[:, 1:]
     before = depth[:, :-1]
@@ -46,9 +46,15 @@ def _baseline(depth: Float32, following: Index, focal: float) -> float:
         return 0.0
     height = focal * (1.0 / after[is_step] - 1.0 / before[is_step])
     baselines = (following[is_step] - 1 - columns) / height
-    order = np.argsort(baselines)
-    share = np.cumsum(height[order])
-    return float(min(baselines[order][np.searchsorted(share, 0.5 * share[-1])], SHADOW_BASELINE))
+    higher = height >= _middle(height, height)
+    return min(_middle(baselines[higher], height[higher]), SHADOW_BASELINE)
+
+
+def _middle(values: Float64, weights: Float64) -> float:
+    """Median of values (N,), each counted by its weight (N,)."""
+    order = np.argsort(values)
+    share = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
 
 
 def _behind(depth: Float32) -> Float32:
