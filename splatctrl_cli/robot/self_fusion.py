@@ -197,10 +197,12 @@ def _learn_link(
         is_solid = solid < 0
         normals = _normals(spread_cells(mask, distance, np.nan))[mask][is_solid]
         its = (cells[is_solid], seen[:, is_solid])
-        is_else = np.zeros(len(cells), bool)
-        is_else[is_solid] = _stays_in_world(*its, normals, poses[run, number])
-        is_else[is_solid] |= _is_on_other_link(surface, number, *its, gap[is_solid], poses[run], reach)
-        grid = _without_others(spread_cells(mask, solid, TRUNCATION), spread_cells(mask, is_else, 0) > 0)
+        stays, is_other = np.zeros((2, len(cells)), bool)
+        stays[is_solid] = _stays_in_world(*its, normals, poses[run, number])
+        is_other[is_solid] = _is_on_other_link(surface, number, *its, gap[is_solid], poses[run], reach)
+        grid = _without_scene(spread_cells(mask, solid, TRUNCATION), spread_cells(mask, stays, 0) > 0)
+        grid = np.where(spread_cells(mask, is_other, 0) > 0, np.float32(TRUNCATION), grid)
+        grid = _without_scene(grid, np.zeros_like(mask))
         is_part = (grid < 0)[mask]
         if not is_part.any() and (index or len(np.unique(at[num_own >= LEAST_CELLS])) < NUM_CONFIGURATIONS):
             continue
@@ -317,11 +319,11 @@ def _normals(distance: Float32) -> Float64:
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12))
 
 
-def _without_others(distance: Float32, is_else: Bool) -> Float32:
-    """The grid without cells that are no part of the link, without pieces of which they are the most, and without
-    pieces of fewer than `LEAST_CELLS`.
+def _without_scene(distance: Float32, stays: Bool) -> Float32:
+    """The grid without cells that stay in the world, without pieces of which they are the most, and without pieces of
+    fewer than `LEAST_CELLS`.
     """
-    for left_out in (is_else, np.zeros_like(is_else)):
+    for left_out in (stays, np.zeros_like(stays)):
         pieces, num = ndimage.label(distance < 0)
         sizes = np.bincount(pieces.ravel(), minlength=num + 1)
         lost = np.bincount(pieces.ravel(), left_out.ravel(), num + 1)
