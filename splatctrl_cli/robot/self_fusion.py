@@ -31,7 +31,7 @@ from splatctrl_cli.robot.surface import RobotSurface
 
 REACH = 0.06  # [m] outside of a link's visual surface, in which its parts are looked for
 MOST_REACH = 0.24  # [m], to which it grows with parts that go as far
-STEP = 0.03  # [m] by which some corner of a link's box moves between clearly different configurations
+STEP = 0.02  # [m] by which some corner of a link's box moves between clearly different configurations
 SAME = 0.01  # [m] within which cameras of one moment see a link in one configuration
 PATH_SHARE = 0.5  # of how far a link went between two moments, that parts them where it came back
 TURN = 0.97  # mean length of a surface's normals in world, below which they turn by 15 degrees or more
