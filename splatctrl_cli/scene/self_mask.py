@@ -111,6 +111,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     offset = depth - rendered
     is_told = core & has_depth & (np.abs(offset) <= MASK_FAR_OFF) & (link < len(surface.links) - surface.num_carried)
+    is_told &= rendered - nearest_within(rendered, is_robot, wide) < MASK_STEP  # else it may be a nearer part
     is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
         mask,

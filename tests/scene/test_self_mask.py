@@ -305,3 +305,22 @@ def test_a_carried_box_is_the_robots() -> None:
     larger = Box(lower=held.lower - [0.0, 0.0, 0.05], upper=held.upper)  # what it holds need not fill the box
     holding = replace(holding, surface=posture.surface.with_boxes([("arm", larger)]))
     assert (kinds(depth, holding)[101:109, 71:89] == PixelKind.ROBOT).all()
+
+
+def test_beside_a_nearer_link_depth_that_has_grown_over_a_link_is_not_its_residual() -> None:
+    """Stereo gives the rim of what is behind the depth of what is before."""
+    plates = (("near", (0.0, 0.0, 0.8)), ("far", (0.08, 0.0, 0.9)))
+    solids = [Shape(link=link, kind="box", size=(0.1, 0.1, 0.01), T_link_shape=pose_at(at)) for link, at in plates]
+    posture = RobotPosture(
+        centers=CENTER[None],
+        radii=np.array([RADIUS]),
+        T_world_link=np.eye(4)[None],
+        surface=RobotSurface.from_parts(solids),
+        T_world_surface={5: np.tile(np.eye(4), (2, 1, 1))},
+    )
+    exact = self_mask(frame(np.full(SHOWN.shape, np.inf)), posture, CONFIG).robot_depth
+    depth = np.where(exact > 0, exact, FLOOR)
+    left = int(np.flatnonzero((exact > 0.85).any(axis=0))[0])
+    depth[:, left : left + 2] = np.where(exact[:, left : left + 2] > 0, 0.795, depth[:, left : left + 2])
+    found = self_mask(frame(depth), posture, CONFIG).residuals
+    assert len(found["far"]) > 20 and np.abs(found["far"]).max() < 1e-3
