@@ -21,9 +21,8 @@ def _num_images(text: str) -> int:
 
 SIMULATE = (
     *output("folder for log.mcap, truth.json, robot.urdf, robot_spheres.yaml", default="simulated"),
-    option(
-        "--urdf FILE", "another arm with collision geometry, its base on the table; spheres are fitted to it", Path
-    ),
+    option("--urdf FILE", "another arm with collision geometry, its base on the table", Path),
+    option("--spheres FILE", "its spheres (default: fitted to it)", Path),
     PACKAGES,
     seed("the noise, of --environment and of --human-arm"),
     option(

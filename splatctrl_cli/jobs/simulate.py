@@ -26,13 +26,14 @@ from splatctrl_cli.simulate.truth import Truth, truth_document
 class SimulateRequest:
     """Write log.mcap, truth.json and the robot's files into the folder `out`; dtu: and a scan, in both layouts.
 
-    urdf: of another arm than the simulated one, its base on the table at the world's origin; packages: where its
-    meshes are looked for. is_slim: the arm is seen by shapes inside of its collision shapes; unmodelled: names of
-    `UNMODELLED` parts that move with it, in images and truth alone.
+    urdf: of another arm than the simulated one, its base on the table at the world's origin; spheres: that cover it
+    (None: fitted); packages: where its meshes are looked for. is_slim: the arm is seen by shapes inside of its
+    collision shapes; unmodelled: names of `UNMODELLED` parts that move with it, in images and truth alone.
     """
 
     out: Path
     urdf: Path | None = None
+    spheres: Path | None = None
     packages: tuple[Path, ...] = ()
     options: RecordingOptions = field(default_factory=RecordingOptions)
     is_slim: bool = False
@@ -41,8 +42,8 @@ class SimulateRequest:
     force: bool = False
 
     def __post_init__(self) -> None:
-        if self.urdf is not None and (self.is_slim or self.unmodelled):
-            raise UsageError("--slim, --unmodelled: expected the simulated arm, got --urdf")
+        if self.spheres is not None if self.urdf is None else self.is_slim or self.unmodelled:
+            raise UsageError("--slim, --unmodelled: expected the simulated arm, got --urdf; --spheres: the reverse")
 
     @property
     def config(self) -> dict[str, Any]:
@@ -117,8 +118,8 @@ def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Re
         spheres.write_text(arm_spheres_yaml(), encoding="utf-8")
         robot = RobotModel.from_urdf(urdf, spheres)
     else:
-        progress.log(f"simulate: fitting spheres to {request.urdf.name}")
-        robot, surfaces = copied_arm(request.urdf, request.packages, folder, progress)
+        progress.log(f"simulate: reading {request.urdf.name}")
+        robot, surfaces = copied_arm(request.urdf, request.spheres, request.packages, folder, progress)
     if options.environment is not None:
         progress.log(f"simulate: looking for a way through the {options.environment}")
         scene = task_of(options.environment, options.seed, robot).scene(robot, options)

@@ -34,10 +34,10 @@ REMEDY = "give the URDF of an arm whose base stands on the table's top"
 
 
 def copied_arm(
-    urdf: Path, packages: Sequence[Path], folder: Path, progress: Progress
+    urdf: Path, given: Path | None, packages: Sequence[Path], folder: Path, progress: Progress
 ) -> tuple[RobotModel, SelfSurfaces]:
-    """Write ``robot.urdf``, the meshes that it names into ``meshes/``, and ``robot_spheres.yaml`` into a folder, and
-    read them back as the robot and the surfaces of its links.
+    """Write ``robot.urdf``, the meshes that it names into ``meshes/``, and ``robot_spheres.yaml`` (a copy of the file
+    `given`, or fitted) into a folder, and read them back as the robot and the surfaces of its links.
 
     Raises InputError for a URDF without collision geometry, or whose collision meshes are missing.
     """
@@ -46,8 +46,11 @@ def copied_arm(
     copy = folder / "robot.urdf"
     copy.write_text(_with_own_meshes(original, packages, folder, progress), encoding="utf-8")
     spheres = folder / "robot_spheres.yaml"
-    fitted = fit_spheres(solids, FitOptions(max_spheres=max(fixed.DEFAULT_SPHERES, len(solids))))
-    spheres.write_text(spheres_yaml(fitted, [f"Fitted to {urdf.name} by: splatctrl simulate."]), encoding="utf-8")
+    if given is not None:
+        shutil.copyfile(given, spheres)
+    else:
+        fitted = fit_spheres(solids, FitOptions(max_spheres=max(fixed.DEFAULT_SPHERES, len(solids))))
+        spheres.write_text(spheres_yaml(fitted, [f"Fitted to {urdf.name} by: splatctrl simulate."]), encoding="utf-8")
     moved = [joint.name for joint in original.joints if joint.kind != "fixed" and joint.name not in original.grippers]
     model = RobotModel.from_urdf(copy, spheres).moved_by(moved)
     report = coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=fixed.COVERED_COARSE)
@@ -60,11 +63,16 @@ def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> M
     the arm) is where the hand of the simulated arm is, as far as it reaches, and any way round.
 
     Among the postures found, those of the shortest way that keeps clear of everything there and of the arm itself;
-    where none is within its velocity limits, the way that has to be slowed down least. Raises InputError where none
-    leads to a waypoint, or every way runs into something.
+    where none is within its velocity limits, the way that has to be slowed down least. An arm whose tip is there in
+    the same postures moves as the simulated arm does. Raises InputError where none leads to a waypoint, or every way
+    runs into something.
     """
-    times = scene.motion.times
-    reached = [_postures(model, hand_pose(q), q) for q in scene.motion.waypoints]
+    times, ours = scene.motion.times, scene.motion.waypoints
+    if ours.shape[1] == model.num_joints and all(
+        np.allclose(model.frame_pose(q, model.frame_names[-1]), hand_pose(q), atol=1e-6) for q in ours
+    ):
+        return scene.motion
+    reached = [_postures(model, hand_pose(q), q) for q in ours]
     costs, before = np.zeros(len(reached[0])), []
     for start, (here, there) in enumerate(pairwise(reached)):
         ways = [Motion(times=times[start : start + 2], waypoints=np.array(ends)) for ends in product(here, there)]
@@ -139,10 +147,9 @@ def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
         ]
         if found:
             return np.array(found)
-    x, y, z = T_base_hand[:3, 3]
     raise InputError(
-        f"{model.urdf.path}: expected {tip} to reach ({x:.2f}, {y:.2f}, {z:.2f}) m or nearer, "
-        "pointing down, got no posture",
+        f"{model.urdf.path}: expected {tip} to reach ({', '.join(f'{x:.2f}' for x in T_base_hand[:3, 3])}) m "
+        "or nearer, pointing down, got no posture",
         remedy=REMEDY,
     )
 

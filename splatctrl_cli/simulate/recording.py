@@ -14,7 +14,7 @@ from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import visual_urdf
 from splatctrl_cli.simulate import shared_workspace, tabletop
 from splatctrl_cli.simulate.arm import UNMODELLED, Capsule, Motion, link_shape
-from splatctrl_cli.simulate.depth_camera import DepthNoise, StereoDepth
+from splatctrl_cli.simulate.depth_camera import WIDTH, DepthNoise, StereoDepth
 from splatctrl_cli.simulate.environments import ENVIRONMENTS
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.render import Camera, Renderer
@@ -25,7 +25,7 @@ JOINT_RATE = 50  # [Hz]
 NOISES: dict[str, DepthNoise | StereoDepth | None] = {
     "none": None,
     "realsense": DepthNoise(),
-    "stereo": StereoDepth(),
+    "stereo": StereoDepth(width=WIDTH),
 }
 NUM_BALLS = 100  # that stand for a capsule of an unmodelled part: a millimetre apart
 OPTICAL_FROM_LINK = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)

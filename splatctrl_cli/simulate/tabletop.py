@@ -27,6 +27,7 @@ PALETTE = {
     "grape": ((0.14, 0.03, 0.20), (0.98, 0.82, 0.95)),
     "sand": ((0.24, 0.17, 0.04), (1.00, 0.95, 0.70)),
     "shell": ((0.20, 0.21, 0.24), (1.00, 1.00, 0.98)),
+    "enamel": ((0.72, 0.72, 0.71), (0.97, 0.97, 0.95)),
 }
 
 # Joint positions [rad]: the hand right of the things on the table, above them, and left of them.
@@ -38,7 +39,6 @@ WAYPOINTS = (
 
 VISITOR = (0.42, 0.08, 0.06)  # [m] x, y and radius of the cylinder that stands there for a while
 NUM_VIEWS = 8
-VIEW_SIZE = (256, 208)  # width, height [px]
 MIDDLE = (0.60, 0.02, 0.06)  # [m] the middle of the things
 
 
@@ -125,25 +125,21 @@ def arm_solids(shapes: Sequence[Shape], T_world_links: dict[str, Float64]) -> li
             kind=shape.kind,
             size=shape.size,
             T_world_shape=T_world_links[shape.link] @ shape.T_link_shape,
-            texture=_link_texture(shape.link),
+            texture=texture("noise", 0.05, ("shell", "ocean")[sum(shape.link.encode()) % 2], 20),
         )
         for index, shape in enumerate(shapes)
     ]
 
 
 def arm_meshes(surface: RobotSurface) -> Meshes:
-    """The arm's meshes; the pattern is fixed to each link."""
+    """The arm's meshes, white as robots are; the pattern is fixed to each link."""
     return Meshes(
         links=surface.links,
         triangles=surface.triangles,
         owners=surface.triangle_links,
-        textures=tuple(_link_texture(link) for link in surface.links),
+        textures=(texture("noise", 0.05, "enamel", 20),) * len(surface.links),
         T_world_link=np.tile(np.eye(4), (len(surface.links), 1, 1)),
     )
-
-
-def _link_texture(link: str) -> Texture:
-    return texture("noise", 0.05, ("shell", "ocean")[sum(link.encode()) % 2], 20)
 
 
 def texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:
@@ -154,7 +150,7 @@ def texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:
 
 def turntable_views() -> Iterator[RgbdFrame]:
     """Exact views of the tabletop's things from an arc of 70 degrees at two heights; the stamp is the number."""
-    width, height = VIEW_SIZE
+    width, height = 256, 208  # [px]
     intrinsics = Intrinsics(
         fx=1.15 * width,
         fy=1.15 * width,

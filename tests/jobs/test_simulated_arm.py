@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.progress import Silent
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
@@ -19,6 +19,7 @@ from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.coverage import coverage_deficit
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
+from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.truth import distance_to, load_truth
 from splatctrl_cli.sources.source import open_source
@@ -33,7 +34,7 @@ FINGERS = "".join(
 
 
 @pytest.fixture(scope="module")
-def arm(tmp_path_factory: pytest.TempPathFactory, sample_data: Path) -> Path:
+def arm(tmp_path_factory: pytest.TempPathFactory, plain_arm: Path) -> Path:
     """The simulated arm of boxes, with other joint names, fingers that no log moves, and a mesh for its forearm."""
     folder = tmp_path_factory.mktemp("packages") / "my_arm"
     mesh = folder / "meshes" / "forearm.stl"
@@ -41,7 +42,7 @@ def arm(tmp_path_factory: pytest.TempPathFactory, sample_data: Path) -> Path:
     capsule = trimesh.creation.capsule(height=0.2, radius=0.055, count=[12, 12])
     capsule.apply_translation([0.0, 0.01, -0.22])
     capsule.export(mesh)
-    text = (sample_data / "tabletop" / "robot.urdf").read_text().replace('name="joint', 'name="my_joint')
+    text = (plain_arm / "tabletop" / "robot.urdf").read_text().replace('name="joint', 'name="my_joint')
     text = re.sub(r'<cylinder radius="(\S+)" length="(\S+)"/>', r'<box size="\1 \1 \2"/>', text)
     text = re.sub(r'<sphere radius="(\S+)"/>', r'<box size="\1 \1 \1"/>', text)
     start = text.index('<link name="link5">')
@@ -100,6 +101,22 @@ def test_the_same_options_give_the_same_bytes(simulated: Path, arm: Path, tmp_pa
     simulate(SimulateRequest(out=tmp_path / "again", urdf=arm, options=OPTIONS))
     for name in ("log.mcap", "truth.json", "robot.urdf"):
         assert (tmp_path / "again" / name).read_bytes() == (simulated / name).read_bytes(), name
+
+
+def test_given_spheres_are_taken_and_the_same_kinematics_move_alike(
+    arm: Path, simulated: Path, tmp_path: Path
+) -> None:
+    spheres = simulated / "robot_spheres.yaml"
+    urdf = written(arm.parent, arm.read_text().replace(FINGERS, ""), "my_bare_arm.urdf")
+    out = tmp_path / "out"
+    simulate(SimulateRequest(out=out, urdf=urdf, spheres=spheres, options=OPTIONS))
+    assert (out / "robot_spheres.yaml").read_bytes() == spheres.read_bytes()
+    source = open_source(out / "log.mcap", SourceOptions())
+    moved = [record.position for record in source.records() if isinstance(record, JointState)]
+    expected = [tabletop.arm_motion(OPTIONS.duration_s).at(index / 50)[0] for index in range(len(moved))]
+    np.testing.assert_allclose(moved, expected, atol=1e-9)
+    with pytest.raises(UsageError, match="--spheres"):
+        SimulateRequest(out=tmp_path / "none", spheres=spheres)
 
 
 NAMES = ("visual/seen", "forearm")
