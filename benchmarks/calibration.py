@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.measure import ROOT
 from benchmarks.open3d_multiway import multiway
 from benchmarks.random_tabletop import random_things
-from benchmarks.scenes import SAMPLE, sample_robot
 from splatctrl_cli.calibration.evidence import transform_of, twist_between
 from splatctrl_cli.calibration.views import still_frame
 from splatctrl_cli.cli.common import table
@@ -27,6 +27,7 @@ from splatctrl_cli.geometry import invert_transform, look_at
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 from splatctrl_cli.logs.mcap_writer import mcap_log
 from splatctrl_cli.records import Float64, JointState, Record, RgbdFrame, by_stamp
+from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.arm import HAND, Motion
 from splatctrl_cli.simulate.recording import (
@@ -42,6 +43,8 @@ from splatctrl_cli.simulate.recording import (
 from splatctrl_cli.simulate.render import Renderer
 from splatctrl_cli.sources.source import open_source
 
+PLAIN = ROOT / "tests" / "data" / "tabletop"  # the arm of primitive shapes
+ARM = {"urdf": PLAIN / "robot.urdf", "spheres": PLAIN / "robot_spheres.yaml"}
 OPTIONS = RecordingOptions(duration_s=6.0, fps=5.0, color_rays=0)
 OFF = (np.radians(1.5), 0.02)  # [rad], [m]: standard deviations of recorded poses, about and along each axis
 CLOCK = 0.06  # [s] at most
@@ -63,7 +66,7 @@ class SetUp(Recording):
 
     def __init__(self, seed: int, options: RecordingOptions = OPTIONS, *, has_wrist: bool = False) -> None:
         self._rng = rng = np.random.default_rng([seed, 1])
-        super().__init__(replace(options, seed=seed), sample_robot(), self._scene(seed, options))
+        super().__init__(replace(options, seed=seed), RobotModel.from_urdf(**ARM), self._scene(seed, options))
         first = rng.uniform(0, 2 * np.pi)
         self.cameras = tuple(
             replace(camera, T_world_camera=_view(first + 2 * np.pi / 3 * number + rng.uniform(-0.4, 0.4), rng))
@@ -216,7 +219,7 @@ def trial(kind: str, seed: int, folder: Path) -> list[Error]:
     write_log(setup, log)
     if kind == OPEN3D:
         return list(errors_of_open3d(setup, log))
-    robot = {} if kind == ALONE else {"urdf": SAMPLE / "robot.urdf", "spheres": SAMPLE / "robot_spheres.yaml"}
+    robot = {} if kind == ALONE else ARM
     result = calibrate(CalibrateRequest(paths=(log,), out=folder / "calibration.toml", force=True, **robot))
     return list(errors(kind, setup, result))
 

@@ -109,8 +109,9 @@ def enlarged(frame: RgbdFrame) -> RgbdFrame:
 
 @cache
 def sample_robot() -> RobotModel:
-    """The sample log's arm."""
-    return RobotModel.from_urdf(SAMPLE / "robot.urdf", SAMPLE / "robot_spheres.yaml")
+    """The sample log's arm, its fingers held."""
+    names = [f"panda_joint{number}" for number in range(1, 8)]
+    return RobotModel.from_urdf(SAMPLE / "robot.urdf", SAMPLE / "robot_spheres.yaml").moved_by(names)
 
 
 @cache

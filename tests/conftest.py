@@ -1,4 +1,4 @@
-"""Where tests find data: the project's own sample_data/, and real recordings kept outside it."""
+"""Where tests find data: the project's own sample_data/, an arm without meshes, and real recordings kept outside."""
 
 import os
 from pathlib import Path
@@ -16,6 +16,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 def sample_data() -> Path:
     """The committed simulated recording."""
     return ROOT / "sample_data"
+
+
+@pytest.fixture(scope="session")
+def plain_arm() -> Path:
+    """A folder whose tabletop/ holds the simulated arm, of primitive shapes, and spheres that cover it closely."""
+    return ROOT / "tests" / "data"
 
 
 @pytest.fixture(scope="session")

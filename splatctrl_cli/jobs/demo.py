@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.config import Config
+from splatctrl_cli.config import Config, SceneConfig
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.evaluate.verdict import DAMAGED, Outcome, Reason, Verdict, verdict_of
@@ -39,16 +39,13 @@ from splatctrl_cli.scene_files.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.sources.source import describe, open_source
 
 TRAINING, SCORING = ("cam0", "cam1", "cam2"), ("cam3",)
-CLOSED_LOOP_START = 1.6  # [s]: the visitor appears ahead of the driven arm; started earlier, right where it is
+CLOSED_LOOP_START = 1.8  # [s]: the visitor appears ahead of the driven arm; started earlier, right where it is
 INPUTS = ("log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml")
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "tabletop"  # of a checkout; an installed package has none
 CAPTURE, USING, TRUTH = "{out}/tabletop.capture", "--threads {threads}", "--truth {data}/truth.json"
 ROBOT = "--urdf {data}/robot.urdf --spheres {data}/robot_spheres.yaml"
-RECONSTRUCT = f"reconstruct {CAPTURE} --cameras {','.join(TRAINING)} {ROBOT} -o {{out}}/scene {USING}"
-BAKE = f"sdf-bake {{out}}/scene {ROBOT} {TRUTH} --seen-by {CAPTURE} -o {{out}}/field {USING}"
-SCORE = f"score {{out}}/scene --reference {CAPTURE} --cameras {','.join(SCORING)} -o {{out}}/score {USING}"
+BUDGET = SceneConfig(max_splats=8000)  # 5000 are full when the visitor comes
 AGAINST = f"replay {CAPTURE} --scene {{out}}/scene {ROBOT} {TRUTH}"
-DRIVE = f"{AGAINST} --mode closed-loop --start-time {CLOSED_LOOP_START} -o {{out}}/closed_loop {USING}"
 PICTURES = {
     "renders.png": "photo, render and depth error of each camera",
     "field_slice.png": "a slice of the distance field with the arm's spheres",
@@ -95,7 +92,7 @@ class DemoResult:
 @dataclass(frozen=True, kw_only=True)
 class Step:
     """One step: the words after `splatctrl` that do the same, what does it, and the label that its verdict should
-    have ("done" where it has none).
+    have, or several with "or" between them ("done" where it has none).
     """
 
     words: Sequence[str]
@@ -151,7 +148,7 @@ def _refuse_unusable(data: Path, out: Path) -> None:
 
 
 def _simulation(data: Path, progress: Progress) -> Step:
-    """The step that makes the sample recording anew: with the options of sample_data/make.py."""
+    """The step that makes a recording of the same scene, with the arm of primitive shapes."""
     asked = SimulateRequest(out=data)
     return Step(words=["simulate", "-o", str(data)], run=lambda: simulate(asked, progress), expected="done")
 
@@ -183,19 +180,42 @@ def _steps(data: Path, out: Path, threads: int, progress: Progress) -> list[Step
     def reconstructed() -> ReconstructResult:
         source, options = open_to_train(training), {**DECIDING_OPTIONS, "cameras": ",".join(TRAINING)}
         asked = ReconstructRequest(
-            source=source, out=scene, urdf=urdf, spheres=spheres, options=options, threads=threads
+            source=source,
+            out=scene,
+            config=Config(scene=BUDGET),
+            urdf=urdf,
+            spheres=spheres,
+            options=options,
+            threads=threads,
         )
         return reconstruct(asked, progress)
 
     steps: tuple[tuple[str, Callable[[], StepResult], str], ...] = (
         ("info {data}/log.mcap", lambda: describe(log, SourceOptions()), "done"),
         (f"ingest {{data}}/log.mcap -o {CAPTURE}", lambda: ingest(ingested, progress), "done"),
-        (RECONSTRUCT, reconstructed, "passed"),
+        (
+            f"reconstruct {CAPTURE} --cameras {','.join(TRAINING)} --max-splats {BUDGET.max_splats}"
+            f" {ROBOT} -o {{out}}/scene {USING}",
+            reconstructed,
+            "passed",
+        ),
         ("export {out}/scene -o {out}/tabletop.ply", lambda: export(exported, progress), "done"),
-        (BAKE, lambda: bake(measured, progress), "passed"),
-        (SCORE, lambda: score(scored, progress), "passed"),
+        (
+            f"sdf-bake {{out}}/scene {ROBOT} {TRUTH} --seen-by {CAPTURE} -o {{out}}/field {USING}",
+            lambda: bake(measured, progress),
+            "passed",
+        ),
+        (
+            f"score {{out}}/scene --reference {CAPTURE} --cameras {SCORING[0]} -o {{out}}/score {USING}",
+            lambda: score(scored, progress),
+            "passed",
+        ),
         (f"{AGAINST} -o {{out}}/audit {USING}", lambda: replay(audited, progress), "safe"),
-        (DRIVE, lambda: replay(driven, progress), "margin broken"),  # the map errs by mm, and the truth shows it
+        (
+            f"{AGAINST} --mode closed-loop --start-time {CLOSED_LOOP_START} -o {{out}}/closed_loop {USING}",
+            lambda: replay(driven, progress),
+            "not evaluable or margin broken",  # beside the visitor's lost edge, by a map that errs by mm
+        ),
     )
     return [
         Step(
@@ -217,7 +237,7 @@ def _reason(step: Step, request: DemoRequest, folder: Path, progress: Progress, 
     label = _label(result)
     reason = Reason(
         criterion=step.name,
-        outcome=Outcome.PASSED if label == step.expected else Outcome.FAILED,
+        outcome=Outcome.PASSED if label in step.expected.split(" or ") else Outcome.FAILED,
         sentence=f"expected '{step.expected}', got '{label}'",
         label="not as expected",
     )
@@ -258,7 +278,7 @@ def _draw(data: Path, out: Path, threads: int) -> None:
     scene = open_scene(out / "scene")
     rows = [_comparison(frame, scene, threads) for frame in newest.values()]
     comparison_picture(out / "renders.png", rows)
-    model = RobotModel.from_urdf(data / "robot.urdf", data / "robot_spheres.yaml")
+    model = RobotModel.from_urdf(data / "robot.urdf", data / "robot_spheres.yaml").moved_by(source.joint_names)
     assert joints is not None
     centers = model.sphere_centers(joints.position[model.joint_order(source.joint_names)])
     height = float(np.median(centers[model.moving_spheres][-4:, 2]))

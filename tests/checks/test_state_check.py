@@ -20,19 +20,18 @@ from splatctrl_cli.checks.clock_offset import (
 from splatctrl_cli.checks.finding import Severity
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.records import Float64, Intrinsics, JointState, RgbdFrame
+from splatctrl_cli.records import Float64, Intrinsics, JointState
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.states.state_source import open_states
+from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 
-SAMPLE = Path(__file__).parents[2] / "sample_data" / "tabletop"
 TOOL = transform_from([0.01, -0.02, 0.1], [0.0, 0.0, np.sin(0.4), np.cos(0.4)])
 
 
 @pytest.fixture(scope="module")
-def model() -> RobotModel:
+def model(plain_arm: Path) -> RobotModel:
     T_world_base = transform_from([0.1, 0.2, 0.3], [0.0, 0.0, np.sin(0.3), np.cos(0.3)])
-    return RobotModel.from_urdf(SAMPLE / "robot.urdf", SAMPLE / "robot_spheres.yaml", T_world_base=T_world_base)
+    arm = plain_arm / "tabletop"
+    return RobotModel.from_urdf(arm / "robot.urdf", arm / "robot_spheres.yaml", T_world_base=T_world_base)
 
 
 def motion(model: RobotModel, num: int = 60, amplitude: float = 0.5) -> Float64:
@@ -164,18 +163,17 @@ INTERVAL = 0.2  # [s] between the frames of the sample
 
 
 @pytest.fixture(scope="module")
-def sample() -> tuple[list[JointState], ImageMotion, RobotPoints]:
-    model = RobotModel.from_urdf(SAMPLE / "robot.urdf", SAMPLE / "robot_spheres.yaml")
-    options = SourceOptions(cameras=("cam0", "cam1"))
-    source = open_states(SAMPLE / "log.mcap", options, model.joint_names)
-    states, motion, order = [], ImageMotion(), model.joint_order(source.joint_names)
-    for record in source.records():
-        if isinstance(record, RgbdFrame):
-            motion.add(record)
-        else:
+def sample(plain_arm: Path) -> tuple[list[JointState], ImageMotion, RobotPoints]:
+    arm = plain_arm / "tabletop"
+    model = RobotModel.from_urdf(arm / "robot.urdf", arm / "robot_spheres.yaml")
+    states, motion = [], ImageMotion()
+    for record in Recording(RecordingOptions(color_rays=0), model).records():
+        if isinstance(record, JointState):
             states.append(record)
+        elif record.camera in ("cam0", "cam1"):
+            motion.add(record)
     moving = model.moving_spheres
-    q = np.array([state.position[order] for state in states])
+    q = np.array([state.position for state in states])
     points = RobotPoints(centers=model.sphere_centers_batch(q)[:, moving], radii=model.sphere_set.radii[moving])
     return states, motion, points
 

@@ -54,15 +54,13 @@ def unpainted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.fixture
-def arm(sample_data: Path) -> RobotModel:
-    return RobotModel.from_urdf(
-        sample_data / "tabletop" / "robot.urdf", sample_data / "tabletop" / "robot_spheres.yaml"
-    )
+def arm(plain_arm: Path) -> RobotModel:
+    return RobotModel.from_urdf(plain_arm / "tabletop" / "robot.urdf", plain_arm / "tabletop" / "robot_spheres.yaml")
 
 
 @pytest.fixture
-def desk(tmp_path: Path, sample_data: Path, monkeypatch: pytest.MonkeyPatch, coverage_once: None) -> Desk:
-    tabletop = sample_data / "tabletop"
+def desk(tmp_path: Path, plain_arm: Path, monkeypatch: pytest.MonkeyPatch, coverage_once: None) -> Desk:
+    tabletop = plain_arm / "tabletop"
     robot = ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
     desk = Desk(folder=tmp_path, source=FakeSource(states=logged()), robot=robot)
     opened = state_source.open_states

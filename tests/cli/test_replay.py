@@ -136,7 +136,8 @@ def test_the_truth_is_reported_beside_the_scene(
     out = desk.folder / "out"
     truth = ["--truth", str(tabletop / "truth.json"), "--worst-frames", "0"]  # asks for no frame
     log = str(tabletop / "log.mcap")
-    assert main(["replay", log, *desk.robot, "--scene", str(scene), "-o", str(out), "-q", *truth]) == 5
+    robot = ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
+    assert main(["replay", log, *robot, "--scene", str(scene), "-o", str(out), "-q", *truth]) == 5
     metrics = desk.metrics()
     recorded = json.loads((tabletop / "truth.json").read_text())["clearance"]["min"]
     assert metrics["min_clearance_true"] == pytest.approx(recorded, abs=1e-5)

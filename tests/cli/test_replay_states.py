@@ -99,8 +99,9 @@ def test_logged_end_effector_poses_are_compared_with_the_robot(
 def test_a_log_with_frames_says_how_the_clocks_agree(
     desk: Desk, scene: str, sample_data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = sample_data / "tabletop" / "log.mcap"
-    assert replayed(desk, scene, log, "--cameras", "cam0") == 0
+    tabletop = sample_data / "tabletop"
+    desk.robot[:] = ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
+    assert replayed(desk, scene, tabletop / "log.mcap", "--cameras", "cam0") == 0
     assert "log: clocks of cameras and robot: frames are stamped" in capsys.readouterr().out
     assert abs(states_of_run(desk)["clock_offset"]["offset_s"]) < 0.06
 

@@ -88,8 +88,8 @@ def test_the_sample_arm_keeps_its_bounds_among_balls(sample_arm: RobotModel) -> 
 
 
 @pytest.fixture(scope="module")
-def sample_arm(sample_data: Path) -> RobotModel:
-    tabletop = sample_data / "tabletop"
+def sample_arm(plain_arm: Path) -> RobotModel:
+    tabletop = plain_arm / "tabletop"
     return RobotModel.from_urdf(tabletop / "robot.urdf", tabletop / "robot_spheres.yaml")
 
 

@@ -29,15 +29,15 @@ ROOM = Balls([[0.6, 0.3, 0.5], [-0.4, 0.5, 0.7], [0.2, -0.6, 0.4]], [0.1, 0.05, 
 SLOPE = Plane([0.4, -0.5, 0.6], -1.2, scale=0.8)
 
 
-def sample_arm(sample_data: Path) -> RobotModel:
-    tabletop = sample_data / "tabletop"
+def sample_arm(plain_arm: Path) -> RobotModel:
+    tabletop = plain_arm / "tabletop"
     return RobotModel.from_urdf(tabletop / "robot.urdf", tabletop / "robot_spheres.yaml")
 
 
 @pytest.fixture(scope="session", params=["sample arm", "Panda"])
-def arm(request: pytest.FixtureRequest, sample_data: Path) -> RobotModel:
+def arm(request: pytest.FixtureRequest, plain_arm: Path) -> RobotModel:
     if request.param == "sample arm":
-        return sample_arm(sample_data)
+        return sample_arm(plain_arm)
     real = request.getfixturevalue("real_data")
     spheres = real / "robot_spheres" / "robometrics" / "robometrics" / "content" / "robot" / "franka_spheres.yml"
     urdf = real / "vamp_panda" / "resources" / "panda" / "panda.urdf"
@@ -245,10 +245,8 @@ def test_a_program_without_a_solution_stands_still_because_the_paper_has_no_seco
 
 
 @pytest.mark.parametrize("solver", ["clarabel", "daqp"])
-def test_the_seven_joint_arm_is_driven_alike_by_both_forms(sample_data: Path, solver: str) -> None:
-    arm = RobotModel.from_urdf(
-        sample_data / "tabletop" / "robot.urdf", sample_data / "tabletop" / "robot_spheres.yaml"
-    )
+def test_the_seven_joint_arm_is_driven_alike_by_both_forms(plain_arm: Path, solver: str) -> None:
+    arm = RobotModel.from_urdf(plain_arm / "tabletop" / "robot.urdf", plain_arm / "tabletop" / "robot_spheres.yaml")
     frame, q = arm.frame_names[-1], np.array([0.6, 0.3, 0, -1.8, 0, 2.1, 0.78])
     T = arm.frame_pose(q + 0.3, frame)
     ball = Balls([[0.5, 0.9, 1.2]], [0.05])

@@ -74,10 +74,8 @@ def test_an_obstacle_that_appears_in_the_arm_is_a_hit_of_the_scene_and_not_of_th
     assert trace.steps[1].rung is Rung.RELAXED
 
 
-def test_the_seven_joint_arm_passes_a_sphere_and_keeps_its_distance(sample_data: Path) -> None:
-    arm = RobotModel.from_urdf(
-        sample_data / "tabletop" / "robot.urdf", sample_data / "tabletop" / "robot_spheres.yaml"
-    )
+def test_the_seven_joint_arm_passes_a_sphere_and_keeps_its_distance(plain_arm: Path) -> None:
+    arm = RobotModel.from_urdf(plain_arm / "tabletop" / "robot.urdf", plain_arm / "tabletop" / "robot_spheres.yaml")
     frame = arm.frame_names[-1]
     start, end = np.array([0.6, 0.3, 0, -1.8, 0, 2.1, 0.78]), np.array([-0.6, 0.3, 0, -1.8, 0, 2.1, 0.78])
     ball = Balls([[0.5, 0.0, 0.3]], [0.08])

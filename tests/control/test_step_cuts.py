@@ -29,9 +29,8 @@ TASK = ReplayTask(
 )
 
 
-def sample_arm() -> RobotModel:
-    """The seven-joint arm of the sample data."""
-    folder = Path(__file__).parents[2] / "sample_data" / "tabletop"
+def seven_joints(plain_arm: Path) -> RobotModel:
+    folder = plain_arm / "tabletop"
     return RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
 
 
@@ -112,9 +111,9 @@ def test_a_corner_stops_an_arm_at_both_of_its_sides(max_cuts: int) -> None:
     assert min(step.clearance for step in trace.steps) >= CONFIG.margin - CONFIG.promise_tolerance
 
 
-def test_an_arm_inside_a_shell_of_balls_gets_out() -> None:
+def test_an_arm_inside_a_shell_of_balls_gets_out(plain_arm: Path) -> None:
     """A cylinder of splats appears around the hand: every motion brings some sphere of it nearer to one of them."""
-    arm, q = sample_arm(), np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.0])
+    arm, q = seven_joints(plain_arm), np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.0])
     T_world_goal = arm.frame_pose(np.array([0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 1.6]), "hand")
     turn, height = np.meshgrid(np.arange(0.0, 2 * np.pi, 0.5), np.arange(-0.12, 0.12, 0.03), indexing="ij")
     shell = np.stack([0.06 * np.cos(turn), 0.06 * np.sin(turn), height], axis=-1).reshape(-1, 3)

@@ -38,8 +38,8 @@ def setup() -> SetUp:
 
 
 @pytest.fixture(scope="module")
-def result(setup: SetUp, sample_data: Path, tmp_path_factory: pytest.TempPathFactory) -> CalibrateResult:
-    return calibrated(setup, tmp_path_factory.mktemp("setup"), **robot_in(sample_data))
+def result(setup: SetUp, plain_arm: Path, tmp_path_factory: pytest.TempPathFactory) -> CalibrateResult:
+    return calibrated(setup, tmp_path_factory.mktemp("setup"), **robot_in(plain_arm))
 
 
 @pytest.fixture(scope="module")
@@ -129,11 +129,11 @@ class Biased(SetUp):
     ("biased", "seed", "has_robot"), [("cam1", 2, False), ("cam0", 2, False), ("cam0", 3, False), ("cam1", 2, True)]
 )
 def test_a_depth_bias_is_found_within_its_sigma_and_in_the_camera_that_has_it(
-    biased: str, seed: int, has_robot: bool, tmp_path: Path, sample_data: Path
+    biased: str, seed: int, has_robot: bool, tmp_path: Path, plain_arm: Path
 ) -> None:
     """A scale of the same camera, or the bias of a camera that is taken as recorded, fits nearly as well."""
     setup = Biased(seed, biased)
-    found = calibrated(setup, tmp_path, **(robot_in(sample_data) if has_robot else {}))
+    found = calibrated(setup, tmp_path, **(robot_in(plain_arm) if has_robot else {}))
     for name, camera in found.calibration.cameras.items():
         if name == biased:
             assert abs(camera.bias - 0.01) < 2 * camera.sigma_depth[1] < 0.005
@@ -164,8 +164,8 @@ def wrist() -> SetUp:
 
 
 @pytest.fixture(scope="module")
-def wrist_result(wrist: SetUp, sample_data: Path, tmp_path_factory: pytest.TempPathFactory) -> CalibrateResult:
-    return calibrated(wrist, tmp_path_factory.mktemp("wrist"), **robot_in(sample_data))
+def wrist_result(wrist: SetUp, plain_arm: Path, tmp_path_factory: pytest.TempPathFactory) -> CalibrateResult:
+    return calibrated(wrist, tmp_path_factory.mktemp("wrist"), **robot_in(plain_arm))
 
 
 @pytest.fixture(scope="module")
@@ -261,8 +261,8 @@ class Still(SetUp):
         return replace(scene, motion=replace(scene.motion, waypoints=waypoints))
 
 
-def test_a_robot_that_hardly_moves_is_refused(tmp_path: Path, sample_data: Path) -> None:
-    told = refused(Still(2, SMALL), tmp_path, **robot_in(sample_data))
+def test_a_robot_that_hardly_moves_is_refused(tmp_path: Path, plain_arm: Path) -> None:
+    told = refused(Still(2, SMALL), tmp_path, **robot_in(plain_arm))
     assert "the robot hardly moves" in told
     assert "record it moving" in told
 

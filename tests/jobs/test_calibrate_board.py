@@ -142,19 +142,19 @@ def test_cameras_without_a_recorded_pose_are_placed_against_the_one_that_is_held
 
 
 def test_cameras_half_a_metre_off_the_robot_are_found_by_a_board_in_its_gripper(
-    tmp_path: Path, sample_data: Path
+    tmp_path: Path, plain_arm: Path
 ) -> None:
     setup = Gripped()
-    result = calibrated(setup, tmp_path, board=BOARD, **robot_in(sample_data))
+    result = calibrated(setup, tmp_path, board=BOARD, **robot_in(plain_arm))
     check_errors(setup, result)
     assert result.after is not None and result.after < 0.002  # the board hides half the arm from one of them
 
 
 def test_a_wrist_camera_half_a_metre_off_its_mount_is_found_by_a_board_that_stands_still(
-    tmp_path: Path, sample_data: Path
+    tmp_path: Path, plain_arm: Path
 ) -> None:
     setup = Lying()
-    check_errors(setup, calibrated(setup, tmp_path, board=BOARD, **robot_in(sample_data)))
+    check_errors(setup, calibrated(setup, tmp_path, board=BOARD, **robot_in(plain_arm)))
 
 
 class ShownApart(Shown):
@@ -218,10 +218,10 @@ def test_a_board_seen_by_one_camera_only_is_refused(tmp_path: Path) -> None:
         calibrated(setup, tmp_path, board=BOARD)
 
 
-def test_a_board_that_no_robot_holds_does_not_tie_the_cameras_to_it(tmp_path: Path, sample_data: Path) -> None:
+def test_a_board_that_no_robot_holds_does_not_tie_the_cameras_to_it(tmp_path: Path, plain_arm: Path) -> None:
     """Somebody moves it beside the robot: no link moves as it does."""
     with pytest.raises(NotEvaluableError, match=r"tied to no robot: .*does not move with the robot") as refusal:
-        calibrated(Turning(options=replace(OPTIONS, duration_s=6.0)), tmp_path, board=BOARD, **robot_in(sample_data))
+        calibrated(Turning(options=replace(OPTIONS, duration_s=6.0)), tmp_path, board=BOARD, **robot_in(plain_arm))
     assert "let the gripper hold the board" in (refusal.value.remedy or "")
 
 

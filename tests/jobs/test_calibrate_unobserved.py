@@ -97,19 +97,19 @@ def test_what_is_not_observed_stays_as_recorded_and_the_rest_is_found(tmp_path: 
         assert np.degrees(np.arccos(off[2, 2])) < 0.3 < np.degrees(np.arccos(recorded[2, 2]))
 
 
-def test_a_robot_of_which_one_link_is_seen_does_not_say_all(tmp_path: Path, sample_data: Path) -> None:
+def test_a_robot_of_which_one_link_is_seen_does_not_say_all(tmp_path: Path, plain_arm: Path) -> None:
     options = SourceOptions(cameras=("cam0",))
     with pytest.raises(NotEvaluableError, match=r"not observed: translation along . of the world of cam0"):
-        calibrated(OneLink(2), tmp_path, options=options, **robot_in(sample_data))
+        calibrated(OneLink(2), tmp_path, options=options, **robot_in(plain_arm))
 
 
 def test_a_camera_that_sees_neither_what_the_others_see_nor_the_robot_is_named(
-    tmp_path: Path, sample_data: Path
+    tmp_path: Path, plain_arm: Path
 ) -> None:
     setup = SetUp(2, SMALL)
     away = replace(setup.cameras[2], T_world_camera=look_at([0.6, 0.9, 0.8], [1.6, 1.3, 0.3]))
     setup.cameras = (*setup.cameras[:2], away)
     with pytest.raises(NotEvaluableError) as refusal:
-        calibrated(setup, tmp_path, **robot_in(sample_data))
+        calibrated(setup, tmp_path, **robot_in(plain_arm))
     assert "of cam2" in refusal.value.message or "cam0, cam1 | cam2" in refusal.value.message
     assert "of cam0" not in refusal.value.message and "of cam1" not in refusal.value.message

@@ -16,7 +16,7 @@ def test_a_log_whose_arm_is_as_its_urdf_draws_it_gives_a_self_model_without_part
     folder, out = sample_data / "tabletop", tmp_path / "self.npz"
     found = learn_robot(LearnRequest(log=folder / "log.mcap", urdf=folder / "robot.urdf", out=out))
     assert found.pieces() == [] and len(found.learned) > 3
-    assert "link0" in found.unknown
+    assert "panda_link0" in found.unknown
     model = RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
     assert len(with_self_model(model, out).surface.triangles) == len(model.surface.triangles)
     out.write_bytes(out.read_bytes()[:400])

@@ -20,8 +20,8 @@ KINDS = ("ball", "box", "cylinder", "capsule")
 
 
 @pytest.fixture(scope="module")
-def arm(sample_data: Path) -> RobotModel:
-    folder = sample_data / "tabletop"
+def arm(plain_arm: Path) -> RobotModel:
+    folder = plain_arm / "tabletop"
     return RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
 
 

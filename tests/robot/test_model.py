@@ -154,9 +154,9 @@ def test_a_sphere_set_for_a_sister_robot_fits_by_link_number(real_data: Path) ->
     assert (hand.num_joints, hand.left_out, len(hand.sphere_set.radii)) == (7, (), 61)
 
 
-def test_links_without_a_sphere_are_said(sample_data: Path, real_data: Path, tmp_path: Path) -> None:
-    urdf = sample_data / "tabletop" / "robot.urdf"
-    assert RobotModel.from_urdf(urdf, sample_data / "tabletop" / "robot_spheres.yaml").doubts == ()
+def test_links_without_a_sphere_are_said(plain_arm: Path, real_data: Path, tmp_path: Path) -> None:
+    urdf = plain_arm / "tabletop" / "robot.urdf"
+    assert RobotModel.from_urdf(urdf, plain_arm / "tabletop" / "robot_spheres.yaml").doubts == ()
     few = tmp_path / "few.yaml"
     few.write_text(
         "collision_spheres: {link3: [{center: [0, 0, 0], radius: 0.05}], gripper: [{center: [0, 0, 0], radius: 0.1}]}"

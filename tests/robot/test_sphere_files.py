@@ -152,8 +152,8 @@ def test_the_lever_of_a_spheres_own_joint_is_its_distance_to_the_axis() -> None:
             assert levers[s, body - 1] == pytest.approx(across, abs=1e-12)
 
 
-def test_the_robot_knows_its_lever_arms(sample_data: Path) -> None:
-    arm = RobotModel.from_urdf(sample_data / "tabletop/robot.urdf", sample_data / "tabletop/robot_spheres.yaml")
+def test_the_robot_knows_its_lever_arms(plain_arm: Path) -> None:
+    arm = RobotModel.from_urdf(plain_arm / "tabletop/robot.urdf", plain_arm / "tabletop/robot_spheres.yaml")
     q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (100, arm.num_joints))
     travel = np.max([np.linalg.norm(arm.sphere_jacobians(row), axis=1) for row in q], axis=0)
     assert np.all(travel <= arm.lever_arms() + 1e-12)

@@ -92,9 +92,9 @@ def test_limits_are_those_that_the_maker_publishes(arm: RobotModel) -> None:
     assert arm.joint_names == tuple(joint[0] for joint in JOINTS)
 
 
-def test_the_committed_robot_files_are_what_the_code_writes(sample_data: Path) -> None:
-    assert (sample_data / "tabletop/robot.urdf").read_text() == arm_urdf()
-    assert (sample_data / "tabletop/robot_spheres.yaml").read_text() == arm_spheres_yaml()
+def test_the_committed_robot_files_are_what_the_code_writes(plain_arm: Path) -> None:
+    assert (plain_arm / "tabletop/robot.urdf").read_text() == arm_urdf()
+    assert (plain_arm / "tabletop/robot_spheres.yaml").read_text() == arm_spheres_yaml()
 
 
 def test_visual_shapes_lie_3_mm_inside_of_collision_shapes_and_a_twentieth_27_to_30_mm(

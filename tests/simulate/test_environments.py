@@ -21,8 +21,8 @@ from tests.simulate.limits import DURATIONS, assert_keeps_limits
 
 
 @pytest.fixture(scope="module")
-def robot(sample_data: Path) -> RobotModel:
-    folder = sample_data / "tabletop"
+def robot(plain_arm: Path) -> RobotModel:
+    folder = plain_arm / "tabletop"
     return RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
 
 

@@ -73,10 +73,8 @@ def test_faces_beyond_what_16_bits_number_are_seen_too(monkeypatch: pytest.Monke
     np.testing.assert_array_equal(whole[1], parted[1])
 
 
-def test_the_hand_is_where_the_model_of_the_arm_has_it(sample_data: Path) -> None:
-    arm = RobotModel.from_urdf(
-        sample_data / "tabletop" / "robot.urdf", sample_data / "tabletop" / "robot_spheres.yaml"
-    )
+def test_the_hand_is_where_the_model_of_the_arm_has_it(plain_arm: Path) -> None:
+    arm = RobotModel.from_urdf(plain_arm / "tabletop" / "robot.urdf", plain_arm / "tabletop" / "robot_spheres.yaml")
     for q in np.random.default_rng(0).uniform(arm.lower, arm.upper, (20, 7)):
         np.testing.assert_allclose(hand_pose(q), arm.frame_pose(q, "hand"), atol=1e-12)
 

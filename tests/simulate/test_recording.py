@@ -9,7 +9,10 @@ import pytest
 
 from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
 from splatctrl_cli.geometry import back_project, transform_points
+from splatctrl_cli.mesh_distance import load_mesh
 from splatctrl_cli.records import Float64, JointState, RgbdFrame
+from splatctrl_cli.robot.coverage import coverage_of_solids
+from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.arm import UNMODELLED, Motion, link_shape
@@ -23,10 +26,8 @@ SMALL = {"duration_s": 3.0, "fps": 1.0, "width": 80, "height": 60}
 
 
 @pytest.fixture(scope="module")
-def robot(sample_data: Path) -> RobotModel:
-    return RobotModel.from_urdf(
-        sample_data / "tabletop" / "robot.urdf", sample_data / "tabletop" / "robot_spheres.yaml"
-    )
+def robot(plain_arm: Path) -> RobotModel:
+    return RobotModel.from_urdf(plain_arm / "tabletop" / "robot.urdf", plain_arm / "tabletop" / "robot_spheres.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -253,13 +254,21 @@ def test_a_missing_truth_file_is_an_input_error(tmp_path: Path) -> None:
     assert caught.value.exit_code == 4
 
 
-def test_the_sample_truth_keeps_its_promises(sample_data: Path) -> None:
-    truth = load_truth(sample_data / "tabletop" / "truth.json")
+def test_the_sample_keeps_its_promises(sample_data: Path) -> None:
+    folder = sample_data / "tabletop"
+    truth = load_truth(folder / "truth.json")
     assert truth.robot_urdf.is_file()
     assert truth.robot_spheres.is_file()
     assert all(truth.luminance_std[camera.name] >= 0.15 for camera in truth.cameras if camera.is_training)
-    assert 0.03 < truth.clearance.min() < 0.10
-    assert sum(path.stat().st_size for path in sample_data.rglob("*") if path.is_file()) < 9e6
+    assert 0.03 < truth.clearance.min() < 0.05
+    assert sum(path.stat().st_size for path in sample_data.rglob("*") if path.is_file()) < 10e6
+    robot = RobotModel.from_urdf(truth.robot_urdf, truth.robot_spheres).moved_by(truth.joint_names)
+    assert all((folder / mesh.filename).is_file() for mesh in robot.urdf.meshes)
+    solids = read_solids(robot.urdf)
+    assert coverage_of_solids(robot.urdf, solids, robot.sphere_set, resolution=0.02).max_deficit == 0.0
+    assert {"LICENSE", "NOTICE"} <= {path.name for path in (folder / "meshes").iterdir()}
+    seen = [load_mesh(path) for path in (folder / "meshes" / "visual").iterdir()]
+    assert len(seen) == 10 and max(len(mesh.faces) for mesh in seen) <= 2000
 
 
 def test_a_person_walks_by_and_the_masks_show_where(robot: RobotModel) -> None:

@@ -19,10 +19,8 @@ SEEDS = range(8)
 
 
 @pytest.fixture(scope="module")
-def robot(sample_data: Path) -> RobotModel:
-    return RobotModel.from_urdf(
-        sample_data / "tabletop" / "robot.urdf", sample_data / "tabletop" / "robot_spheres.yaml"
-    )
+def robot(plain_arm: Path) -> RobotModel:
+    return RobotModel.from_urdf(plain_arm / "tabletop" / "robot.urdf", plain_arm / "tabletop" / "robot_spheres.yaml")
 
 
 def axis_of(solid: Primitive, stamp_ns: int) -> Float64:

@@ -38,8 +38,8 @@ class Carrying(FakeSource):
 
 
 @pytest.fixture(scope="module")
-def recorded(sample_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Carrying:
-    tabletop = sample_data / "tabletop"
+def recorded(plain_arm: Path, tmp_path_factory: pytest.TempPathFactory) -> Carrying:
+    tabletop = plain_arm / "tabletop"
     urdf = tmp_path_factory.mktemp("carrying") / "robot.urdf"
     text = (tabletop / "robot.urdf").read_text()
     assert text.count('<link name="hand">') == 1

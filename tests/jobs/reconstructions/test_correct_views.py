@@ -87,10 +87,10 @@ def test_a_bent_depth_is_freed_in_the_map_and_in_the_corrected_figures_alone(
 
 
 def test_where_a_robot_is_judged_depth_stays_as_it_was_recorded(
-    views: list[RgbdFrame], tmp_path: Path, sample_data: Path
+    views: list[RgbdFrame], tmp_path: Path, plain_arm: Path
 ) -> None:
     asked = request(bent(views, a_bend(0.05)), tmp_path / "scene")
-    result = reconstruct(replace(asked, **robot_in(sample_data)))
+    result = reconstruct(replace(asked, **robot_in(plain_arm)))
     assert result.metrics["pose_residual"] > 0
     assert result.metrics["depth_bend"] is None
     assert "depth_bends" not in result.metrics

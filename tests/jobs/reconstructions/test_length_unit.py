@@ -102,8 +102,8 @@ def test_views_that_meet_in_another_unit_only_are_refused(
     assert any(finding.code == "views-scale" for finding in check(CheckRequest(paths=(folder,))).report.findings)
 
 
-def test_a_robot_is_in_metres_and_takes_no_guess(tmp_path: Path, views: list[RgbdFrame], sample_data: Path) -> None:
-    urdf = sample_data / "tabletop/robot.urdf"
+def test_a_robot_is_in_metres_and_takes_no_guess(tmp_path: Path, views: list[RgbdFrame], plain_arm: Path) -> None:
+    urdf = plain_arm / "tabletop/robot.urdf"
     said = refusal(written(tmp_path / "set", views, poses=1000.0, depths=1000.0), urdf=urdf)
     assert "lengths are taken as millimetres" in said
     assert "write poses and depth in metres, or leave the robot out" in said

@@ -109,9 +109,9 @@ def test_collision_geometry_that_cannot_be_read_is_said_and_refused_as_a_margin(
     assert "with --packages DIR; or set control.coverage = report" in capsys.readouterr().err
 
 
-def test_with_the_deficit_in_the_rows_the_surface_keeps_the_margin(arm: RobotModel, sample_data: Path) -> None:
+def test_with_the_deficit_in_the_rows_the_surface_keeps_the_margin(arm: RobotModel, plain_arm: Path) -> None:
     spheres = shrunk(arm.sphere_set)
-    model = RobotModel.from_urdf(sample_data / "tabletop" / "robot.urdf", spheres)
+    model = RobotModel.from_urdf(plain_arm / "tabletop" / "robot.urdf", spheres)
     model = model.with_coverage(coverage_deficit(model.urdf, spheres))
     ball, frame = Balls([BALL[0]], [BALL[1]]), model.frame_names[-1]
     goal = model.frame_pose(START, frame)
@@ -165,8 +165,8 @@ def test_pairs_that_an_srdf_disables_have_no_row(desk: Desk, arm: RobotModel) ->
 
 
 @pytest.mark.painted
-def test_an_fr3_is_reminded_of_its_limits_by_position(sample_data: Path, tmp_path: Path) -> None:
-    tabletop, urdf = sample_data / "tabletop", tmp_path / "fr3.urdf"
+def test_an_fr3_is_reminded_of_its_limits_by_position(plain_arm: Path, tmp_path: Path) -> None:
+    tabletop, urdf = plain_arm / "tabletop", tmp_path / "fr3.urdf"
     urdf.write_text((tabletop / "robot.urdf").read_text().replace('joint name="joint', 'joint name="fr3_joint'))
     model = RobotModel.from_urdf(urdf, tabletop / "robot_spheres.yaml")
     drive, audit = Namespace(mode="closed-loop"), Namespace(mode="audit")
