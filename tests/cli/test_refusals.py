@@ -332,9 +332,12 @@ TEXTS = {
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
     """A folder with something of every kind that the table names."""
-    folder, sample_data = tmp_path_factory.mktemp("world"), request.getfixturevalue("sample_data")
-    for name in ("dtu", "tabletop/robot.urdf", "tabletop/robot_spheres.yaml", "tabletop/truth.json"):
-        (folder / Path(name).name).symlink_to(sample_data / name)
+    folder = tmp_path_factory.mktemp("world")
+    sample_data, plain_arm = (request.getfixturevalue(name) for name in ("sample_data", "plain_arm"))
+    for path in ("dtu", "tabletop/truth.json"):
+        (folder / Path(path).name).symlink_to(sample_data / path)
+    for path in ("robot.urdf", "robot_spheres.yaml"):
+        (folder / path).symlink_to(plain_arm / "tabletop" / path)
     for name, text in TEXTS.items():
         (folder / name).write_text(text)
     for name in ("empty", "logs"):
