@@ -18,14 +18,15 @@ class FixedParts:
 
     A ball of the scene has come where none stood about its place before, by STATIC_CHANGE; beside a sphere at its
     mount, whose map grows, by MOUNTED_CHANGE. It must be nearer by as much than the first clearance, and a camera
-    must have seen its place before. Where the link has triangles, its surface is what the ball is near to.
+    must have seen its place before, and the next scene must have a ball there, too: noise is gone by then. Where the
+    link has triangles, its surface is what the ball is near to.
     """
 
     def __init__(self, model: ArmModel, near: float) -> None:
         """near [m]: a sphere whose first clearance is less stands near its mount."""
         self._model, self._near = model, near
         self._still = np.flatnonzero(~np.asarray(model.moving_spheres))
-        self._stood = np.zeros((0, 3))
+        self._stood = self._new = np.zeros((0, 3))  # of the first scene, and what came in the last one
         names = sphere_names(model.sphere_set)
         self._names = [names[s] for s in self._still]
         self.found: dict[str, tuple[float, float]] = {}
@@ -66,8 +67,13 @@ class FixedParts:
             self._stood = np.concatenate([self._stood, places[is_new_place]])
         moved = np.array([np.linalg.norm(self._stood - place, axis=1).min(initial=np.inf) for place in places])
         owner = away[:, near].argmin(axis=0)
-        for k in np.unique(owner[moved > change[owner]]).tolist():
-            chosen = near[(owner == k) & (moved > change[k])]
+        has_come = moved > change[owner]
+        before, self._new = self._new, places[has_come]
+        for number in np.flatnonzero(has_come):
+            last = np.linalg.norm(before - places[number], axis=1).min(initial=np.inf)
+            has_come[number] = last <= MOUNTED_CHANGE
+        for k in np.unique(owner[has_come]).tolist():
+            chosen = near[(owner == k) & has_come]
             link = model.sphere_set.links[self._still[k]]
             gaps = model.surface_gaps(q[None], balls.centers[chosen], balls.radii[chosen], {link})
             least[k] = max(away[k, chosen].min(), gaps[link][0] if link in gaps else -np.inf)

@@ -30,7 +30,7 @@ def beside(gap: float) -> DistanceFunction:
 )
 def test_what_moves_by_more_than_a_map_does_has_come(gap: float, later: float, has_come: bool) -> None:
     """By a centimetre, or by three beside a sphere at its mount. The surface is 2 cm within the sphere."""
-    found = looked(beside(gap), beside(later))
+    found = looked(beside(gap), beside(later), beside(later))
     first, least = found["base[0]"]
     assert first == pytest.approx(gap)
     assert least == pytest.approx(later + 0.02 if has_come else gap)
@@ -41,15 +41,23 @@ def test_spheres_say_how_near_a_link_without_triangles_is() -> None:
         def surface_gaps(self, *_: object) -> dict[str, Float64]:
             return {}
 
-    assert looked(beside(0.1), beside(0.0), arm=BallArm())["base[0]"][1] == pytest.approx(0.0)
+    assert looked(beside(0.1), beside(0.0), beside(0.0), arm=BallArm())["base[0]"][1] == pytest.approx(0.0)
 
 
 def test_what_is_seen_for_the_first_time_did_not_come_and_stands_there_from_then_on() -> None:
     parts, before, after = FixedParts(ThinArm(), 0.04), beside(0.4), beside(0.0)
     parts.look(before, Q, None)
     parts.look(after, Q, lambda places: places[:, 1] > 0.3)
-    parts.look(after, Q, lambda places: np.ones(len(places), bool))
+    for _ in range(2):
+        parts.look(after, Q, lambda places: np.ones(len(places), bool))
     assert parts.found["base[0]"][1] == pytest.approx(0.4, abs=0.05)
+
+
+def test_what_one_scene_alone_has_is_noise() -> None:
+    """A thing that comes by 5 cm a scene is there in each; one that is elsewhere in the next was nowhere."""
+    assert looked(beside(0.1), beside(0.0), beside(0.1), beside(0.0))["base[0]"][1] == pytest.approx(0.1)
+    coming = [beside(gap) for gap in (0.1, 0.06, 0.035, 0.01)]
+    assert looked(*coming)["base[0]"][1] == pytest.approx(0.03)
 
 
 def test_each_sphere_has_what_is_nearest_to_it() -> None:
@@ -71,7 +79,7 @@ def test_each_sphere_has_what_is_nearest_to_it() -> None:
 
     arm.sphere_centers = centers_at  # type: ignore[method-assign]
     scene = scene_of([FREE, [0.0, 0.1, 0.0], [-0.3, 0.11, 0.0]], [0.01, 0.01, 0.01])
-    found = looked(scene_of([FREE], [0.01]), scene, arm=arm)
+    found = looked(scene_of([FREE], [0.01]), scene, scene, arm=arm)
     assert [least for _, least in found.values()] == pytest.approx([0.06, 0.05])
 
 
