@@ -121,6 +121,7 @@ PAIR_MOST = 100  # of pairs of views that are compared
 PAIR_ROWS = 60  # of an image that are looked at, and as many pixels of a row in proportion
 PAIR_CLOSE_NS = 1_000_000_000  # [ns] poses further apart in time may be anywhere
 SPLATS_ON_SURFACE = 0.6  # of the splats: 0.98 were measured on the sample, 1.00 on apc_shelf, 0.76 on office_sun3d
+BARE_GROUP = 3  # occupied voxels without a splat that touch count at once, fewer in two time steps alone
 OCCUPIED_WITH_SPLATS = 0.95  # of the occupied voxels: 0.993 to 1; splats moved by 10 cm 0.83, of 7 s before 0.88
 SAME_LENS_PIXELS = 0.5  # [px] by which focal lengths and principal points of one camera may differ
 SAME_POSE_METRES = 0.002  # [m] by which two poses of one camera may differ

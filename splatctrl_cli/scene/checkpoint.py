@@ -54,8 +54,9 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
         for index, view in enumerate(views):
             arrays |= {f"{kind}/{index}/{name}": array for name, array in _frame_arrays(view.frame).items()}
     arrays |= {f"seen/{index}": mask.kinds for index, (_, mask) in enumerate(fitter.seen)}
-    balls = fitter.unrepresented
-    arrays |= {"unrepresented/centers": balls.centers, "unrepresented/labels": balls.labels}
+    for name, balls in (("unrepresented", fitter.unrepresented), ("bare", fitter.bare)):
+        if balls is not None:
+            arrays |= {f"{name}/centers": balls.centers, f"{name}/labels": balls.labels}
     return arrays
 
 
@@ -96,9 +97,13 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
     fitter.window = Window(fitter.config)
     fitter.window.newest = [fitter.view(frame) for frame in _frames(arrays, "newest")]
     fitter.window.keyframes = [fitter.view(frame) for frame in _frames(arrays, "keyframe")]
-    centers, labels = (arrays[f"unrepresented/{name}"] for name in ("centers", "labels"))
-    fitter.unrepresented = Balls.of_voxels(
-        np.asarray(centers, np.float32), fitter.occupancy.config.voxel, np.asarray(labels, np.uint8)
+    fitter.unrepresented, fitter.bare = (
+        Balls.of_voxels(
+            np.asarray(arrays[f"{name}/centers"], np.float32),
+            fitter.occupancy.config.voxel,
+            np.asarray(arrays[f"{name}/labels"], np.uint8),
+        )
+        for name in ("unrepresented", "bare")
     )
     kinds = [arrays[f"seen/{index}"] for index in range(sum(name.startswith("seen/") for name in arrays))]
     frames = [view.frame for view in fitter.window.newest[len(fitter.window.newest) - len(kinds) :]]

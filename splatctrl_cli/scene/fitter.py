@@ -61,7 +61,7 @@ from splatctrl_cli.scene.self_mask import (
 )
 from splatctrl_cli.scene.shell import Shell
 from splatctrl_cli.scene.time_steps import AuditRow, Refined
-from splatctrl_cli.scene.unrepresented import bare_voxels, unrepresented_voxels
+from splatctrl_cli.scene.unrepresented import bare_voxels, confirmed, unrepresented_voxels
 from splatctrl_cli.voxels import Balls, KnownVoxels
 
 
@@ -101,6 +101,7 @@ class SceneFitter:
         self.mounted: dict[str, Bool] = {}  # by camera, pixels (H, W) that show what it carries
         self.refined = Refined(num_blocks=0, filled=Filled(), removed=dict.fromkeys(REASONS, 0))
         self._unrepresented: Balls | None = None
+        self.bare: Balls | None = None  # of the last time step, before some were left out
         self.seen: Seen = ()  # frames of the last time step, as its newest views have them, with their masks
 
     def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
@@ -214,7 +215,7 @@ class SceneFitter:
             found = unrepresented_voxels(self.occupancy, self.splats(), self.config, error)
             if self.posture is not None:
                 found = found.select(~self.posture.holds(found.centers, WELL_INSIDE))
-            self._unrepresented = found
+            self._unrepresented, self.bare = confirmed(found, self.bare), found
         return self._unrepresented
 
     @unrepresented.setter

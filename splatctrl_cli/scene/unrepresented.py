@@ -8,10 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import maximum_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import OCCUPIED_WITH_SPLATS, SPLATS_ON_SURFACE
+from splatctrl_cli.config.fixed import BARE_GROUP, OCCUPIED_WITH_SPLATS, SPLATS_ON_SURFACE
 from splatctrl_cli.kernels.points import SplatTree
 from splatctrl_cli.records import Bool, Box, Float32, Label, SplatSet
 from splatctrl_cli.scene.occupancy import OccupancyMap
@@ -34,6 +36,24 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
     is_human = occupancy.entity.reshape(-1)[voxels[is_missing]] & Label.HUMAN > 0
     labels = np.where(is_human, np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
     return Balls.of_voxels(centers[is_missing], occupancy.config.voxel, labels)
+
+
+def confirmed(found: Balls, before: Balls | None) -> Balls:
+    """The balls that touch at least `BARE_GROUP` - 1 others, directly or by others, or that are where one was before.
+
+    Fewer are often noise that is gone with the next time step, or that gap filling has not come to. A thing that
+    moves in a map without splats to spare shows more at once. before: of the last time step, None in the first.
+    """
+    voxel = 2.0 * found.radius / 3**0.5
+    if before is None or not len(found):
+        return found
+    pairs = cKDTree(found.centers).query_pairs(1.01 * 3**0.5 * voxel, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(found), len(found)))
+    group = connected_components(graph, directed=False)[1]
+    is_kept = np.bincount(group)[group] >= BARE_GROUP
+    if len(before):
+        is_kept |= cKDTree(before.centers).query(found.centers)[0] < 0.5 * voxel
+    return found.select(is_kept)
 
 
 def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) -> float:

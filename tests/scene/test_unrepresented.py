@@ -14,6 +14,7 @@ from splatctrl_cli.scene.unrepresented import (
     GridAgreement,
     agreement_with_grid,
     bare_voxels,
+    confirmed,
     representing_reach,
     unrepresented_voxels,
 )
@@ -47,6 +48,34 @@ def test_the_voxels_are_those_of_the_plain_reference(voxel: float) -> None:
     assert 20 < missing.sum() < 0.9 * len(missing)
     assert found.centers.tolist() == centers[missing].astype(np.float32).tolist()
     assert found.radius == pytest.approx(0.5 * 3**0.5 * voxel)
+
+
+def balls(*cells: tuple[int, int, int]) -> Balls:
+    centers = 0.02 * np.array(cells, np.float32).reshape(-1, 3)
+    return Balls.of_voxels(centers, 0.02, np.full(len(cells), Label.OBJECT, np.uint8))
+
+
+LONE, PAIR, ROW = [(0, 0, 0)], [(9, 9, 9), (10, 10, 10)], [(5, 5, 5), (5, 5, 6), (6, 6, 7)]
+
+
+@pytest.mark.parametrize(
+    ("before", "kept"),
+    [
+        pytest.param(None, [*LONE, *PAIR, *ROW], id="the first step knows none before"),
+        pytest.param([], ROW, id="three that touch, by a corner too, count at once"),
+        pytest.param([*LONE, (9, 9, 9)], [*LONE, (9, 9, 9), *ROW], id="what was there before counts"),
+        pytest.param([(0, 0, 1), (10, 9, 9)], ROW, id="beside it is not there"),
+    ],
+)
+def test_few_voxels_count_where_they_were_before(
+    before: list[tuple[int, int, int]] | None, kept: list[tuple[int, int, int]]
+) -> None:
+    found = confirmed(balls(*LONE, *PAIR, *ROW), None if before is None else balls(*before))
+    assert found.centers.tolist() == balls(*kept).centers.tolist()
+
+
+def test_none_are_confirmed_by_none() -> None:
+    assert not len(confirmed(balls(), balls(*LONE)))
 
 
 def test_a_voxel_is_represented_up_to_the_gap_that_is_filled() -> None:
