@@ -204,8 +204,9 @@ def _brought_together(judged: Judged) -> Reason | None:
 
 
 def static_clearance(judged: Judged) -> Iterator[Reason]:
-    """Nothing comes within the margin of a link that no joint moves, by its own surface and 1 cm or more (beside its
-    mount 3 cm) from all that stood there when a camera first looked. What stands there from the start is a note.
+    """Nothing comes within the margin of a link that no joint moves, by its own surface, in two scenes in a row and
+    1 cm or more (beside its mount 3 cm) from all that stood there when a camera first looked. What stands there from
+    the start is a note.
     """
     broken = {
         name: (first, least)
