@@ -186,7 +186,8 @@ class ArrayFile(ABC):
         self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
     ) -> tuple[Stamps, dict[str, Rows]]:
         """`stamps`, and of each group of names its `columns`."""
-        return self.stamps(time, unit_ns, epoch_ns), {key: self.columns(names) for key, names in groups.items()}
+        columns = {key: self.columns(names) for key, names in groups.items()}
+        return self.stamps(time, unit_ns, epoch_ns), columns
 
     def numbers(self, names: Sequence[str]) -> Float64:
         """`columns`, all rows at once."""

@@ -18,6 +18,7 @@ from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import Finding, Severity
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.geometry import pose_at
+from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.survey import survey
@@ -43,10 +44,12 @@ class Table:
 
 
 @pytest.fixture(scope="module")
-def table(sample_data: Path) -> Table:
-    folder = sample_data / "tabletop"
-    model = RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
-    log = open_raw_log(folder / "log.mcap")
+def table(plain_arm: Path, tmp_path_factory: pytest.TempPathFactory) -> Table:
+    folder = tmp_path_factory.mktemp("table")
+    arm = plain_arm / "tabletop"
+    model = RobotModel.from_urdf(arm / "robot.urdf", arm / "robot_spheres.yaml")
+    simulate(SimulateRequest(out=folder / "log"))
+    log = open_raw_log(folder / "log" / "log.mcap")
     states = log_states(survey(log), SourceOptions(), model).states
     assert states is not None
     frames = check_log(log, SourceOptions()).frames
