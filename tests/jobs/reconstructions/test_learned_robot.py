@@ -40,6 +40,7 @@ def request_(sample_data: Path, tmp_path: Path) -> ReconstructRequest:
 def learned(request: ReconstructRequest, *, is_new: bool = True) -> tuple[RobotModel, list[str]]:
     """The robot of a reconstruction whose folder is there already, and what was logged."""
     heard, robot = Said(), RobotModel.from_urdf(request.urdf, request.spheres)  # type: ignore[arg-type]
+    robot = robot.moved_by(request.source.joint_names)
     request.out.mkdir(exist_ok=True)
     found = reconstruct._learned(robot, request, request.out, heard, is_new=is_new)
     assert found is not None
