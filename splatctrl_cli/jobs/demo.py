@@ -214,7 +214,7 @@ def _steps(data: Path, out: Path, threads: int, progress: Progress) -> list[Step
         (
             f"{AGAINST} --mode closed-loop --start-time {CLOSED_LOOP_START} -o {{out}}/closed_loop {USING}",
             lambda: replay(driven, progress),
-            "not evaluable or margin broken",  # beside the visitor's lost edge, by a map that errs by mm
+            "safe or not evaluable or margin broken",  # it presses on its margin, by a map that errs by mm
         ),
     )
     return [
