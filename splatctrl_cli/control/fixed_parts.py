@@ -16,10 +16,10 @@ WasSeen = Callable[[Float64], Bool]
 class FixedParts:
     """`found`: for each fixed sphere its clearance [m] in the first scene, and the least to anything that came later.
 
-    A ball of the scene has come where none stood about its place before, by STATIC_CHANGE; beside a sphere at its
-    mount, whose map grows, by MOUNTED_CHANGE. It must be nearer by as much than the first clearance, and a camera
-    must have seen its place before, and the next scene must have a ball there, too: noise is gone by then. Where the
-    link has triangles, its surface is what the ball is near to.
+    A ball of the scene has come where none stood about its place in the first, by STATIC_CHANGE; beside a sphere at
+    its mount, whose map grows, by MOUNTED_CHANGE. It is nearer than the first clearance by as much, and a camera has
+    seen its place before. The last scene had a ball there, too: noise is in one scene alone. Where the link has
+    triangles, the ball is as near as to its surface.
     """
 
     def __init__(self, model: ArmModel, near: float) -> None:

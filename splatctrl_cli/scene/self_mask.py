@@ -94,7 +94,8 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     is_explained &= depth <= farthest_within(rendered, reach) + tolerance
     if surface.vague:
         is_explained |= np.isin(inside, surface.vague)
-    beside = np.isfinite(nearest_within(rendered, is_robot, wide)) & has_depth
+    nearest = nearest_within(rendered, is_robot, wide)
+    beside = np.isfinite(nearest) & has_depth
     is_sure = depth < nearest_within(rendered, is_robot, edge)  # infinite away from the outline
     is_sure |= cv2.erode(is_robot.view(np.uint8), _window(edge)).view(bool)
     if surface.trees:
@@ -111,7 +112,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     offset = depth - rendered
     is_told = core & has_depth & (np.abs(offset) <= MASK_FAR_OFF) & (link < len(surface.links) - surface.num_carried)
-    is_told &= rendered - nearest_within(rendered, is_robot, wide) < MASK_STEP  # else it may be a nearer part
+    is_told &= rendered - nearest < MASK_STEP  # beside a nearer part stereo may give it that part's depth
     is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
         mask,

@@ -1,4 +1,4 @@
-"""Where a depth camera of two imagers has no depth as one of them alone sees the place: beside what is nearer."""
+"""Shadows of near things in a stereo camera's depth: where one imager alone sees the place, there is no depth."""
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ from splatctrl_cli.records import Bool, Float32, Float64, Index
 
 
 def shadowed(depth: Float32, focal: float) -> Bool:
-    """Pixels (H, W) without depth that the shadow of a nearer thing in their row explains.
+    """Pixels (H, W) without depth that lie in the shadow of something nearer in their row.
 
     depth (H, W) [m], 0 = none; focal [px]. From the other imager, a baseline B away, a thing at depth z hides
     B focal (1/z - 1/z_behind) pixels of what is behind it, always on the same side. Side and baseline are measured
@@ -31,11 +31,11 @@ def shadowed(depth: Float32, focal: float) -> Bool:
 
 
 def _baseline(depth: Float32, following: Index, focal: float) -> float:
-    """Baseline [m] of the shadows at the left of what is nearer, 0 without any: the median over the higher steps.
+    """The baseline [m] that the shadows at the left of nearer things show; 0 where there are no shadows.
 
     following (H, W): the column of the first depth from each pixel on, W = none. A step is a pixel and the next of
-    its row with depth, nearer by `SHADOW_STEP`; it counts by its height. Between them B focal (1/z - 1/z_behind)
-    pixels are lost, less those by which the outline is fattened: of the lower half that is most of them.
+    its row with depth, nearer by `SHADOW_STEP`. Each step gives a baseline by how many pixels are lost in it. The
+    median is taken over the higher half, weighted by height: a fattened outline covers most of the low steps' shadow.
     """
     following = following[:, 1:]
     before = depth[:, :-1]
@@ -46,11 +46,11 @@ def _baseline(depth: Float32, following: Index, focal: float) -> float:
         return 0.0
     height = focal * (1.0 / after[is_step] - 1.0 / before[is_step])
     baselines = (following[is_step] - 1 - columns) / height
-    higher = height >= _middle(height, height)
-    return min(_middle(baselines[higher], height[higher]), SHADOW_BASELINE)
+    higher = height >= _median(height, height)
+    return min(_median(baselines[higher], height[higher]), SHADOW_BASELINE)
 
 
-def _middle(values: Float64, weights: Float64) -> float:
+def _median(values: Float64, weights: Float64) -> float:
     """Median of values (N,), each counted by its weight (N,)."""
     order = np.argsort(values)
     share = np.cumsum(weights[order])
