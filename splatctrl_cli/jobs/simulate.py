@@ -42,8 +42,10 @@ class SimulateRequest:
     force: bool = False
 
     def __post_init__(self) -> None:
-        if self.spheres is not None if self.urdf is None else self.is_slim or self.unmodelled:
-            raise UsageError("--slim, --unmodelled: expected the simulated arm, got --urdf; --spheres: the reverse")
+        if self.urdf is None and self.spheres is not None:
+            raise UsageError(f"--spheres {self.spheres}: needs the robot", remedy="give --urdf as well")
+        if self.urdf is not None and (self.is_slim or self.unmodelled):
+            raise UsageError("--slim, --unmodelled: expected the simulated arm, got --urdf")
 
     @property
     def config(self) -> dict[str, Any]:
