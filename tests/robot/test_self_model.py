@@ -58,14 +58,14 @@ def scene(*, has_bracket: bool = True) -> RobotSurface:
 
 
 def poses(turn: float, lift: float) -> dict[str, Float64]:
-    """Of base, arm and world: the arm turns about z and, at its shoulder 0.36 m up, lifts."""
+    """Of base, world, and arm with its fingers: the arm turns about z and, at its shoulder 0.36 m up, lifts."""
     c, s = np.cos(lift), np.sin(lift)
     T = pose_at((0.0, 0.0, 0.36), turn_about_z(turn)[:3, :3] @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
-    return {"base": np.eye(4), "arm": T, "world": np.eye(4)}
+    return {"base": np.eye(4), "world": np.eye(4), **dict.fromkeys(("arm", "left", "right"), T)}
 
 
 def recorded(
-    moves: list[tuple[float, float]], truth: RobotSurface, noise: float = 0.0
+    moves: list[tuple[float, float]], truth: RobotSurface, noise: float = 0.0, robot: RobotSurface = ROBOT
 ) -> tuple[list[RgbdFrame], Float64]:
     frames, at = [], []
     rng = np.random.default_rng(0)
@@ -86,7 +86,7 @@ def recorded(
                     T_world_camera=T,
                 )
             )
-            at.append(ROBOT.poses(there))
+            at.append(robot.poses(there))
     return frames, np.array(at)
 
 
@@ -118,6 +118,22 @@ def test_a_bracket_that_the_urdf_lacks_is_found_within_a_voxel_and_nothing_else_
 @pytest.mark.parametrize("noise", [0.0, 0.003])
 def test_an_arm_as_its_urdf_draws_it_gets_no_parts(noise: float) -> None:
     assert learned(has_bracket=False, noise=noise).pieces() == []
+
+
+def test_what_two_fingers_hold_between_them_is_robot() -> None:
+    """Each cell is nearer to one of two links that move as one; neither lets go of its half for the other's."""
+    fingers = [
+        Shape(link=link, kind="box", size=(0.06, 0.02, 0.06), T_link_shape=pose_at((0.4, y, 0.0)))
+        for link, y in (("left", 0.05), ("right", -0.05))
+    ]
+    robot = RobotSurface.from_parts([*shapes(has_bracket=False)[:1], shapes()[2], *fingers], fixed=("base",))
+    held = Shape(link="arm", kind="box", size=(0.05, 0.08, 0.16), T_link_shape=pose_at((0.41, 0.0, 0.0)))
+    frames, at = recorded(MOVES, RobotSurface.from_parts([*shapes(has_bracket=False), *fingers, held]), robot=robot)
+    found = learn(robot, robot.links, frames, at).pieces()
+    assert {"left", "right"} <= {link for link, _ in found}
+    corners = np.concatenate([triangles.reshape(-1, 3) for _, triangles in found])  # all frames are one here
+    tips = corners[np.abs(corners[:, 2]) > 0.06]
+    assert np.ptp(tips, axis=0) == pytest.approx((0.05, 0.08, 0.16), abs=2 * VOXEL)
 
 
 def test_links_that_do_not_move_are_named() -> None:
