@@ -84,7 +84,7 @@ class SceneConfig(Section, section="scene"):
             0.001,
             0.1,
             "m",
-            "radius of splats on objects within 2 cm of the moving robot, where contact hides the surface",
+            "apart of splats on objects within 2 cm of the moving robot, twice their radius",
         ),
     ] = 0.010
     gap_reserve: Annotated[float, Within(0, 1, "", "share of the budget kept for such gaps")] = 0.02

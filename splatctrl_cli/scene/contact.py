@@ -61,15 +61,16 @@ def contact_seeds(
     num_threads: int = 1,
     each: Each = map,
 ) -> Seeds:
-    """Seeds of `contact_radius` wherever an object beside the robot has no splat's centre so near; mappable: pixels
-    (H, W) of each frame.
+    """Seeds wherever an object beside the robot has no splat's centre within `contact_radius`, of half that radius:
+    larger ones stand out of a plane by more than the gaps between these are deep. mappable: pixels (H, W) of each
+    frame.
 
     The robot hides where the two meet, and a camera returns no depth at a step: so much of the surface beyond what is
     measured is taken to be there.
     """
     radius = config.contact_radius
     beside = each(lambda one, pixels: contact_pixels(one[0], one[1], robot) & pixels, seen, mappable)
-    return gap_seeds(
+    seeds = gap_seeds(
         [(frame, pixels) for (frame, _), pixels in zip(seen, beside, strict=True)],
         np.zeros((0, 3), np.float32),
         radius,
@@ -79,6 +80,7 @@ def contact_seeds(
         num_threads=num_threads,
         each=each,
     )
+    return replace(seeds, radii=0.5 * seeds.radii)
 
 
 def hidden_objects(

@@ -60,6 +60,7 @@ from splatctrl_cli.scene.self_mask import (
     without_mixed,
 )
 from splatctrl_cli.scene.shell import Shell
+from splatctrl_cli.scene.steady_depth import steadied
 from splatctrl_cli.scene.time_steps import AuditRow, Refined
 from splatctrl_cli.scene.unrepresented import bare_voxels, confirmed, unrepresented_voxels
 from splatctrl_cli.voxels import Balls, KnownVoxels
@@ -117,6 +118,11 @@ class SceneFitter:
             masks = [settled(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
             masks = voted(list(zip(frames, masks, strict=True)), self.occupancy.origin, config.voxel)
         frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
+        before = {view.frame.camera: view.frame for view in self.window.newest}
+        frames = [
+            steadied(frame, before.get(frame.camera), mask.kinds == PixelKind.OBJECT, config)
+            for frame, mask in zip(frames, masks, strict=True)
+        ]
         views = list(self._each(self.view, frames, masks))
         seen = self.seen = list(zip(frames, masks, strict=True))
         if self.descent.background is None:
@@ -377,10 +383,10 @@ class SceneFitter:
         return self.buffer.is_alive & (is_robot if label == Label.ROBOT else ~is_robot)
 
     def _show_contact(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> Filled:
-        """Give objects beside the robot's moving links splats of one radius, no farther apart than it."""
+        """Give objects beside the robot's moving links splats of half `contact_radius`, no farther apart than it."""
         if robot is None:
             return Filled()
-        radius, is_object = self.config.contact_radius, self._standing_for(Label.OBJECT)
+        radius, is_object = 0.5 * self.config.contact_radius, self._standing_for(Label.OBJECT)
         slots = np.flatnonzero(is_object)
         self.buffer.set_radius(slots[is_in_contact(self.buffer.centers[slots], robot)], radius)
         splats = self.splats().select(is_object[self.buffer.is_alive])

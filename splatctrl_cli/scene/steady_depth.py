@@ -1,0 +1,32 @@
+"""Depth averaged over time: a camera that stands still measures a surface that stands still again and again."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.config.fixed import MASK_EDGE, STEADY_GAIN, STEADY_MOVED, STEADY_SIGMAS
+from splatctrl_cli.records import Bool, RgbdFrame
+
+
+def steadied(frame: RgbdFrame, before: RgbdFrame | None, is_object: Bool, config: OccupancyConfig) -> RgbdFrame:
+    """The frame with a running mean of its depth, as far as its pixels (H, W) of objects show what they did before.
+
+    before: the camera's last frame, averaged in the same way. Where it is None or from another pose, the depth stays
+    as it is. A pixel shows the same surface if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2,
+    and the pixels about it by at most `STEADY_MOVED` `depth_error` z^2 on average. A surface that moves along the ray
+    lags by no more than the latter.
+    """
+    if before is None or before.depth.shape != frame.depth.shape:
+        return frame
+    if not np.array_equal(before.T_world_camera, frame.T_world_camera):
+        return frame
+    offset = frame.depth - before.depth
+    error = config.depth_error * frame.depth**2
+    is_same = is_object & (before.depth > 0) & (np.abs(offset) <= STEADY_SIGMAS * error)
+    side = 2 * round(frame.intrinsics.width / MASK_EDGE) + 1
+    weight = is_same.astype(np.float32)
+    total, num = (cv2.boxFilter(image, -1, (side, side), normalize=False) for image in (weight * offset, weight))
+    is_same &= np.abs(total) <= STEADY_MOVED * error * num
+    return replace(frame, depth=np.where(is_same, before.depth + np.float32(STEADY_GAIN) * offset, frame.depth))
