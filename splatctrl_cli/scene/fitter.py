@@ -119,10 +119,13 @@ class SceneFitter:
             masks = voted(list(zip(frames, masks, strict=True)), self.occupancy.origin, config.voxel)
         frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
         before = {view.frame.camera: view.frame for view in self.window.newest}
-        frames = [
-            steadied(frame, before.get(frame.camera), mask.kinds == PixelKind.OBJECT, config)
-            for frame, mask in zip(frames, masks, strict=True)
-        ]
+        frames, steady = zip(
+            *(
+                steadied(frame, before.get(frame.camera), mask.kinds == PixelKind.OBJECT, config)
+                for frame, mask in zip(frames, masks, strict=True)
+            ),
+            strict=True,
+        )
         views = list(self._each(self.view, frames, masks))
         seen = self.seen = list(zip(frames, masks, strict=True))
         if self.descent.background is None:
@@ -149,7 +152,7 @@ class SceneFitter:
         hidden = np.union1d(hidden, hidden_objects(self.buffer, robot, seen, self.occupancy.config))  # drifted there
         self.buffer.parameters[hidden] = as_they_were[hidden]
         self._prune(robot, views, seen, removed)
-        filled += self._show_contact(robot, views, seen)
+        filled += self._show_contact(robot, views, seen, steady)
         filled += self._fill_gaps(views, masks, removed, half=self.num_steps % 2 if self.num_steps else None)
         self._keep_to_surface(robot, views, seen)
         if self.shell is not None:
@@ -382,15 +385,21 @@ class SceneFitter:
         is_robot: Bool = self.buffer.labels == Label.ROBOT
         return self.buffer.is_alive & (is_robot if label == Label.ROBOT else ~is_robot)
 
-    def _show_contact(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> Filled:
-        """Give objects beside the robot's moving links splats of half `contact_radius`, no farther apart than it."""
+    def _show_contact(
+        self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, steady: Sequence[Bool]
+    ) -> Filled:
+        """Give objects beside the robot's moving links splats of half `contact_radius`, no farther apart than it.
+
+        Only where pixels (H, W) of the frames are steady: a single measurement may be noise, which the arm may hide
+        from then on.
+        """
         if robot is None:
             return Filled()
         radius, is_object = 0.5 * self.config.contact_radius, self._standing_for(Label.OBJECT)
         slots = np.flatnonzero(is_object)
         self.buffer.set_radius(slots[is_in_contact(self.buffer.centers[slots], robot)], radius)
         splats = self.splats().select(is_object[self.buffer.is_alive])
-        mappable = [view.mappable for view in views]
+        mappable = [view.mappable & pixels for view, pixels in zip(views, steady, strict=True)]
         seeds = contact_seeds(
             seen, mappable, robot, splats, self.config, num_threads=self.num_threads, each=self._each
         )

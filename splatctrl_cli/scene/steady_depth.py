@@ -10,8 +10,11 @@ from splatctrl_cli.config.fixed import MASK_EDGE, STEADY_GAIN, STEADY_MOVED, STE
 from splatctrl_cli.records import Bool, RgbdFrame
 
 
-def steadied(frame: RgbdFrame, before: RgbdFrame | None, is_object: Bool, config: OccupancyConfig) -> RgbdFrame:
-    """The frame with a running mean of its depth, as far as its pixels (H, W) of objects show what they did before.
+def steadied(
+    frame: RgbdFrame, before: RgbdFrame | None, is_object: Bool, config: OccupancyConfig
+) -> tuple[RgbdFrame, Bool]:
+    """The frame with a running mean of its depth where its pixels (H, W) of objects show what they did before, and
+    those pixels (H, W); all of them where the camera has moved, as nobody can say.
 
     before: the camera's last frame, averaged in the same way. Where it is None or from another pose, the depth stays
     as it is. A pixel shows the same surface if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2,
@@ -19,9 +22,9 @@ def steadied(frame: RgbdFrame, before: RgbdFrame | None, is_object: Bool, config
     lags by no more than the latter.
     """
     if before is None or before.depth.shape != frame.depth.shape:
-        return frame
+        return frame, np.zeros(frame.depth.shape, bool)
     if not np.array_equal(before.T_world_camera, frame.T_world_camera):
-        return frame
+        return frame, np.ones(frame.depth.shape, bool)
     offset = frame.depth - before.depth
     error = config.depth_error * frame.depth**2
     is_same = is_object & (before.depth > 0) & (np.abs(offset) <= STEADY_SIGMAS * error)
@@ -29,4 +32,5 @@ def steadied(frame: RgbdFrame, before: RgbdFrame | None, is_object: Bool, config
     weight = is_same.astype(np.float32)
     total, num = (cv2.boxFilter(image, -1, (side, side), normalize=False) for image in (weight * offset, weight))
     is_same &= np.abs(total) <= STEADY_MOVED * error * num
-    return replace(frame, depth=np.where(is_same, before.depth + np.float32(STEADY_GAIN) * offset, frame.depth))
+    depth = np.where(is_same, before.depth + np.float32(STEADY_GAIN) * offset, frame.depth)
+    return replace(frame, depth=depth), np.asarray(is_same)
