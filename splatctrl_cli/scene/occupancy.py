@@ -113,8 +113,10 @@ class OccupancyMap:
 
         seen: frames of one time step, their pixels (H, W) of the robot and of objects. A voxel that an object's pixel
         hits is solid until a ray passes it or only the robot's pixels hit it: it is not the robot's, whatever else is
-        in it. The robot's voxels become swept.
+        in it. The robot's voxels become swept. One of these that becomes solid has been hit once: what the robot's
+        pixels added says nothing of the object.
         """
+        was_solid = self.entity & SOLID > 0
         self.mark_robot(centers, radii)
         for frame, is_robot, _ in seen:
             self._label_hits(frame, is_robot, set_bits=Label.ROBOT | SWEPT)
@@ -122,6 +124,8 @@ class OccupancyMap:
         for frame, _, is_object in seen:
             self._label_hits(frame, is_object, set_bits=SOLID)
         self.entity[self.entity & SOLID > 0] &= np.uint8(~Label.ROBOT & 0xFF)
+        is_new = (self.entity & (SWEPT | SOLID) == SWEPT | SOLID) & ~was_solid
+        self.log_odds[is_new] = np.minimum(self.log_odds[is_new], self.config.log_odds_hit)
 
     def forget_hidden(self, centers: Float64, radii: Float64, distance: Callable[[Float32], Float64]) -> None:
         """Take back that voxels within the robot are solid, where no solid voxel beside it is connected to them.

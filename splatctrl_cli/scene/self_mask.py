@@ -28,6 +28,7 @@ from splatctrl_cli.config.fixed import (
 from splatctrl_cli.geometry import back_project_pixels, invert_transform, project, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.surface_steps import surface_steps
 from splatctrl_cli.scene.time_steps import AuditRow
 
 
@@ -108,7 +109,8 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
         is_sure[v, u] &= gap > sure
     kinds[is_explained] = PixelKind.ROBOT
     area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0)
-    _judge(kinds, depth, beside, area)
+    is_edge = np.isfinite(nearest_within(rendered, is_robot, edge))
+    _judge(kinds, depth, beside, area, surface_steps(kinds == PixelKind.OBJECT, depth, is_edge, edge, config))
     core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     offset = depth - rendered
     is_told = core & has_depth & (np.abs(offset) <= MASK_FAR_OFF) & (link < len(surface.links) - surface.num_carried)
@@ -124,12 +126,13 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     )
 
 
-def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64) -> None:
+def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Float32) -> None:
     """Find the object pixels (H, W) beside the robot that are too few to believe, in place.
 
-    They are taken by piece of surface: neighbours whose depths differ by less than `MASK_STEP`. A piece that goes on
-    away from the robot is an object. Of the others one is mixed where the area [m^2] of its pixels, as far as neither
-    the sensor's error nor the outline accounts for them, is less than `MASK_SPECK`; doubted, than `MASK_ALONE`.
+    They are taken by piece of surface: neighbours whose depths differ by less than the `steps` (H, W) [m] of both.
+    A piece that goes on away from the robot is an object. Of the others one is mixed where the area [m^2] of its
+    pixels, as far as neither the sensor's error nor the outline accounts for them, is less than `MASK_SPECK`, and
+    doubted where it is less than `MASK_ALONE`.
     """
     is_object = kinds == PixelKind.OBJECT
     chosen = is_object & beside
@@ -144,7 +147,7 @@ def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64) -> None:
         a = (slice(0, depth.shape[0] - dv), slice(max(-du, 0), depth.shape[1] - max(du, 0)))
         b = (slice(dv, depth.shape[0]), slice(max(du, 0), depth.shape[1] + min(du, 0)))
         is_one = (number[a] >= 0) & (number[b] >= 0) & (chosen[a] | chosen[b])
-        is_one &= np.abs(depth[a] - depth[b]) < MASK_STEP
+        is_one &= np.abs(depth[a] - depth[b]) < np.minimum(steps[a], steps[b])
         first.append(number[a][is_one])
         second.append(number[b][is_one])
     pairs = np.concatenate(first), np.concatenate(second)

@@ -133,3 +133,22 @@ def test_a_seed_in_contact_that_a_view_looks_past_is_noise(monkeypatch: pytest.M
     assert 0 < before < 0.012 < OccupancyConfig().see_through
     target.step([view], robot)
     assert np.linalg.norm(target.splats().centers - center, axis=1).min() > 1e-4
+
+
+def test_contact_is_looked_for_where_depth_has_been_measured_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    target, robot, view = robot_over_the_floor()
+    asked: list[Any] = []
+
+    def recorded(seen: Any, mappable: Any, *given: Any, **named: Any) -> Seeds:
+        asked.append(mappable[0])
+        return Seeds(centers=np.zeros((0, 3), np.float32), radii=np.zeros(0, np.float32), colors=np.zeros((0, 3)))
+
+    monkeypatch.setattr(fitter_module, "contact_seeds", recorded)
+    target.step([view], robot)
+    target.step([view], robot)
+    depth, places = view.depth.copy(), np.argwhere(asked[-1])
+    v, u = places[len(places) // 2]
+    depth[v, u] -= 0.05
+    target.step([replace(view, depth=depth)], robot)
+    assert not asked[-1][v, u]
+    assert asked[-1].sum() > 0.9 * asked[-2].sum()

@@ -282,6 +282,21 @@ def test_an_object_that_arrives_where_the_robot_was_is_occupied() -> None:
     assert bits(grid, (0.0, 0.0, VISITOR))[0] & (SWEPT | SOLID) == SWEPT | SOLID
 
 
+def test_what_the_robots_pixels_added_to_a_voxel_is_no_evidence_of_an_object() -> None:
+    grid, robot, away = grid_of(), ball(0.3), ball(5.0)
+    for _ in range(3):
+        labelled(grid, robot, seen_with(robot))
+    top = np.float32([[0.0, 0.0, 0.4]])
+
+    def is_occupied() -> bool:
+        return bool((np.abs(grid.occupied_centers() - top).max(axis=1) < 0.5 * grid.config.voxel).any())
+
+    labelled(grid, away, frame(block=0.4))
+    assert bits(grid, (0.0, 0.0, 0.4))[0] & SOLID and not is_occupied()  # one hit of an object may be noise
+    labelled(grid, away, frame(block=0.4))
+    assert is_occupied()
+
+
 def test_a_voxel_that_the_robot_left_is_not_occupied() -> None:
     grid, robot, away = grid_of(), ball(0.3), ball(5.0)
     for _ in range(3):

@@ -31,10 +31,10 @@ CONFIG = OccupancyConfig()
 TOLERANCE = CONFIG.self_mask_tolerance
 
 
-def ball_depth(center: Float64 = CENTER, radius: float = RADIUS) -> Float64:
+def ball_depth(center: Float64 = CENTER, radius: float = RADIUS, k: Intrinsics = K) -> Float64:
     """Depth (H, W) of a ball, inf where there is none; the camera is the world."""
-    v, u = np.mgrid[: K.height, : K.width]
-    d = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(u.shape)], axis=-1)
+    v, u = np.mgrid[: k.height, : k.width]
+    d = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(u.shape)], axis=-1)
     a, b, c = np.sum(d * d, axis=-1), d @ center, center @ center - radius**2
     root = b * b - a * c
     return np.where(root > 0, (b - np.sqrt(np.maximum(root, 0.0))) / a, np.inf)
@@ -139,6 +139,19 @@ def test_depths_that_lie_between_the_robot_and_what_is_behind_are_no_part_of_eit
     assert (found == PixelKind.MIXED).mean() > 0.8
     is_kept = found == PixelKind.OBJECT
     assert (depth[rim][is_kept] > FLOOR - 0.06).all()  # as near to the floor as neighbours of one surface may be
+
+
+@pytest.mark.parametrize("lift", [0.017, 0.0])
+def test_pixels_on_the_outline_that_lead_from_the_robot_down_to_the_floor_are_no_part_of_it(lift: float) -> None:
+    wide = Intrinsics(fx=640.0, fy=640.0, cx=319.5, cy=239.5, width=640, height=480)
+    depth = np.minimum(ball_depth(k=wide), FLOOR)
+    left = int(np.argmax(depth[240] < FLOOR)) - 1
+    depth[239, left], depth[240, left] = FLOOR - 2.0 * lift, FLOOR - lift  # 17 mm from one to the next
+    view = plain_frame(depth, wide, stamp_ns=5)
+    mask = self_mask(view, robot(), CONFIG)
+    kind = PixelKind.MIXED if lift else PixelKind.OBJECT
+    assert mask.kinds[239:241, left].tolist() == [kind, kind]
+    assert (mask.kinds == PixelKind.MIXED).sum() == (2 if lift else 0)
 
 
 @pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.MIXED), (3, PixelKind.OBJECT)])
