@@ -390,8 +390,8 @@ class SceneFitter:
     ) -> Filled:
         """Give objects beside the robot's moving links splats of half `contact_radius`, no farther apart than it.
 
-        Only where pixels (H, W) of the frames are steady: a single measurement may be noise, which the arm may hide
-        from then on.
+        They come from the steady pixels (H, W) of each frame alone. A single measurement may be noise, and stays in
+        the map for as long as the arm hides its place.
         """
         if robot is None:
             return Filled()

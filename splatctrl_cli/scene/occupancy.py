@@ -113,8 +113,8 @@ class OccupancyMap:
 
         seen: frames of one time step, their pixels (H, W) of the robot and of objects. A voxel that an object's pixel
         hits is solid until a ray passes it or only the robot's pixels hit it: it is not the robot's, whatever else is
-        in it. The robot's voxels become swept. One of these that becomes solid has been hit once: what the robot's
-        pixels added says nothing of the object.
+        in it. The robot's voxels become swept. When one of them becomes solid, its log-odds fall to those of one
+        hit: the robot's own pixels are no evidence of an object.
         """
         was_solid = self.entity & SOLID > 0
         self.mark_robot(centers, radii)

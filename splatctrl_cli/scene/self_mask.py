@@ -97,7 +97,8 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
         is_explained |= np.isin(inside, surface.vague)
     nearest = nearest_within(rendered, is_robot, wide)
     beside = np.isfinite(nearest) & has_depth
-    is_sure = depth < nearest_within(rendered, is_robot, edge)  # infinite away from the outline
+    nearest_at_edge = nearest_within(rendered, is_robot, edge)  # infinite away from the outline
+    is_sure = depth < nearest_at_edge
     is_sure |= cv2.erode(is_robot.view(np.uint8), _window(edge)).view(bool)
     if surface.trees:
         is_near = depth < farthest_within(rendered, wide) + CONTACT_THICKNESS
@@ -109,8 +110,8 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
         is_sure[v, u] &= gap > sure
     kinds[is_explained] = PixelKind.ROBOT
     area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0)
-    is_edge = np.isfinite(nearest_within(rendered, is_robot, edge))
-    _judge(kinds, depth, beside, area, surface_steps(kinds == PixelKind.OBJECT, depth, is_edge, edge, config))
+    is_object, is_edge = kinds == PixelKind.OBJECT, np.isfinite(nearest_at_edge)
+    _judge(kinds, depth, beside, area, surface_steps(is_object, depth, is_edge, edge, tolerance, config.depth_error))
     core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     offset = depth - rendered
     is_told = core & has_depth & (np.abs(offset) <= MASK_FAR_OFF) & (link < len(surface.links) - surface.num_carried)

@@ -13,13 +13,14 @@ from splatctrl_cli.records import Bool, RgbdFrame
 def steadied(
     frame: RgbdFrame, before: RgbdFrame | None, is_object: Bool, config: OccupancyConfig
 ) -> tuple[RgbdFrame, Bool]:
-    """The frame with a running mean of its depth where its pixels (H, W) of objects show what they did before, and
-    those pixels (H, W); all of them where the camera has moved, as nobody can say.
+    """The frame with a running mean of its depth, and its steady pixels (H, W).
 
-    before: the camera's last frame, averaged in the same way. Where it is None or from another pose, the depth stays
-    as it is. A pixel shows the same surface if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2,
-    and the pixels about it by at most `STEADY_MOVED` `depth_error` z^2 on average. A surface that moves along the ray
-    lags by no more than the latter.
+    A pixel of objects (H, W) is steady where it shows the same surface as before, and its depth is the mean. That is
+    where its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2, and the depths about it by at most
+    `STEADY_MOVED` `depth_error` z^2 on average. A surface that moves along the ray lags by no more than the latter.
+
+    before: the camera's last frame, averaged in the same way; without one no pixel is steady. Once the camera has
+    moved its frames cannot be compared: the depth stays as it is, and all pixels count as steady.
     """
     if before is None or before.depth.shape != frame.depth.shape:
         return frame, np.zeros(frame.depth.shape, bool)

@@ -141,6 +141,18 @@ def test_depths_that_lie_between_the_robot_and_what_is_behind_are_no_part_of_eit
     assert (depth[rim][is_kept] > FLOOR - 0.06).all()  # as near to the floor as neighbours of one surface may be
 
 
+@pytest.mark.parametrize("before", [0.02, 0.05])
+def test_a_rod_that_goes_on_beyond_the_outline_is_an_object_up_to_it(before: float) -> None:
+    """6 mm thick, before a floor with the sensor's noise: the plane beside the outline takes none of it."""
+    wide = Intrinsics(fx=640.0, fy=640.0, cx=319.5, cy=239.5, width=640, height=480)
+    depth = np.minimum(ball_depth(k=wide), FLOOR)
+    left = int(np.argmax(depth[240] < FLOOR))
+    depth[239:242, left - 60 : left] = FLOOR - before
+    noise = np.random.default_rng(0).normal(0.0, CONFIG.depth_error, depth.shape)
+    mask = self_mask(plain_frame(depth + noise * depth**2, wide, stamp_ns=5), robot(), CONFIG)
+    assert (mask.kinds[239:242, left - 60 : left - 1] == PixelKind.OBJECT).mean() > 0.97
+
+
 @pytest.mark.parametrize("lift", [0.017, 0.0])
 def test_pixels_on_the_outline_that_lead_from_the_robot_down_to_the_floor_are_no_part_of_it(lift: float) -> None:
     wide = Intrinsics(fx=640.0, fy=640.0, cx=319.5, cy=239.5, width=640, height=480)

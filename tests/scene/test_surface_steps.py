@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import MASK_STEP
 from splatctrl_cli.records import Bool, Float32
 from splatctrl_cli.scene.surface_steps import surface_steps
 
 SHAPE, EDGE = (200, 300), 5
-SENSOR = OccupancyConfig(depth_error=0.002, self_mask_tolerance=0.004)
+ERROR = 0.002  # [m] at 1 m
 V, U = np.indices(SHAPE)
 ROBOT = (V < 100) & (U >= 100) & (U < 200)
 IS_EDGE = (V < 100 + EDGE) & (U >= 100 - EDGE) & (U < 200 + EDGE) & ~ROBOT
@@ -18,11 +17,15 @@ IS_EDGE = (V < 100 + EDGE) & (U >= 100 - EDGE) & (U < 200 + EDGE) & ~ROBOT
 def table(rng: np.random.Generator) -> Float32:
     """A slanted plane 1.3 to 1.5 m away, with noise of 2 mm at 1 m."""
     z = 1.0 / (1.0 / 1.5 + 6e-4 * V - 1e-4 * U)
-    return np.asarray(z + 0.002 * z**2 * rng.standard_normal(SHAPE), np.float32)
+    return np.asarray(z + ERROR * z**2 * rng.standard_normal(SHAPE), np.float32)
+
+
+def tolerance(z: Float32) -> Float32:
+    return np.asarray(0.004 + 2.0 * ERROR * z**2, np.float32)
 
 
 def steps(depth: Float32, is_object: Bool = ~ROBOT) -> Float32:
-    return surface_steps(is_object, depth, IS_EDGE, EDGE, SENSOR)
+    return surface_steps(is_object, depth, IS_EDGE, EDGE, tolerance(depth), ERROR)
 
 
 def test_pixels_off_the_plane_beside_the_outline_have_half_of_their_distance() -> None:
@@ -59,7 +62,7 @@ def test_too_little_of_a_plane_says_nothing() -> None:
 def test_the_plane_is_the_least_squares_plane_of_the_pixels_beyond(sigmas: float) -> None:
     rng = np.random.default_rng(3)
     depth = table(rng)
-    depth[102, 150] -= np.float32(0.004 + sigmas * 2.0 * 0.002 * 1.4**2)
+    depth[102, 150] -= np.float32(0.004 + sigmas * 2.0 * ERROR * 1.4**2)
     v, u = 102, 150
     z = float(depth[v, u])
     expected = MASK_STEP
@@ -68,6 +71,6 @@ def test_the_plane_is_the_least_squares_plane_of_the_pixels_beyond(sigmas: float
         design = np.column_stack([np.ones(np.count_nonzero(beyond)), U[beyond], V[beyond]])
         plane = np.linalg.lstsq(design, 1.0 / depth[beyond].astype(np.float64), rcond=None)[0]
         off = float(abs(1.0 / z - plane @ [1.0, u, v])) * z**2
-        if off > 0.004 + 2.0 * 0.002 * z**2:
+        if off > tolerance(depth)[v, u]:
             expected = min(expected, 0.5 * off)
     assert steps(depth)[v, u] == pytest.approx(expected, abs=1e-6)

@@ -5,6 +5,7 @@
 #include "bind.h"
 #include "points.h"
 #include "surface_image.h"
+#include "surface_steps.h"
 
 namespace splatctrl {
 namespace {
@@ -71,6 +72,22 @@ void bind_surface(nb::module_& m) {
       nb::arg("triangles").noconvert(), nb::arg("triangle_links").noconvert(), nb::arg("link_poses").noconvert(),
       nb::arg("measured").noconvert(), nb::arg("tolerance"), nb::arg("quadratic"),
       nb::arg("depth").noconvert(), nb::arg("link").noconvert(), nb::arg("inside").noconvert(), nb::arg("num_threads"));
+  m.def(
+      "surface_steps",
+      [](const Array<const float, nb::ndim<2>>& depth, const Array<const float>& tolerance,
+         const Array<const std::uint8_t>& support, const Array<const std::uint8_t>& asked, int reach, double variance,
+         double residual, const Array<float>& steps) {
+        const std::size_t size = depth.size();
+        expect(tolerance.size() == size && support.size() == size && asked.size() == size && steps.size() == size,
+               "expected images (H, W)");
+        const PlaneImage image{depth.data(), tolerance.data(), support.data(), asked.data(),
+                               static_cast<int>(depth.shape(0)), static_cast<int>(depth.shape(1))};
+        const nb::gil_scoped_release release;
+        surface_steps(image, reach, {variance, residual}, steps.data());
+      },
+      nb::arg("depth").noconvert(), nb::arg("tolerance").noconvert(), nb::arg("support").noconvert(),
+      nb::arg("asked").noconvert(), nb::arg("reach"), nb::arg("variance"), nb::arg("residual"),
+      nb::arg("steps").noconvert());
 }
 
 }  // namespace splatctrl
