@@ -91,7 +91,8 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     link, inside = shown.link[part], shown.inside[part]
     has_depth, is_robot = depth > 0, rendered > 0
     tolerance = tolerance_at(depth, config)
-    is_explained = has_depth & (depth >= nearest_within(rendered, is_robot, reach) - tolerance)
+    is_behind = depth >= nearest_within(rendered, is_robot, reach) - tolerance
+    is_explained = has_depth & is_behind
     is_explained &= depth <= farthest_within(rendered, reach) + tolerance
     if surface.vague:
         is_explained |= np.isin(inside, surface.vague)
@@ -105,7 +106,9 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
         v, u = np.nonzero(beside & is_near & ~is_explained)
         rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
         sure = tolerance_at(depth[v, u], config, MASK_SURE) + edge * depth[v, u] / np.float32(frame.intrinsics.fx)
-        gap = surface.distance(T_world_link, transform_points(frame.T_world_camera, rays), within=sure)
+        gap = surface.distance(
+            T_world_link, transform_points(frame.T_world_camera, rays), within=sure, outside=~is_behind[v, u]
+        )
         is_explained[v, u] = gap <= tolerance[v, u]
         is_sure[v, u] &= gap > sure
     kinds[is_explained] = PixelKind.ROBOT

@@ -10,40 +10,42 @@ namespace {
 
 // Of the support in one column of a window: its number, and sums of y, y^2, 1/z, y/z and 1/z^2.
 struct ColumnSums {
-  explicit ColumnSums(int width) : num(width), y(width), yy(width), i(width), yi(width), ii(width) {}
-
-  void add_row(const PlaneImage& image, int row, double sign) {
-    const std::size_t first = static_cast<std::size_t>(row) * image.width;
-    for (int x = 0; x < image.width; ++x) {
-      if (!image.support[first + x]) continue;
-      const double inverse = 1.0 / image.depth[first + x];
-      num[x] += sign;
-      y[x] += sign * row;
-      yy[x] += sign * row * row;
-      i[x] += sign * inverse;
-      yi[x] += sign * row * inverse;
-      ii[x] += sign * inverse * inverse;
-    }
-  }
-
-  std::vector<double> num, y, yy, i, yi, ii;
+  double num, y, yy, i, yi, ii;
 };
 
+void add_row(std::vector<ColumnSums>& columns, const PlaneImage& image, int row, double sign) {
+  const std::size_t first = static_cast<std::size_t>(row) * image.width;
+  const double y = row, signed_y = sign * y;
+  for (int x = 0; x < image.width; ++x) {
+    if (!image.support[first + x]) continue;
+    const double inverse = 1.0 / image.depth[first + x], signed_inverse = sign * inverse;
+    ColumnSums& sums = columns[x];
+    sums.num += sign;
+    sums.y += signed_y;
+    sums.yy += signed_y * y;
+    sums.i += signed_inverse;
+    sums.yi += signed_inverse * y;
+    sums.ii += signed_inverse * inverse;
+  }
+}
+
 // How far [1/m] 1 / z of pixel (u, v) lies from the plane of the columns first to last; 0 where there is none.
-double off_plane(const ColumnSums& column, int first, int last, int u, int v, double inverse, const PlaneRule& rule) {
+double off_plane(const std::vector<ColumnSums>& columns, int first, int last, int u, int v, double inverse,
+                 const PlaneRule& rule) {
   double num = 0, x = 0, y = 0, i = 0, xx = 0, xy = 0, yy = 0, xi = 0, yi = 0, ii = 0;
   for (int at = first; at <= last; ++at) {  // x and y from the pixel
-    const double dx = at - u, dy = column.y[at] - v * column.num[at];
-    num += column.num[at];
-    x += dx * column.num[at];
+    const ColumnSums& column = columns[at];
+    const double dx = at - u, dy = column.y - v * column.num;
+    num += column.num;
+    x += dx * column.num;
     y += dy;
-    i += column.i[at];
-    xx += dx * dx * column.num[at];
+    i += column.i;
+    xx += dx * dx * column.num;
     xy += dx * dy;
-    yy += column.yy[at] - v * (column.y[at] + dy);
-    xi += dx * column.i[at];
-    yi += column.yi[at] - v * column.i[at];
-    ii += column.ii[at];
+    yy += column.yy - v * (column.y + dy);
+    xi += dx * column.i;
+    yi += column.yi - v * column.i;
+    ii += column.ii;
   }
   if (num < 3) return 0.0;
   x /= num, y /= num, i /= num;
@@ -60,17 +62,17 @@ double off_plane(const ColumnSums& column, int first, int last, int u, int v, do
 }  // namespace
 
 void surface_steps(const PlaneImage& image, int reach, const PlaneRule& rule, float* steps) {
-  ColumnSums column(image.width);
-  for (int row = 0; row < std::min(reach, image.height); ++row) column.add_row(image, row, 1.0);
+  std::vector<ColumnSums> columns(image.width);
+  for (int row = 0; row < std::min(reach, image.height); ++row) add_row(columns, image, row, 1.0);
   for (int v = 0; v < image.height; ++v) {
-    if (v + reach < image.height) column.add_row(image, v + reach, 1.0);
-    if (v > reach) column.add_row(image, v - reach - 1, -1.0);
+    if (v + reach < image.height) add_row(columns, image, v + reach, 1.0);
+    if (v > reach) add_row(columns, image, v - reach - 1, -1.0);
     for (int u = 0; u < image.width; ++u) {
       const std::size_t at = static_cast<std::size_t>(v) * image.width + u;
       if (!image.asked[at]) continue;
       const int first = std::max(u - reach, 0), last = std::min(u + reach, image.width - 1);
       const double z = image.depth[at];
-      const double off = off_plane(column, first, last, u, v, 1.0 / z, rule) * z * z;
+      const double off = off_plane(columns, first, last, u, v, 1.0 / z, rule) * z * z;
       if (off > image.tolerance[at]) steps[at] = std::min(steps[at], static_cast<float>(0.5 * off));
     }
   }
