@@ -330,7 +330,7 @@ def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
 
 def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:
     """Depth as uint16 counts of `unit`; None where they would not give the depth back."""
-    if depth.max(initial=0.0) / unit > 65535.5:
+    if depth.max(initial=0.0) / unit > 65534.5:
         return None
     counts = np.round(depth / np.float32(unit)).astype(np.uint16)
     error = np.abs(metres(counts, unit) - depth).max(initial=0.0)

@@ -49,6 +49,7 @@ class ImageWatch:
     def __init__(self, where: str, scale: float | None = None) -> None:
         self.where, self.scale = where, scale
         self.count = self.num_decoded = self.num_bad = self.num_without_depth = self.num_invalid = 0
+        self.num_repeats, self._last_depth = 0, np.zeros((0, 0), np.float32)
         self.first_bad_ns: int | None = None
         self.first_bad = ""
         self.encodings: Counter[str] = Counter()
@@ -93,6 +94,8 @@ class ImageWatch:
         self.add_undecoded(encoding, width, height)
         self.num_decoded += 1
         self.num_invalid += num_invalid
+        self.num_repeats += bool(depth.any()) and np.array_equal(depth, self._last_depth)
+        self._last_depth = depth
         stride = stride_of(height)
         small = depth[::stride, ::stride]
         valid = small[small > 0]
@@ -199,9 +202,14 @@ def depth_findings(images: ImageWatch) -> list[Finding]:
         text = f"{100 * share:.0f} % of the pixels have depth (median of the images)"
         found.append(severity("depth-share", where, text, value=share))
     if images.num_invalid:
-        text = f"{images.num_invalid} depth pixels of {images.num_decoded} images are NaN, infinite or negative"
+        text = (
+            f"{images.num_invalid} depth pixels of {images.num_decoded} images are NaN, infinite, negative or 65535"
+        )
         text += ": they count as none"
         found.append(note("depth-invalid", where, text, value=images.num_invalid))
+    if images.num_repeats:
+        text = f"{images.num_repeats} of {images.num_decoded} depth images equal the one before to the bit"
+        found.append(warning("depth-repeats", where, text, value=images.num_repeats))
     return [*found, *_scale(images)]
 
 

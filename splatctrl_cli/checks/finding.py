@@ -86,7 +86,9 @@ depth-share | note, warning |  | less than half of the pixels have depth; a warn
     unseen: dark or shiny things, too near, or warped depth with holes
 depth-empty | warning, error | later | depth images without any depth; an error where all are | is the projector on,
     and the scene within its range?
-depth-invalid | note |  | pixels that are NaN, infinite or negative
+depth-invalid | note |  | pixels that are NaN, infinite, negative or 65535, the format's largest count
+depth-repeats | warning |  | depth images that equal the one before to the bit | look for a driver that publishes its
+    last image again; they are no new evidence, and only depth that was made without noise may stay the same
 principal-point | warning, error | later | cx or cy over 15 % of the size off the middle; an error, naming the size,
     where both fit another image size
 focal-ratio | warning |  | fx and fy differ by over 5 %

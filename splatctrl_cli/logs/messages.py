@@ -64,6 +64,7 @@ _LAYOUT = {  # channels and dtype by encoding
     **dict.fromkeys(["16UC1", "mono16"], (1, "u2")),
     "32FC1": (1, "f4"),
 }
+NO_RETURN = 65535  # counts by which a camera of 16 bits says that it measured nothing
 _DEPTH_HEAD = 12  # bytes of compressed_depth_image_transport before its image
 _MOSAICS = frozenset({*BAYER, *BAYER_16})
 _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
@@ -236,8 +237,8 @@ def depth_of(image: ImageMessage, scale: float | None) -> Float32:
 
 
 def num_invalid(depth: NDArray[Any]) -> int:
-    """Pixels of a depth image (H, W) as recorded that are NaN, infinite or negative: what no camera measured."""
-    return 0 if depth.dtype.kind == "u" else int((~np.isfinite(depth) | (depth < 0)).sum())
+    """Pixels of a depth image (H, W) as recorded that are NaN, infinite, negative or `NO_RETURN`: not measured."""
+    return int((depth == NO_RETURN if depth.dtype.kind == "u" else ~np.isfinite(depth) | (depth < 0)).sum())
 
 
 def measured(depth: NDArray[Any], scale: float) -> Float32:
@@ -247,8 +248,11 @@ def measured(depth: NDArray[Any], scale: float) -> Float32:
 
 
 def metres(counts: NDArray[Any], scale: float) -> Float32:
-    """Integer depth counts (H, W) as float32 [m]; the one formula, so that re-reading gives the same bits."""
+    """Integer depth counts (H, W) as float32 [m], 0 where they are `NO_RETURN`; the one formula, so that re-reading
+    gives the same bits.
+    """
     depth = counts.astype(np.float32)
+    depth[counts == NO_RETURN] = 0.0
     depth *= np.float32(scale)
     return depth
 

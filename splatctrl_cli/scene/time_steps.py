@@ -1,5 +1,6 @@
 """Groups a stream of records into time steps, finds the workspace, and what is reported of each step."""
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import FRAMES_PER_STEP, JOINTS_GAP_NS
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Box, Float64, JointState, PointCloud, Record, RgbdFrame
+from splatctrl_cli.records import Box, Float32, Float64, JointState, PointCloud, Record, RgbdFrame
 from splatctrl_cli.scene.buffer import Filled
 from splatctrl_cli.scene.seeding import thinned, thinning, world_points_at
 
@@ -99,11 +100,15 @@ def time_steps(
     has_clock: bool,
     tolerance_ns: int = 20_000_000,
     observe: Callable[[Record], None] = lambda record: None,
+    repeats: Counter[str] | None = None,
 ) -> Iterator[TimeStep]:
     """Group the frames of `cameras`: with a clock by stamp, else up to FRAMES_PER_STEP views at a time.
 
-    observe: is shown every record on its way, of whatever camera, so that one pass serves both.
+    With a clock, a frame whose depth equals its camera's last one to the bit shows nothing new: it is left out, and
+    counted in `repeats` by camera. observe: is shown every record on its way, of whatever camera, so that one pass
+    serves both.
     """
+    newest_depth: dict[str, Float32] = {}
     frames: list[RgbdFrame] = []
     newest: JointState | None = None
     at_frames: JointState | None = None
@@ -113,6 +118,12 @@ def time_steps(
             newest = record
             continue
         if record.camera not in cameras:
+            continue
+        before = newest_depth.get(record.camera)
+        newest_depth[record.camera] = record.depth
+        if has_clock and before is not None and before.any() and np.array_equal(before, record.depth):
+            if repeats is not None:
+                repeats[record.camera] += 1
             continue
         if frames and _is_complete(frames, record, has_clock=has_clock, tolerance_ns=tolerance_ns):
             yield _time_step(frames, at_frames)

@@ -268,7 +268,7 @@ def test_the_script_of_the_page_writes_a_capture(tmp_path: Path, capsys: pytest.
     records = list(source.records())
     frames = [record for record in records if isinstance(record, RgbdFrame)]
     assert [frame.stamp_ns for frame in frames] == [0, 100_000_000]
-    assert np.unique(frames[1].depth).tolist() == [np.float32(1.25)]
+    assert np.unique(frames[1].depth).tolist() == [np.float32(1.251)]
     assert frames[1].T_world_camera[0, 3] == pytest.approx(0.1)
     assert [record.position.tolist() for record in records if isinstance(record, JointState)] == [[0.0]]
     assert source.loss.damaged == 0

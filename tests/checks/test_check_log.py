@@ -21,6 +21,7 @@ from splatctrl_cli.sources.source import open_logs
 from tests.logs.make_log import (
     FRAME_NS,
     START_NS,
+    WIDTH,
     Change,
     LogRecipe,
     Message,
@@ -119,6 +120,11 @@ def half_the_depth(log_time: int, topic: str, kind: str, message: Any) -> Iterat
 
 def _with(**values: Any) -> Edit:
     return lambda message: [setattr(message, name, value) for name, value in values.items()]
+
+
+def _last_again(message: Any) -> None:
+    """All pixels as in the image before, where the first row alone differs."""
+    message.data[: 2 * WIDTH] = 0
 
 
 def _cut(message: Any) -> None:
@@ -225,6 +231,8 @@ FAULTS = [
     Fault(code="depth-share", change=edited(DEPTH, _dark(23)), beside=True),
     Fault(code="depth-empty", severity=ERROR, change=edited(DEPTH, _dark(24)), beside=True),
     Fault(code="depth-invalid", severity=NOTE, recipe=replace(GOOD, depth_encoding="32FC1"), value=30, beside=True),
+    Fault(code="depth-repeats", change=edited(DEPTH, _last_again, first=20), where=DEPTH, value=9,
+          what="9 of 30 depth images equal the one before"),
     Fault(code="principal-point", change=edited(INFO, _of_info(0.13, 2)), beside=True),
     Fault(code="principal-point", severity=ERROR, change=edited(INFO, _of_info(2, 0, 2, 4, 5)), beside=True),
     Fault(code="focal-ratio", change=edited(INFO, _of_info(1.3, 4)), beside=True),

@@ -142,7 +142,7 @@ def _with_alien(log: Path, path: Path) -> Path:
     return write_raw(path, [*extra, *messages_of(log)])
 
 
-COUNTS = np.array([[0, 1, 500], [1000, 40000, 65535]], dtype=np.uint16)
+COUNTS = np.array([[0, 1, 500], [1000, 40000, 65534]], dtype=np.uint16)
 
 
 def encoded_rvl(pixels: np.ndarray[Any, np.dtype[np.uint16]]) -> bytes:

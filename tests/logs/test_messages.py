@@ -11,11 +11,11 @@ import pytest
 
 from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.logs.decoder import COMPRESSED_IMAGE, IMAGE, UndecodableMessageError
-from splatctrl_cli.logs.messages import color_of, depth_of, read_image
+from splatctrl_cli.logs.messages import color_of, depth_of, num_invalid, read_image
 from tests.logs.make_log import header
 
 RGB = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
-COUNTS = np.array([[0, 1, 500], [1000, 40000, 65535]], dtype=np.uint16)
+COUNTS = np.array([[0, 1, 500], [1000, 40000, 65534]], dtype=np.uint16)
 
 
 def message(pixels: np.ndarray[Any, Any], encoding: str, *, big: bool = False, padding: int = 0) -> SimpleNamespace:
@@ -269,6 +269,14 @@ def test_every_form_of_a_compressed_image_is_told_apart(form: str, suffix: str, 
         assert np.array_equal(depth_of(image, None), COUNTS.astype(np.float32) * np.float32(1e-3))
     elif suffix == ".png":
         assert np.array_equal(color_of(image), RGB)
+
+
+def test_the_largest_count_is_no_depth() -> None:
+    """A D415 and an OAK write 65535 where they measured nothing."""
+    counts = np.array([[1000, 65535], [0, 65534]], np.uint16)
+    image = read_image(message(counts, "16UC1"), IMAGE)
+    assert depth_of(image, None) == pytest.approx(np.array([[1.0, 0.0], [0.0, 65.534]]), rel=1e-6)
+    assert num_invalid(counts) == 1
 
 
 def test_float_depth_in_a_tiff_is_metres() -> None:

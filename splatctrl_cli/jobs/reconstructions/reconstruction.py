@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -118,6 +119,7 @@ class Reconstruction:
         self.fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []
         self.stamps: list[int] = []
+        self.repeats: Counter[str] = Counter()  # by camera, frames whose depth was that of the frame before
         self.first_frames: dict[str, dict[str, Any]] = {}  # of each camera, what tells this recording from another
         self.num_read = 0  # time steps of the source, those that were left out included
         self.is_refined = False
@@ -287,6 +289,7 @@ class Reconstruction:
             "psnr": last.psnr,
             "background": list(self.fitter.descent.background or (0.0, 0.0, 0.0)),
             "mounted_share": {camera: float(mask.mean()) for camera, mask in self.fitter.mounted.items()},
+            "repeated_frames": dict(sorted(self.repeats.items())),
             "frames_without_depth": sum(row.without_depth for row in self.rows),
             "disagreement": self.agreement.disagreement,
             **dict.fromkeys(("pose_residual", "depth_bend", "exposure_spread")),
@@ -350,7 +353,7 @@ class Reconstruction:
     def time_steps(self) -> Iterator[TimeStep]:
         """Those of the source, from its beginning."""
         records, has_clock = self.source.records(), self.source.has_clock
-        steps = time_steps(records, self.cameras, has_clock=has_clock, observe=self._see)
+        steps = time_steps(records, self.cameras, has_clock=has_clock, observe=self._see, repeats=self.repeats)
         return steps if self.cloud is None else (step.without_depth() for step in steps)
 
     def _see(self, record: Record) -> None:

@@ -137,7 +137,9 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
 
 
 def _blind(made: Reconstructed) -> Iterator[Reason]:
-    """Cameras that returned no depth at all for longer than evidence lasts."""
+    """Cameras whose depth came again as it was, or that returned no depth at all for longer than evidence lasts."""
+    for camera, num in made.metrics.get("repeated_frames", {}).items():
+        yield noted("depth", f"camera {camera}: {num} frames repeat the depth of the one before: left out")
     without = made.metrics["frames_without_depth"]
     if made.is_seeded or not without:
         return

@@ -1,6 +1,7 @@
 """The verdict of a replay: every criterion of *safe*, with what it found, when, where and what to do about it."""
 
 from collections.abc import Iterator
+from operator import attrgetter
 
 from splatctrl_cli.control.line_process import shown
 from splatctrl_cli.evaluate.gates import gate_reasons
@@ -10,9 +11,19 @@ from splatctrl_cli.jobs.replays.evidence_criteria import OF_EVIDENCE, bound_word
 from splatctrl_cli.jobs.replays.golden import Golden, golden_reason
 from splatctrl_cli.jobs.replays.metrics import counts_of, first_time
 from splatctrl_cli.jobs.replays.motion_criteria import OF_MOTION
+from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.robot.declared_contact import carried_words
 
 ASKED = ("--require", "golden")  # criteria that the request itself asked for
+LAX = {  # what a verdict is judged by, 1 where a larger value asks for less, -1 where a smaller one does
+    **dict.fromkeys(("max_unknown", "max_map_age", "max_pose_jump", "allow_disagreement"), 1),
+    **{f"config.verdict.{name}": 1 for name in ("unjudged", "lead_in", "longest_interval")},
+    **{f"config.verdict.{name}": -1 for name in ("confidence", "evidence_reach")},
+    **{
+        f"config.control.{name}": sign
+        for name, sign in {"margin": -1, "self_margin": -1, "limit_tolerance": 1}.items()
+    },
+}
 CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
 
 
@@ -54,11 +65,23 @@ def _notes(judged: Judged) -> Iterator[str]:
     if nearby(judged, "age") is None:
         yield "age of the evidence about the arm not judged"
     yield from _declared_notes(judged)
+    yield from waivers(judged.request)
     inside = judged.inputs.scene.figures().get("inside_robot_points")
     if inside:
         yield f"{inside} measured points lie inside the robot: contact, a carried object, or calibration"
     if judged.request.re_anchor is not None:
         yield "the arm is put back into the log's posture on the way: nothing is said between states"
+
+
+def waivers(request: ReplayRequest) -> Iterator[str]:
+    """Options and settings of the evidence and the margins that are laxer than their defaults."""
+    usual = ReplayRequest(log=request.log, out=request.out)
+    for name, sign in LAX.items():
+        given, default = (attrgetter(name)(each) for each in (request, usual))
+        if sign * given > sign * default:
+            words = f"--{name.replace('_', '-')}" if "." not in name else name.removeprefix("config.")
+            said = "" if given is True else f" {given:g} (by default {default:g})"
+            yield f"waived: {words}{said}"
 
 
 def _declared_notes(judged: Judged) -> Iterator[str]:

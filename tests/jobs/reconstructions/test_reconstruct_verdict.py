@@ -71,6 +71,11 @@ def test_a_sound_map_passes_without_a_note() -> None:
     assert (verdict.said, verdict.exit_code) == ((), 0)
 
 
+def test_frames_that_repeat_their_depth_are_noted_by_camera() -> None:
+    (said,) = notes(made(*STEPS, repeated_frames={"cam1": 3}))
+    assert said.sentence == "camera cam1: 3 frames repeat the depth of the one before: left out"
+
+
 def test_an_empty_map_is_not_evaluable_and_balls_alone_are_no_empty_map() -> None:
     verdict = reconstruct_verdict(made(*STEPS, splats=40), [])
     assert (verdict.exit_code, verdict.label) == (5, "not evaluable")

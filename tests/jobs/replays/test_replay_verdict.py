@@ -49,6 +49,18 @@ def test_a_run_with_nothing_broken_is_safe(stage: Stage, mode: str) -> None:
     assert "map error not measured" in verdict["sentence"]
 
 
+def test_what_asks_for_less_than_the_defaults_stands_in_the_sentence(stage: Stage) -> None:
+    laxer = ("--max-map-age=100", "--max-unknown=0.5", "--set=verdict.lead_in=2", "--set=control.margin=0.01")
+    code, verdict = stage.judged(*laxer, "--set=verdict.confidence=0.999")
+    assert code == 0 and [note for note in verdict["notes"] if note.startswith("waived: ")] == [
+        "waived: --max-unknown 0.5 (by default 0.05)",
+        "waived: --max-map-age 100 (by default 1)",
+        "waived: verdict.lead_in 2 (by default 0.5)",
+        "waived: control.margin 0.01 (by default 0.02)",
+    ]
+    assert verdict["sentence"].count("waived: ") == 4
+
+
 def test_every_criterion_is_shown_to_turn_the_verdict() -> None:
     names = [criterion.name for criterion in CRITERIA]
     assert len(set(names)) == len(names) and set(names) == ELSEWHERE | {of for _, _, of, _, _ in ALONE.values()} - {

@@ -1,0 +1,49 @@
+"""Frames by time steps: a depth image that comes again with a new stamp shows nothing new."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.scene.time_steps import TimeStep, time_steps
+from tests.scene.wall import frame
+
+EVERY_NS = 100_000_000
+
+
+def frames(*depths: float, camera: str = "cam0") -> list[RgbdFrame]:
+    """Of one camera, at 10 Hz, each with one of its pixels as far away as given [m]."""
+    found = []
+    for number, depth in enumerate(depths):
+        seen = replace(frame(stamp_ns=number * EVERY_NS), camera=camera)
+        seen.depth[0, 0] = depth
+        seen.color[:] = number  # live
+        found.append(seen)
+    return found
+
+
+def steps(*cameras: Sequence[RgbdFrame], has_clock: bool = True) -> tuple[list[TimeStep], Counter[str]]:
+    records = sorted((each for its in cameras for each in its), key=lambda each: each.stamp_ns)
+    repeats: Counter[str] = Counter()
+    names = {each.camera for each in records}
+    return list(time_steps(iter(records), names, has_clock=has_clock, repeats=repeats)), repeats
+
+
+def test_depth_that_equals_the_image_before_is_left_out_and_counted_though_its_colour_is_new() -> None:
+    found, repeats = steps(frames(1.0, 1.1, 1.1, 1.1, 1.0))
+    assert [step.stamp_ns // EVERY_NS for step in found] == [0, 1, 4]
+    assert repeats == {"cam0": 2}
+
+
+def test_one_camera_that_hangs_leaves_the_others_as_they_are() -> None:
+    found, repeats = steps(frames(1.0, 1.0, 1.0), frames(1.0, 1.1, 1.2, camera="cam1"))
+    assert [[each.camera for each in step.frames] for step in found] == [["cam0", "cam1"], ["cam1"], ["cam1"]]
+    assert repeats == {"cam0": 2}
+
+
+def test_images_without_depth_and_views_without_a_clock_never_repeat() -> None:
+    dark = [replace(each, depth=np.zeros_like(each.depth)) for each in frames(1.0, 1.0)]
+    assert [len(step.frames) for step in steps(dark)[0]] == [1, 1]
+    assert [len(step.frames) for step in steps(frames(1.0, 1.0), has_clock=False)[0]] == [2]
