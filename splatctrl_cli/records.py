@@ -130,11 +130,10 @@ class LossReport:
     """What of an input did not become records: `damaged` sets exit code 3, the rest is only counted.
 
     duplicate_images: images of a stamp that their topic had before; dropped_images: how many are missing where a
-    topic of a steady rate has gaps; invalid_depth: pixels whose depth is NaN, infinite or negative, which count as
-    having none.
-    differentiated_velocities: joint states with a velocity that is the change of the positions; unsorted_states,
-    duplicate_states: stamps that went back, or came again; conflicting_states: of the latter those whose positions
-    differ from the one that was kept; state_gaps: times without joint states.
+    topic of a steady rate has gaps; invalid_depth: pixels whose depth is NaN, infinite, negative or 65535 counts,
+    which is taken as none. differentiated_velocities: joint states with a velocity that is the change of the
+    positions; unsorted_states, duplicate_states: stamps that went back, or came again; conflicting_states: of the
+    latter those whose positions differ from the one that was kept; state_gaps: times without joint states.
     """
 
     unpaired_color: int = 0

@@ -291,7 +291,7 @@ def _losses(source: FrameSource, where: str) -> list[Finding]:
             code = "pose-missing" if name == "without_pose" else "pairing"
             findings.append(warning(code, where, f"{count} {words}", "they are left out", value=count))
     if loss.invalid_depth:
-        text = f"{loss.invalid_depth} depth pixels are NaN, infinite or negative: they count as none"
+        text = f"{loss.invalid_depth} depth pixels are NaN, infinite, negative or 65535: they count as none"
         findings.append(note("depth-invalid", where, text, value=loss.invalid_depth))
     return findings
 

@@ -88,7 +88,7 @@ depth-empty | warning, error | later | depth images without any depth; an error 
     and the scene within its range?
 depth-invalid | note |  | pixels that are NaN, infinite, negative or 65535, the format's largest count
 depth-repeats | warning |  | depth images that equal the one before to the bit | look for a driver that publishes its
-    last image again; they are no new evidence, and only depth that was made without noise may stay the same
+    last image again; repeated depth is no new evidence, and only depth that was made without noise may repeat
 principal-point | warning, error | later | cx or cy over 15 % of the size off the middle; an error, naming the size,
     where both fit another image size
 focal-ratio | warning |  | fx and fy differ by over 5 %

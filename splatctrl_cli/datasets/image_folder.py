@@ -278,7 +278,9 @@ class ImageFolderSource:
             )
         if table.encoding == "uint16-rotated3":
             counts = (counts >> 3) | (counts << 13)
-        return metres(np.where(counts == table.invalid, np.uint16(0), counts), scale)
+        counts = np.where(counts == table.invalid, np.uint16(0), counts)
+        self._num_invalid += num_invalid(counts)
+        return metres(counts, scale)
 
 
 def _is_float(encoding: str, path: ImageFile) -> bool:

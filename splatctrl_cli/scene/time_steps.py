@@ -108,7 +108,7 @@ def time_steps(
     counted in `repeats` by camera. observe: is shown every record on its way, of whatever camera, so that one pass
     serves both.
     """
-    newest_depth: dict[str, Float32] = {}
+    last_depth: dict[str, Float32] = {}
     frames: list[RgbdFrame] = []
     newest: JointState | None = None
     at_frames: JointState | None = None
@@ -119,8 +119,8 @@ def time_steps(
             continue
         if record.camera not in cameras:
             continue
-        before = newest_depth.get(record.camera)
-        newest_depth[record.camera] = record.depth
+        before = last_depth.get(record.camera)
+        last_depth[record.camera] = record.depth
         if has_clock and before is not None and before.any() and np.array_equal(before, record.depth):
             if repeats is not None:
                 repeats[record.camera] += 1

@@ -70,9 +70,9 @@ FEW = [
 ]
 
 
-def write_folder(folder: Path, frames: Sequence[RgbdFrame], *, has_clock: bool = True) -> Path:
-    """An image folder of the frames, each camera's numbered, and its description. By micrometres of noise no two depth
-    images are the same.
+def write_folder(folder: Path, frames: Sequence[RgbdFrame], *, has_clock: bool = True, noise: float = 1e-6) -> Path:
+    """An image folder of the frames, each camera's numbered, and its description. By noise, a share of one pixel's
+    depth, no two depth images are the same.
     """
     folder.mkdir()
     k = INTRINSICS
@@ -85,7 +85,7 @@ def write_folder(folder: Path, frames: Sequence[RgbdFrame], *, has_clock: bool =
             name = f"{folder}/{camera}-{number}"
             cv2.imwrite(f"{name}.png", cv2.cvtColor(one.color, cv2.COLOR_RGB2BGR))
             depth = one.depth.copy()
-            depth[0, 0] *= np.float32(1.0 + 1e-6 * number)
+            depth[0, 0] *= np.float32(1.0 + noise * number)
             np.save(f"{name}.npy", depth)
             np.savetxt(f"{name}.txt", one.T_world_camera)
         text += f'[[cameras]]\nname = "{camera}"\n{lens}'
@@ -115,12 +115,26 @@ def test_a_frame_without_depth_is_counted_and_seeds_nothing(
     assert json.loads((tmp_path / "scene" / "run.json").read_text())["metrics"]["frames_without_depth"] == 1
 
 
+def test_frames_that_repeat_their_depth_are_left_out_and_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_folder(tmp_path / "in", [frame() for _ in range(4)], noise=0.0)
+    assert reconstruct_folder(folder, tmp_path / "scene", "-q") == 0
+    assert (
+        "  note: depth: camera cam0: 3 frames repeat the depth of the one before: left out" in capsys.readouterr().out
+    )
+    metrics = json.loads((tmp_path / "scene" / "run.json").read_text())["metrics"]
+    assert (metrics["time_steps"], metrics["repeated_frames"]) == (1, {"cam0": 3})
+
+
 def test_depth_that_is_not_finite_is_counted_and_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     odd, plain = [frame() for _ in range(2)], [frame() for _ in range(2)]
     for view, values in ((odd[1], [np.nan, np.inf, -np.inf, -1.0]), (plain[1], [0.0] * 4)):
         view.depth[20, 10:14] = values
     assert reconstruct_folder(write_folder(tmp_path / "odd", odd), tmp_path / "a", "-q") == 0
-    assert "  note: input: 4 pixels of depth NaN, infinite or negative: taken as none" in capsys.readouterr().out
+    assert (
+        "  note: input: 4 pixels of depth NaN, infinite, negative or 65535: taken as none" in capsys.readouterr().out
+    )
     assert reconstruct_folder(write_folder(tmp_path / "plain", plain), tmp_path / "b", "-q") == 0
     assert "infinite" not in capsys.readouterr().out
     assert audit(tmp_path / "a") == audit(tmp_path / "b")

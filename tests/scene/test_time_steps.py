@@ -14,10 +14,10 @@ EVERY_NS = 100_000_000
 
 
 def frames(*depths: float, camera: str = "cam0") -> list[RgbdFrame]:
-    """Of one camera, at 10 Hz, each with one of its pixels as far away as given [m]."""
+    """Frames of one camera at 10 Hz. They differ in the depth [m] of one pixel, and all in colour."""
     found = []
     for number, depth in enumerate(depths):
-        seen = replace(frame(stamp_ns=number * EVERY_NS), camera=camera)
+        seen = frame(stamp_ns=number * EVERY_NS, camera=camera)
         seen.depth[0, 0] = depth
         seen.color[:] = number  # live
         found.append(seen)

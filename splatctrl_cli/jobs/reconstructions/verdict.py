@@ -99,7 +99,7 @@ def _unbent(metrics: Mapping[str, Any]) -> Iterator[Reason]:
 def loss_notes(loss: LossReport) -> Iterator[Reason]:
     """What the input lost."""
     if loss.invalid_depth:
-        yield noted("input", f"{loss.invalid_depth} pixels of depth NaN, infinite or negative: taken as none")
+        yield noted("input", f"{loss.invalid_depth} pixels of depth NaN, infinite, negative or 65535: taken as none")
     for text in loss.notes:
         yield noted("input", text)
 
@@ -137,8 +137,8 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
 
 
 def _blind(made: Reconstructed) -> Iterator[Reason]:
-    """Cameras whose depth came again as it was, or that returned no depth at all for longer than evidence lasts."""
-    for camera, num in made.metrics.get("repeated_frames", {}).items():
+    """Cameras that repeated their depth, or returned none for longer than evidence lasts."""
+    for camera, num in made.metrics["repeated_frames"].items():
         yield noted("depth", f"camera {camera}: {num} frames repeat the depth of the one before: left out")
     without = made.metrics["frames_without_depth"]
     if made.is_seeded or not without:

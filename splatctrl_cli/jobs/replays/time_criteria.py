@@ -48,7 +48,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             threshold=judged.request.max_map_age,
             unit="s",
             time_s=near[1],
-            remedy="frames without depth do not count: check the cameras ('splatctrl check')",
+            remedy="frames that have no depth or repeat it do not count: check the cameras ('splatctrl check')",
             count=near[2],
         )
     elif near is not None:

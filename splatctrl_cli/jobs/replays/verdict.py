@@ -15,15 +15,14 @@ from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.robot.declared_contact import carried_words
 
 ASKED = ("--require", "golden")  # criteria that the request itself asked for
-LAX = {  # what a verdict is judged by, 1 where a larger value asks for less, -1 where a smaller one does
-    **dict.fromkeys(("max_unknown", "max_map_age", "max_pose_jump", "allow_disagreement"), 1),
-    **{f"config.verdict.{name}": 1 for name in ("unjudged", "lead_in", "longest_interval")},
-    **{f"config.verdict.{name}": -1 for name in ("confidence", "evidence_reach")},
-    **{
-        f"config.control.{name}": sign
-        for name, sign in {"margin": -1, "self_margin": -1, "limit_tolerance": 1}.items()
-    },
-}
+LARGER_IS_LAXER = (
+    *("max_unknown", "max_map_age", "max_pose_jump", "allow_disagreement", "config.control.limit_tolerance"),
+    *("config.verdict.unjudged", "config.verdict.lead_in", "config.verdict.longest_interval"),
+)
+SMALLER_IS_LAXER = (
+    *("config.verdict.confidence", "config.verdict.evidence_reach"),
+    *("config.control.margin", "config.control.self_margin"),
+)
 CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
 
 
@@ -76,12 +75,11 @@ def _notes(judged: Judged) -> Iterator[str]:
 def waivers(request: ReplayRequest) -> Iterator[str]:
     """Options and settings of the evidence and the margins that are laxer than their defaults."""
     usual = ReplayRequest(log=request.log, out=request.out)
-    for name, sign in LAX.items():
+    for name in (*LARGER_IS_LAXER, *SMALLER_IS_LAXER):
         given, default = (attrgetter(name)(each) for each in (request, usual))
-        if sign * given > sign * default:
-            words = f"--{name.replace('_', '-')}" if "." not in name else name.removeprefix("config.")
-            said = "" if given is True else f" {given:g} (by default {default:g})"
-            yield f"waived: {words}{said}"
+        if given > default if name in LARGER_IS_LAXER else given < default:
+            words = name.removeprefix("config.") if "." in name else f"--{name.replace('_', '-')}"
+            yield f"waived: {words}" + ("" if given is True else f" {given:g} (by default {default:g})")
 
 
 def _declared_notes(judged: Judged) -> Iterator[str]:

@@ -49,6 +49,7 @@ def made(*rows: AuditRow, loss: LossReport | None = None, is_seeded: bool = Fals
         "inside_robot_first_ns": None,
         "inside_robot_first_link": None,
         "carried": [],
+        "repeated_frames": {},
         "frames_without_depth": sum(row.without_depth for row in rows),
     }
     return Reconstructed(

@@ -257,7 +257,7 @@ ALONE: dict[str, Broken] = {
         (),
         "evidence age",
         "not evaluable",
-        "frames without depth do not count",
+        "frames that have no depth or repeat it do not count",
     ),
     "frames ahead": (frames_of_the_future, (), "evidence age", "not evaluable", "is 2.00 s later than the state"),
     "unwatched": (came_unwatched, (), "evidence age", "not evaluable", "arm from 0.25 to 1.00 s, and then"),
