@@ -26,6 +26,7 @@ from splatctrl_cli.grid_files.grid_format import GridFormat
 from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
 from splatctrl_cli.jobs.judged_runs import Compared, documented
 from splatctrl_cli.jobs.replays.criteria_input import Judged
+from splatctrl_cli.jobs.replays.evidence_criteria import LIMITS, PROOF, Limit
 from splatctrl_cli.jobs.replays.verdict import CRITERIA
 from splatctrl_cli.splat_files.splat_format import SplatFormat
 from splatctrl_cli.splat_files.splats import FORMATS as SPLAT_FORMATS
@@ -37,13 +38,13 @@ INPUT = "input"  # the group of options that say how a recording is read
 HELP = ("help", "help_all")
 SIMPLE = ("int", "float", "str")  # types that a default shows
 TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n)((?:[|-].*\n)*)")
-REGISTRIES: dict[
-    str, tuple[tuple[str, ...], Iterable[SplatFormat | GridFormat | Layout | Check | Criterion[Judged] | Compared]]
-] = {
+Entry = SplatFormat | GridFormat | Layout | Check | Criterion[Judged] | Limit | Compared
+REGISTRIES: dict[str, tuple[tuple[str, ...], Iterable[Entry]]] = {
     "splat_files": (("suffix", "what it is", "rounds to", "does not hold"), SPLAT_FORMATS.values()),
     "grid_files": (("`--formats`", "file", "who opens it", "checked", "cost"), GRID_FORMATS.values()),
     "datasets": (("layout", "known by", "poses", "depth", "intrinsics"), LAYOUTS),
     "criteria": (("criterion", "holds where", "broken:"), CRITERIA),
+    "limits": (("evidence", "allowed", "why"), (*LIMITS, PROOF)),
     "metrics": (("command", "figures", "unit", "better", "tolerance"), [*documented()]),
     "checks": ((), CHECKS.values()),  # without a header: a list
 }

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.records import Bool, Float32, Float64, UInt8
 
 MOST_VOXELS = 400_000_000  # of a grid
-UNANSWERED = 0xFFFF  # in place of a time step: a camera looked at the voxel, and none ever got depth from it
+FIRST_REASON = 0xF0  # of one byte; of two 0xFFF0: from here on `last_seen` says why a voxel was never seen
 SWEPT = 0b100  # entity bit of a voxel that the robot was in at some time of the log
 SOLID = 0b1000  # entity bit, where a robot is known: an object's pixel hit the voxel since it was last seen free
 
@@ -24,6 +23,37 @@ class VoxelState(IntEnum):
     OCCUPIED = 2
     UNCERTAIN = 3
     SWEPT_BY_ROBOT = 4  # never seen, but the robot was in it
+
+
+class Unseen(IntEnum):
+    """Why no camera ever got depth through or on a voxel, in `last_seen` of two bytes. Of several cameras'
+    reasons the largest counts; the last two stay until a ray passes.
+    """
+
+    SWEPT = 0xFFF0  # the robot's body was in it
+    OUT_OF_VIEW = 0xFFF1
+    HIDDEN_BY_ARM = 0xFFF2
+    HIDDEN_BY_THING = 0xFFF3
+    NO_RETURN = 0xFFF4  # a camera has no depth there now
+    CONTRADICTED = 0xFFFE  # a ray passed it, through a surface that another camera measured
+    UNANSWERED = 0xFFFF  # a ray returned nothing, though it meets a surface, or depth is all about it
+
+
+class EvidenceClass(IntEnum):
+    """What is known of a point beside the arm at a time; exactly one of these."""
+
+    FREE = 0  # a camera got depth through or on it, not too long ago
+    SWEPT = 1  # never seen, but the robot's body was there
+    STALE = 2  # seen too long ago
+    HIDDEN_BY_ARM = 3
+    HIDDEN_BY_THING = 4
+    OUT_OF_VIEW = 5  # of all cameras; or never asked, far from where the arm was
+    NO_RETURN = 6  # no depth in a pixel that shows it, which may be of the empty background
+    CONTRADICTED = 7
+    UNANSWERED = 8  # no depth where there should be some
+    DEPTH_EDGE = 9  # a surface may go on there, where its edge was lost
+    OUTSIDE = 10  # of the workspace
+    SURFACE = 11  # within a surface of the map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,8 +150,8 @@ class SeenVoxels:
     """When cameras last saw each voxel: its centre is `origin` [m] + its index times the edge `voxel` [m].
 
     last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last time step in which
-    a camera returned depth through or on the voxel, 0 never, the type's largest number (`UNANSWERED` in uint16) never
-    although one looked at it. edges: of the newest images.
+    a camera returned depth through or on the voxel; 0 never, nor was it asked why; one of the type's largest numbers,
+    why not (`Unseen`, its lower byte in uint8). edges: of the newest images.
     """
 
     origin: Float64
@@ -130,24 +160,31 @@ class SeenVoxels:
     step_stamps_ns: NDArray[np.int64]
     edges: LostEdges = NO_EDGES
 
-    def last_seen_ns(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
-        """points (Q, 3) [m], world -> stamps (Q,) [ns] at which their voxels were last seen; -1 never, or outside."""
+    def look(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], UInt8]:
+        """Of points (Q, 3) [m], world: the stamps (Q,) [ns] at which their voxels were last seen, -1 never; and the
+        `EvidenceClass` (Q,), of what was ever seen `FREE`.
+        """
         cell = np.floor((points - self.origin) / self.voxel + 0.5)
         is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)
         i, j, k = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
         step = np.where(is_inside, self.last_seen[i, j, k], 0).astype(np.int64)
-        return np.concatenate([[-1], self.step_stamps_ns])[np.where(step == self._unanswered, 0, step)]
+        first = int(np.iinfo(self.last_seen.dtype).max) & ~0xF
+        reason = np.where(step >= first, step - first + 1, 0)
+        step[reason > 0] = 0
+        classes = np.where(step > 0, np.uint8(EvidenceClass.FREE), _CLASS_OF[reason])
+        classes[~is_inside] = EvidenceClass.OUTSIDE
+        return np.concatenate([[-1], self.step_stamps_ns])[step], classes
 
-    @cached_property
-    def unanswered(self) -> Float64:
-        """Centres (K, 3) [m], world, of the voxels that a camera looked at and that never returned depth."""
-        flat = np.flatnonzero(self.last_seen == self._unanswered)  # ten times as fast as argwhere
-        cells = np.stack(np.unravel_index(flat, self.last_seen.shape), axis=1)
-        return np.asarray(self.origin + self.voxel * cells)
 
-    @property
-    def _unanswered(self) -> int:
-        return int(np.iinfo(self.last_seen.dtype).max)
+def _classes() -> UInt8:
+    """`EvidenceClass` by one more than the lower four bits of `Unseen`; of 0, what nobody asked."""
+    classes = np.full(17, np.uint8(EvidenceClass.OUT_OF_VIEW))
+    for reason in Unseen:
+        classes[1 + (reason & 0xF)] = EvidenceClass[reason.name]
+    return classes
+
+
+_CLASS_OF = _classes()
 
 
 @dataclass(frozen=True, kw_only=True)

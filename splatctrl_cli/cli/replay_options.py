@@ -127,6 +127,7 @@ REPLAY = (  # what people use, and in groups the rest
             " of every K-th frame set",
         ),
         option("--require-evidence", "not evaluable (exit 5) without a bound on the map's error"),
+        option("--require-proof", "not evaluable (exit 5) where space beside the arm was assumed to be free"),
         *DISAGREEMENT,
     ),
     group(  # ``--golden``, and what is driven beside the closed loop

@@ -1,8 +1,7 @@
-"""What cameras knew of the space just outside of a moving arm, and how old that evidence was.
+"""What cameras knew of the space beside a moving arm: each point within the margin has exactly one class of evidence.
 
-The space inside the arm is never seen, and that the arm was somewhere says nothing of what is beside it. So the
-question is put to points on shells: each moving sphere's radius and the margin away from its centre, outside of all
-other spheres of the arm. Where its link has triangles, the shell is as near to the link's own surface instead.
+The space inside the arm is never seen. The points are those of a lattice outside of the robot and within the margin
+of its moving links: of their own surfaces where these have triangles, else of their spheres.
 """
 
 from collections.abc import Callable
@@ -15,73 +14,70 @@ from scipy.spatial.distance import cdist
 from splatctrl_cli.config import fixed
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.geometry import invert_transform, transform_points
-from splatctrl_cli.records import Bool, Float64, Index
+from splatctrl_cli.records import Float64, Index, UInt8
+from splatctrl_cli.voxels import EvidenceClass
+
+NEVER_SEEN = (
+    *(EvidenceClass.HIDDEN_BY_ARM, EvidenceClass.HIDDEN_BY_THING, EvidenceClass.OUT_OF_VIEW),
+    *(EvidenceClass.NO_RETURN, EvidenceClass.CONTRADICTED, EvidenceClass.UNANSWERED),
+)
+PROVEN = (EvidenceClass.FREE, EvidenceClass.SWEPT)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Seen:
-    """What cameras had seen at one moment. last_ns: points (Q, 3) [m], world -> stamps (Q,) [ns] at which a camera
-    last returned depth through or on them, -1 never; unanswered: centres (K, 3) [m], world, of the voxels, with edges
-    of `voxel` [m], that cameras looked at and got no depth from; edges: centre and radius (K, 4) [m], world, of balls
-    in which a surface may go on where its edge was lost.
+    """What cameras had seen at one moment.
+
+    look: points (Q, 3) [m], world -> stamps (Q,) [ns] at which a camera last returned depth through or on them, -1
+    never, and `EvidenceClass` (Q,), `FREE` whenever they were seen. edges: centre and radius (K, 4) [m], world, of
+    balls in which a surface may go on where its edge was lost. origin (3,), voxel [m]: of the voxels behind it.
     """
 
-    last_ns: Callable[[Float64], NDArray[np.int64]]
-    unanswered: Float64 = field(default_factory=lambda: np.empty((0, 3)))
-    voxel: float = 0.0
+    look: Callable[[Float64], tuple[NDArray[np.int64], UInt8]]
     edges: Float64 = field(default_factory=lambda: np.empty((0, 4)))
+    origin: Float64 = field(default_factory=lambda: np.zeros(3))
+    voxel: float = fixed.NEAR_LATTICE
 
 
 @dataclass(frozen=True, kw_only=True)
-class NearFigures:
-    """Of one state: unseen, the share of the points in space that is new to the motion that no camera had ever seen;
-    blind, the share of the moving spheres about which nearly all (`NEAR_BLIND`) of that space was never seen; age [s]
-    within which `NEAR_FRESH_SHARE` of the seen points were last seen; ahead [s] by which the last of them was seen
-    after the state. NaN where there are too few points. unanswered [m]: the distance of the nearest voxel that
-    cameras looked at without an answer, and its place (3,) [m]; hidden [m]: how near a point that was never seen, of
-    new space or not, is to the map's surfaces, and its place (3,) [m]; beyond [m]: the same of new space about a
-    sphere that comes to almost nothing else (`NEAR_BLIND`); edge [m]: the distance of the nearest lost edge, and its
-    place (3,) [m]; infinite and NaN where there is none.
+class Account:
+    """Of one posture. shares (C,): of the points within the margin, by `EvidenceClass`; assumed: the share of those
+    whose voxels reach into it that nobody saw free and the arm never was in; nearest (C,) [m]: how near one
+    of a class comes to the arm, and places (C, 3) [m], infinite and NaN where there is none. blind: the largest share
+    of never-seen points beside one link. beside [m]: how near a never-seen point is to the map's surfaces, and its
+    place (3,). age [s]: within which `NEAR_FRESH_SHARE` of the seen points were last seen; ahead [s]: by which the
+    last of them was seen after the state; NaN where nothing was seen.
     """
 
-    unseen: float
+    shares: Float64
+    assumed: float
+    nearest: Float64
+    places: Float64
     blind: float
+    beside: float
+    beside_place: Float64
     age: float
     ahead: float
-    unanswered: float
-    unanswered_place: Float64
-    hidden: float
-    hidden_place: Float64
-    beyond: float
-    beyond_place: Float64
-    edge: float
-    edge_place: Float64
 
 
 class NearSpace:
-    """Asks for the shells of the states of a motion that are far enough apart, in time or in space."""
+    """Takes account of the states of a motion that are far enough apart, in time or in space."""
 
-    def __init__(self, model: ArmModel, margin: float) -> None:
-        self._model = model
-        self._moving = np.flatnonzero(model.moving_spheres)
+    def __init__(self, model: ArmModel, margin: float, max_age: float = np.inf) -> None:
+        """max_age [s]: what was seen longer ago is stale."""
+        self._model, self._margin, self._max_age = model, margin, max_age
+        self._moving = model.moving_spheres
         self._radii = np.asarray(model.sphere_set.radii, np.float64)
-        self._margin = margin
-        self._depths = np.arange(margin, 0.0, -fixed.NEAR_LAYER)  # of shells, the outermost first
-        self._first: Float64 | None = None  # centres (S, 3) of the first state
+        self._links = np.array(model.sphere_set.links)
+        self._names = list(dict.fromkeys(self._links))
+        self._surfaces = model.link_distances
         self._next_ns = -(2**63)
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres when they were last looked about
-        self._surfaces, self._links = model.link_distances, np.array(model.sphere_set.links)
-        names = list(dict.fromkeys(self._links))
-        own = np.arange(len(names), len(names) + len(self._links))  # a sphere is a body where its link has no surface
-        self._body = np.where(
-            np.isin(self._links, list(self._surfaces)), [names.index(link) for link in self._links], own
-        )
-        self._reaches = dict[tuple[int, float], Float64]()  # of shells, by the number of directions and how far away
 
     def due(self, stamps: NDArray[np.int64], centers: Float64) -> dict[int, bool]:
         """Of states at stamps (T,) [ns] that do not go back, with their spheres' centres (T, S, 3), those to look at:
         each time a sphere has moved by `NEAR_MOVED`, and True for those `NEAR_EVERY_NS` after the last such, whose
-        shares and ages count: what is allowed of these is from states so far apart.
+        ages count.
         """
         chosen, moving = dict[int, bool](), centers[:, self._moving]
         for index, stamp_ns in enumerate(stamps.tolist()):
@@ -106,156 +102,94 @@ class NearSpace:
 
     def look(
         self, stamp_ns: int, q: Float64, known: Seen, distance: Callable[[Float64], Float64] | None = None
-    ) -> NearFigures:
+    ) -> Account:
         """What was known about the posture q (J,) at a stamp; distance: of points (Q, 3) from the map's surfaces."""
-        centers = self._model.sphere_centers(q)
-        if self._first is None:
-            self._first = centers
-        points, owners = self._shell(q, centers, DIRECTIONS, self._margin)
-        fewest = fixed.NEAR_LEAST_SHARE * len(self._moving) * len(DIRECTIONS)
-        seen = known.last_ns(points)
-        is_never = seen < 0
-        is_new = self._is_new(points)
-        unseen = blind = age = ahead = np.nan
-        if is_new.sum() >= fewest:
-            unseen = float(is_never[is_new].mean())
-            num_new, num_never = (np.bincount(owners[which]) for which in (is_new, is_new & is_never))
-            num_never = np.pad(num_never, (0, len(num_new) - len(num_never)))
-            is_blind = (num_new >= fixed.NEAR_FEWEST) & (num_never >= fixed.NEAR_BLIND * num_new)
-            blind = float(np.sum(is_blind)) / len(self._moving)
-        if (~is_never).sum() >= fewest:
-            ages = (stamp_ns - seen[~is_never]) * 1e-9
-            age, ahead = float(np.quantile(ages, fixed.NEAR_FRESH_SHARE)), max(-float(ages.min()), 0.0)
-        voxels = known.unanswered
-        unanswered, unanswered_place = self._nearest(q, voxels, centers, known.voxel / 2)  # from its nearest face
-        edge, edge_place = self._nearest(q, known.edges[:, :3], centers, known.edges[:, 3])
-        hidden, hidden_place = beyond, beyond_place = NOWHERE
-        if distance is not None:
-            fine, owners = self._shell(q, centers, FINE, self._margin)
-            is_never = known.last_ns(fine) < 0
-            within = [self._shell(q, centers, FINE, away)[0] for away in self._depths[1:]]
-            never = [fine[is_never], *(points[known.last_ns(points) < 0] for points in within)]
-            hidden, hidden_place = _nearest_of(np.concatenate(never), distance)
-            beyond, beyond_place = _nearest_of(fine[self._is_in_the_blind(fine, owners, is_never)], distance)
-        return NearFigures(
-            unseen=unseen,
-            blind=blind,
-            age=age,
-            ahead=ahead,
-            unanswered=unanswered,
-            unanswered_place=unanswered_place,
-            hidden=hidden,
-            hidden_place=hidden_place,
-            beyond=beyond,
-            beyond_place=beyond_place,
-            edge=edge,
-            edge_place=edge_place,
+        centers, step = self._model.sphere_centers(q), _step_of(known.voxel)
+        points = self._lattice(known.origin, step, centers)
+        gaps, links = self._gaps(q, centers, points, self._margin + step / 2)
+        is_near = (gaps > 0) & (gaps <= self._margin + step / 2)  # the voxel of a point that far reaches into it
+        points, gaps, links = points[is_near], gaps[is_near], links[is_near]
+        seen_ns, classes = known.look(points)
+        ages, is_seen = (stamp_ns - seen_ns) * 1e-9, seen_ns >= 0
+        classes = np.where((classes == EvidenceClass.FREE) & (ages > self._max_age), EvidenceClass.STALE, classes)
+        away = np.full(len(points), np.inf)
+        if distance is not None and len(points):
+            away = np.nan_to_num(distance(points), nan=np.inf)
+        classes[away <= 0] = EvidenceClass.SURFACE
+        nearest, places = _nearest_by(classes, gaps - step / 2, points)
+        edge = EvidenceClass.DEPTH_EDGE
+        nearest[edge], places[edge] = self._nearest_edge(q, centers, known.edges)
+        is_within = gaps <= self._margin
+        is_never = is_within & np.isin(classes, NEVER_SEEN)
+        beside = np.where(is_never, away, np.inf)
+        least = int(beside.argmin()) if len(beside) else None
+        num, num_never = (np.bincount(links[which], minlength=len(self._names)) for which in (is_within, is_never))
+        return Account(
+            shares=np.bincount(classes[is_within], minlength=len(EvidenceClass)) / max(num.sum(), 1),
+            assumed=float(np.mean(~np.isin(classes, PROVEN))) if len(points) else 0.0,
+            nearest=nearest,
+            places=places,
+            blind=float(np.max(num_never / np.maximum(num, fixed.NEAR_FEWEST))),
+            beside=np.inf if least is None else float(beside[least]),
+            beside_place=np.full(3, np.nan) if least is None else points[least],
+            age=float(np.quantile(ages[is_seen], fixed.NEAR_FRESH_SHARE)) if is_seen.any() else np.nan,
+            ahead=max(-float(ages[is_seen].min()), 0.0) if is_seen.any() else np.nan,
         )
 
-    def _shell(self, q: Float64, centers: Float64, directions: Float64, away: float) -> tuple[Float64, Index]:
-        """Points (Q, 3), so far [m] from moving spheres or their surfaces and outside of all others, and their
-        spheres (Q,).
+    def _lattice(self, origin: Float64, step: float, centers: Float64) -> Float64:
+        """Points (Q, 3) [m], `step` [m] apart from `origin` (3,), in the moving spheres grown by the margin."""
+        at = (centers[self._moving] - origin) / step
+        reaches = (self._radii[self._moving] + self._margin) / step + 0.5
+        first = np.floor((at - reaches[:, None]).min(axis=0)).astype(int)
+        is_near = np.zeros(np.ceil((at + reaches[:, None]).max(axis=0)).astype(int) - first + 1, bool)
+        for center, reach in zip(at - first, reaches, strict=True):
+            low, high = np.ceil(center - reach).astype(int), np.floor(center + reach).astype(int) + 1
+            x, y, z = (np.arange(a, b) - c for a, b, c in zip(low, high, center, strict=True))
+            is_in = x[:, None, None] ** 2 + y[:, None] ** 2 + z**2 <= reach**2
+            is_near[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] |= is_in
+        return np.asarray(origin + step * (first + np.argwhere(is_near)))
+
+    def _gaps(self, q: Float64, centers: Float64, points: Float64, reach: float) -> tuple[Float64, Index]:
+        """The distance (Q,) [m] of points (Q, 3) to the moving links, infinite beyond `reach` [m], negative within
+        any link; and the number (Q,) of the nearest link.
         """
-        turned = np.tile(directions, (len(self._moving), 1, 1))
-        for link in self._surfaces:
-            turned[self._links[self._moving] == link] = directions @ self._model.frame_pose(q, link)[:3, :3].T
-        offsets = self._reach(directions, away)[..., None] * turned
-        points = (centers[self._moving][:, None] + offsets).reshape(-1, 3)
-        owners = np.repeat(self._moving, len(directions))
-        is_outside = _is_outside(points, centers, self._radii + fixed.NEAR_APART, self._body[owners], self._body)
-        return points[is_outside], owners[is_outside]
+        to_spheres = cdist(points, centers) - self._radii
+        gaps, links = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
+        is_inside = np.zeros(len(points), bool)
+        for number, name in enumerate(self._names):
+            own = self._links == name
+            gap = to_spheres[:, own].min(axis=1)
+            is_asked = gap <= reach
+            if name in self._surfaces and is_asked.any():
+                T_link_world = invert_transform(self._model.frame_pose(q, str(name)))
+                gap[is_asked] = self._surfaces[name](transform_points(T_link_world, points[is_asked]))
+            is_inside |= gap <= 0
+            is_nearer = is_asked & (gap < gaps) & bool(self._moving[own].any())
+            gaps[is_nearer], links[is_nearer] = gap[is_nearer], number
+        return np.where(is_inside, -np.abs(gaps), gaps), links
 
-    def _reach(self, directions: Float64, away: float) -> Float64:
-        """How far (M, D) [m] from the moving spheres' centres their shells are, along directions (D, 3) in the frames
-        of links that have triangles; NaN where another part of the link is nearer.
-        """
-        key = len(directions), away
-        if key not in self._reaches:
-            reach = np.repeat((self._radii[self._moving] + away)[:, None], len(directions), axis=1)
-            for row, sphere in enumerate(self._moving):
-                if (distance := self._surfaces.get(self._links[sphere])) is not None:
-                    center = self._model.sphere_set.centers[sphere]
-                    for _ in range(fixed.NEAR_STEPS):
-                        gap = distance(center + reach[row][:, None] * directions)
-                        reach[row] -= np.clip(gap - away, 0.0, reach[row])
-                    reach[row][gap < away - fixed.NEAR_APART] = np.nan
-            self._reaches[key] = reach
-        return self._reaches[key]
-
-    def _is_new(self, points: Float64) -> Bool:
-        """Points (Q, 3) that the motion comes to: away from the arm of the first state."""
-        assert self._first is not None
-        return _is_outside(points, self._first, self._radii + fixed.NEAR_NEW)
-
-    def _is_in_the_blind(self, points: Float64, owners: Index, is_never: Bool) -> Bool:
-        """Those of `FINE` points (Q, 3) about spheres (Q,) in new space that were never seen, as nearly all of the
-        new space about their sphere.
-        """
-        is_unknown, num = is_never.copy(), len(self._radii)
-        is_unknown[is_never] = self._is_new(points[is_never])
-        num_unknown = np.bincount(owners[is_unknown], minlength=num)
-        is_asked = (num_unknown >= fixed.NEAR_BLIND * fixed.NEAR_FEWEST_FINE)[owners]
-        num_new = np.bincount(owners[is_asked], self._is_new(points[is_asked]), minlength=num)
-        is_blind = (num_new >= fixed.NEAR_FEWEST_FINE) & (num_unknown >= fixed.NEAR_BLIND * num_new)
-        return np.asarray(is_unknown & is_blind[owners])
-
-    def _nearest(
-        self, q: Float64, points: Float64, centers: Float64, reach: float | Float64
-    ) -> tuple[float, Float64]:
-        """The least distance [m] of balls about points (K, 3), `reach` (K,) [m] large, near the arm to its moving
-        spheres, within the margin to the surfaces that these stand for, at least 0, and that point (3,).
-        """
-        moving, radii = centers[self._moving], self._radii[self._moving]
-        around = radii.max() + max(fixed.NEAR_NEW, self._margin + np.max(reach, initial=0.0))
-        is_near = np.all((points > moving.min(axis=0) - around) & (points < moving.max(axis=0) + around), axis=1)
-        if not is_near.any():
-            return NOWHERE
-        points, reach = points[is_near], np.broadcast_to(reach, len(is_near))[is_near]
-        each = cdist(points, moving) - radii
-        is_within = each.min(axis=1) - reach <= self._margin
-        for link, distance in self._surfaces.items():
-            T_link_world = invert_transform(self._model.frame_pose(q, link))
-            gap = distance(transform_points(T_link_world, points[is_within]))
-            each[np.ix_(is_within, self._links[self._moving] == link)] = gap[:, None]
-        away = each.min(axis=1) - reach
-        least = int(np.argmin(away))
-        return max(float(away[least]), 0.0), points[least]
+    def _nearest_edge(self, q: Float64, centers: Float64, edges: Float64) -> tuple[float, Float64]:
+        """How near the arm comes to balls (K, 4) [m], 0 where it meets one, and that ball's centre."""
+        reach = self._margin + np.max(edges[:, 3], initial=0.0)
+        around = self._radii.max() + reach
+        moving = centers[self._moving]
+        is_near = np.all((edges[:, :3] > moving.min(0) - around) & (edges[:, :3] < moving.max(0) + around), axis=1)
+        balls = edges[is_near]
+        away = self._gaps(q, centers, balls[:, :3], reach)[0] - balls[:, 3] if len(balls) else np.array([np.inf])
+        least = int(away.argmin())
+        return max(float(away[least]), 0.0), balls[least, :3] if len(balls) else np.full(3, np.nan)
 
 
-def _nearest_of(points: Float64, distance: Callable[[Float64], Float64]) -> tuple[float, Float64]:
-    """The least distance [m] of points (Q, 3) to surfaces, and that point (3,)."""
-    away = distance(points) if len(points) else np.full(len(points), np.nan)
-    if np.isnan(away).all():
-        return NOWHERE
-    least = int(np.nanargmin(away))
-    return float(away[least]), points[least]
+def _step_of(voxel: float) -> float:
+    """The lattice's step [m] for voxels [m]: some of them, one, or a part of one."""
+    return float(voxel * np.ceil(fixed.NEAR_LATTICE / voxel - 1e-6) / np.ceil(voxel / fixed.NEAR_LATTICE - 1e-6))
 
 
-def _is_outside(
-    points: Float64, centers: Float64, radii: Float64, owners: Index | None = None, bodies: Index | None = None
-) -> Bool:
-    """Points (Q, 3) outside of all spheres (S, 3), (S,) [m] but those of their owner (Q,), by bodies (S,)."""
-    squared = np.sum(points**2, axis=1)[:, None] + np.sum(centers**2, axis=1) - 2.0 * points @ centers.T
-    beyond = squared - radii**2
-    if owners is not None and bodies is not None:
-        beyond[owners[:, None] == bodies] = np.inf
-    return np.asarray(beyond.min(axis=1) > 0)
-
-
-def _directions() -> Float64:
-    """Unit vectors (26, 3) towards the faces, edges and corners of a cube."""
-    steps = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)], np.float64) - 1.0
-    return np.asarray(steps / np.linalg.norm(steps, axis=1)[:, None])
-
-
-def _spiral(num: int) -> Float64:
-    """Unit vectors (num, 3) spread evenly over the sphere, on a Fibonacci spiral."""
-    z = 1.0 - 2.0 * (np.arange(num) + 0.5) / num
-    angle = np.pi * (1.0 + 5.0**0.5) * np.arange(num)
-    flat = np.sqrt(1.0 - z * z)
-    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
-
-
-NOWHERE = (np.inf, np.full(3, np.nan))  # a distance and its place
-DIRECTIONS = _directions()
-FINE = _spiral(fixed.NEAR_DIRECTIONS)
+def _nearest_by(classes: UInt8, gaps: Float64, points: Float64) -> tuple[Float64, Float64]:
+    """The least of gaps (Q,) [m] of each `EvidenceClass` (C,), at least 0, and its point (C, 3)."""
+    nearest, places = np.full(len(EvidenceClass), np.inf), np.full((len(EvidenceClass), 3), np.nan)
+    for each in np.unique(classes):
+        mine = np.flatnonzero(classes == each)
+        least = mine[gaps[mine].argmin()]
+        nearest[each], places[each] = max(gaps[least], 0.0), points[least]
+    return nearest, places

@@ -98,7 +98,7 @@ class Verdict:
 
     label: the outcome in the command's own word, such as "safe"; scope: what was judged; notes: what a person should
     know and that decides nothing. is_damaged: part of the input was lost. counts: how many states, views or points
-    each metric of the command rests on.
+    each metric of the command rests on. how: a word on how it passed, such as "proven" or "waived".
     """
 
     command: str
@@ -106,6 +106,7 @@ class Verdict:
     label: str
     scope: str
     reasons: tuple[Reason, ...]
+    how: str = ""
     notes: tuple[str, ...] = ()
     is_damaged: bool = False
     counts: Mapping[str, int] = field(default_factory=dict)
@@ -137,7 +138,8 @@ class Verdict:
         """The verdict as one sentence."""
         scope = f" ({self.scope})" if self.scope else ""
         if not self.decisive:
-            return f"{self.command}: {self.label.upper()}{scope}" + "".join(f"; {note}" for note in self.notes)
+            how = f", {self.how}" if self.how else ""
+            return f"{self.command}: {self.label.upper()}{how}{scope}" + "".join(f"; {note}" for note in self.notes)
         more = len(self.decisive) - 1
         others = f"; and {more} more reason{'s' if more > 1 else ''}" if more else ""
         return f"{self.command}: {self.label.upper()}{scope}: {self.decisive[0]}{others}"
@@ -147,6 +149,7 @@ class Verdict:
         return {
             "outcome": str(self.outcome),
             "label": self.label,
+            "how": self.how if self.outcome is Outcome.PASSED else "",
             "sentence": self.sentence,
             "scope": self.scope,
             "exit_code": self.exit_code,
@@ -162,13 +165,15 @@ def verdict_of(
     *,
     scope: str = "",
     passed: str = "passed",
+    how: str = "",
     notes: Iterable[str] = (),
     is_damaged: bool = False,
     counts: Mapping[str, int] | None = None,
 ) -> Verdict:
     """The verdict that reasons make: failed where any failed, else not evaluable where any is, else passed.
 
-    Without a single reason nothing was judged, which is not evaluable. passed: the label of a verdict that passed.
+    Without a single reason nothing was judged, which is not evaluable. passed: the label of a verdict that passed,
+    how: a word on how.
     The label of a failure is the first given by `Reason.label` in the order of the reasons.
     """
     given = list(reasons)
@@ -185,6 +190,7 @@ def verdict_of(
         label=label,
         scope=scope,
         reasons=tuple(ordered),
+        how=how,
         notes=tuple(notes),
         is_damaged=is_damaged,
         counts=counts or {},

@@ -50,7 +50,7 @@ class _Edge:
     def __init__(self, parent: str, transforms: _Transforms) -> None:
         self.parent = parent
         self.stamps, self.numbers = array("q"), array("q")
-        self.static: Float64 | None = None
+        self.static: dict[int, Float64] = {}  # by the stamp [ns] from which on each holds, ascending
         self.holds = False
         self._transforms = transforms
         self._is_sorted = True
@@ -61,8 +61,9 @@ class _Edge:
         self.numbers.append(self._transforms.add(T))
 
     def at(self, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
-        if self.static is not None:
-            return self.static
+        if self.static:
+            since = [stamp for stamp in self.static if stamp <= stamp_ns]
+            return self.static[since[-1] if since else next(iter(self.static))]
         if self.holds and len(self.stamps) == 1:
             return self._at(0)
         self._sort()
@@ -116,8 +117,8 @@ class TfTree:
     ) -> None:
         """Add T_parent_child at a time; a static one holds always, one that `holds` as long as it is the only one.
 
-        The first parent of a frame stays its parent, what would close a loop is left out, the last of different
-        static transforms holds; all of this is noted.
+        The first parent of a frame stays its parent, what would close a loop is left out, each of different static
+        transforms holds from its stamp on (of one stamp the last, before all the first); all of this is noted.
         Raises ValueError for a rotation or position that is not one (a zero quaternion, NaN).
         """
         parent, child = parent.strip("/"), child.strip("/")
@@ -135,10 +136,13 @@ class TfTree:
         if not static:
             edge.add(stamp_ns, T)
         else:
-            if edge.static is not None and not _is_still(edge.static, T):
-                self.note(f"tf: {parent} -> {child} is static and changes; the last one holds")
-            edge.static = T
-        if edge.static is not None and edge.stamps:
+            before = edge.at(stamp_ns, 0) if edge.static else None
+            if before is not None and _is_still(before, T):
+                return  # said again
+            if before is not None:
+                self.note(f"tf: {parent} -> {child} is static and changes; each holds from its stamp on")
+            edge.static = dict(sorted((edge.static | {stamp_ns: T}).items()))
+        if edge.static and edge.stamps:
             self.note(f"tf: {parent} -> {child} is both static and moving; the static one holds")
 
     def note(self, note: str) -> None:
@@ -163,7 +167,7 @@ class TfTree:
     def span_ns(self, frame: str) -> tuple[int, int] | None:
         """First and last stamp for which the moving edges above `frame` are all known; None if none moves."""
         edges = [self._edges[f] for f in self._ancestors(frame)[:-1]]
-        moving = [edge.stamps for edge in edges if edge.static is None]
+        moving = [edge.stamps for edge in edges if not edge.static]
         return (max(min(s) for s in moving), min(max(s) for s in moving)) if moving else None
 
     def connects(self, target: str, source: str) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.records import Float64, FloatRows
 from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, save_figure, span_of
+from splatctrl_cli.voxels import EvidenceClass
 
 Intervals = Sequence[tuple[float, float]]
 """First and last time [s] of each interval."""
@@ -36,6 +37,19 @@ KIND_COLORS = {  # by what happened; Okabe and Ito
     "hold": "#222222",
     "scaled-back": "#56b4e9",
     "cannot-act": "#8a6d3b",
+}
+EVIDENCE_COLORS = {  # what is known green and blue, what is assumed grey, what is warned of red
+    EvidenceClass.FREE: "#009e73",
+    EvidenceClass.SWEPT: "#56b4e9",
+    EvidenceClass.STALE: "#8a6d3b",
+    EvidenceClass.HIDDEN_BY_ARM: "#c8c8c8",
+    EvidenceClass.HIDDEN_BY_THING: "#a0a0a0",
+    EvidenceClass.OUT_OF_VIEW: "#787878",
+    EvidenceClass.NO_RETURN: "#505050",
+    EvidenceClass.CONTRADICTED: "#e69f00",
+    EvidenceClass.UNANSWERED: "#d55e00",
+    EvidenceClass.OUTSIDE: "#cc79a7",
+    EvidenceClass.SURFACE: "#111111",
 }
 FIELD_STYLES: Mapping[str, tuple[str, Any, float]] = {  # colour, dashes, width
     "exact": (CURVE_COLORS[0], "-", 2.6),
@@ -91,6 +105,30 @@ def clearance_picture(
         )
         _tidy(axes, seconds)
         _draw_strip(strip, axes, shown, seconds)
+        save_figure(figure, path)
+
+
+def evidence_picture(path: Path, seconds: Float64, shares: Float64) -> None:
+    """Write what is known of the space within the margin of the arm: shares (T, C) by `EvidenceClass`, one on top of
+    the other, at those `seconds` (T,) that were asked about.
+    """
+    is_asked = np.isfinite(shares).all(axis=1)
+    there = [kind for kind in EVIDENCE_COLORS if shares[is_asked, kind].any()]
+    with drawn_figure(3.6) as figure:
+        axes = figure.subplots()
+        axes.stackplot(
+            seconds[is_asked],
+            *(100 * shares[is_asked, kind] for kind in there),
+            colors=[EVIDENCE_COLORS[kind] for kind in there],
+            labels=[kind.name.lower().replace("_", " ") for kind in there],
+            linewidth=0,
+        )
+        axes.set(ylabel="space within the margin [%]", ylim=(0, 100), xlabel="time [s]")
+        axes.set_title("What cameras knew of the space beside the arm", pad=44)
+        axes.legend(
+            frameon=False, loc="lower left", bbox_to_anchor=(-0.01, 0.99), ncols=4, fontsize=10, borderaxespad=0.2
+        )
+        _tidy(axes, seconds)
         save_figure(figure, path)
 
 

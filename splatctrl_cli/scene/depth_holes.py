@@ -1,65 +1,54 @@
 """Space that cameras looked into and got no depth from: a dark, shiny or clear thing in full view leaves only a hole.
 
-A hole is a group of pixels without depth that has depth all around it. Where there is no depth behind the thing
-either, as before a far background, it is a wide gap between objects instead. What is in it stands somewhere on its
-rays, before what is seen beside it. Other cameras and later images that see through these rays clear them; what is
-left is where the thing may be.
+A hole is a group of pixels without depth that has depth all around it. What is in it stands somewhere on its rays,
+before what is seen beside it. Other cameras and later images that see through these rays clear them; what is left is
+where the thing may be.
 
 Depth is also lost on both sides of a step of depth: what lies in such a pixel is as likely the edge of the nearer
 surface, which goes on there, as what is behind it.
 """
 
 from collections.abc import Iterator, Sequence
-from itertools import chain
 
 import cv2
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import GAP_DIRECTIONS, NARROW_GAP, NARROW_HOLE
+from splatctrl_cli.config.fixed import NARROW_HOLE
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.kernels import points
-from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame, UInt8
+from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import camera_array
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask
 from splatctrl_cli.scene.stereo_shadow import shadowed
 from splatctrl_cli.voxels import LostEdges
 
-NOTHING, OBJECT, BLANK = 0, 1, 2  # what a pixel shows: nothing that counts, an object, or no depth
+BESIDE_ROBOT = np.ones((9, 9), np.uint8)  # its outline is fattened, too
 MOST_POINTS = 1 << 18  # at a time: fine voxels and a large hole come to a hundred million
 
 
 def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Iterator[Float64]:
-    """Points (K, 3) [m], world, on the rays of a frame's holes and gaps, half a voxel [m] apart along each; some at a
-    time, some of them twice. The holes are found at once, the points when they are asked for.
+    """Points (K, 3) [m], world, on the rays of a frame's holes, half a voxel [m] apart along each; some at a time,
+    some of them twice. The holes are found at once, the points when they are asked for.
 
     From `min_range` before the camera to the depth that is seen nearest to the pixel, on rays about a voxel apart;
-    holes up to `NARROW_HOLE` and gaps up to `NARROW_GAP` voxels wide do not count. robot_depth (H, W) [m]: of the
-    rendered robot, 0 = none; beside it what is far behind may show, so that it bounds neither.
+    holes up to `NARROW_HOLE` voxels wide do not count. robot_depth (H, W) [m]: of the rendered robot, 0 = none;
+    beside it what is far behind may show, so that it bounds none.
     """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
         return iter(())
     is_blank &= ~shadowed(frame.depth, frame.intrinsics.fx)
-    if not is_blank.any():
-        return iter(())
-    behind = _nearest_depth(frame.depth)
-    is_end = cv2.dilate(robot_depth, np.ones((5, 5), np.uint8)) > 0
+    is_end = cv2.dilate(robot_depth, BESIDE_ROBOT) > 0
     if frame.valid is not None:
         is_end |= ~frame.valid
-    holes, parts = _holes(is_blank, is_end), []
-    if holes.any():
-        width = _voxel_width(frame, behind[holes], config)
-        parts.append((_wide(holes, NARROW_HOLE * width), max(int(width), 1)))
-    width = _voxel_width(frame, behind[is_blank], config)
-    step = max(int(0.5 * width), 1)  # as fine as is needed for something so wide
-    every = slice(None, None, step)
-    is_end = cv2.dilate(is_end.view(np.uint8), np.ones((step, step), np.uint8)) > 0  # narrow parts too
-    gaps = np.zeros_like(is_blank)
-    gaps[every, every] = _wide(_gaps(is_blank[every, every], is_end[every, every]), NARROW_GAP * width / step)
-    parts.append((gaps, step))
-    return chain.from_iterable(_on_rays(frame, pixels, behind, apart, config) for pixels, apart in parts)
+    holes = _holes(is_blank, is_end)
+    if not holes.any():
+        return iter(())
+    behind = _nearest_depth(frame.depth)
+    width = _voxel_width(frame, behind[holes], config)
+    return _on_rays(frame, _wide(holes, NARROW_HOLE * width), behind, max(int(width), 1), config)
 
 
 def _voxel_width(frame: RgbdFrame, depths: Float32, config: OccupancyConfig) -> float:
@@ -93,30 +82,6 @@ def _holes(is_blank: Bool, is_end: Bool) -> Bool:
     _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
     return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
-
-
-def _gaps(is_blank: Bool, is_end: Bool) -> Bool:
-    """Pixels (H, W) without depth between two objects in `GAP_DIRECTIONS` of the image's four directions: across, up
-    and down, and the diagonals.
-    """
-    kinds = np.pad(np.where(is_end, NOTHING, np.where(is_blank, BLANK, OBJECT)).astype(np.uint8), 1)
-    flat, width = kinds.ravel(), kinds.shape[1]
-    between = np.zeros(len(flat), np.uint8)
-    for step in (1, width - 1, width, width + 1):
-        between += _sees_object(flat, step) & _sees_object(flat[::-1], step)[::-1]
-    is_gap = (between >= GAP_DIRECTIONS) & (flat == BLANK)
-    return np.ascontiguousarray(is_gap.reshape(kinds.shape)[1:-1, 1:-1])
-
-
-def _sees_object(flat: UInt8, step: int) -> Bool:
-    """Pixels (N,) of a flattened image with a border of `NOTHING` that first meet depth at an object, or are one, on
-    the path back to its start, `step` pixels at a time.
-    """
-    num = len(flat)
-    last = np.zeros((-(-num // step), step), np.int32)  # a path is a column
-    last.ravel()[:num] = np.where(flat == BLANK, 0, np.arange(num, dtype=np.int32))
-    np.maximum.accumulate(last, axis=0, out=last)
-    return np.asarray(flat[last.ravel()[:num]] == OBJECT)
 
 
 def _nearest_depth(depth: Float32) -> Float32:

@@ -25,6 +25,7 @@ from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
+from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
 from splatctrl_cli.scene.depth_holes import lost_edges, unanswered_points
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, seen_through
@@ -57,13 +58,14 @@ from splatctrl_cli.scene.self_mask import (
     self_mask,
     settled,
     voted,
-    without_mixed,
+    without,
 )
 from splatctrl_cli.scene.shell import Shell
 from splatctrl_cli.scene.steady_depth import steadied
 from splatctrl_cli.scene.time_steps import AuditRow, Refined
 from splatctrl_cli.scene.unrepresented import bare_voxels, confirmed, unrepresented_voxels
-from splatctrl_cli.voxels import Balls, KnownVoxels
+from splatctrl_cli.scene.unseen import explain_unseen
+from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
 
 
 class SceneFitter:
@@ -117,7 +119,10 @@ class SceneFitter:
             others = [[*(other for other in seen if other is not one), *self.seen] for one in seen]
             masks = [settled(*one, asked, config) for one, asked in zip(seen, others, strict=True)]
             masks = voted(list(zip(frames, masks, strict=True)), self.occupancy.origin, config.voxel)
-        frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
+        is_drawn = robot is not None and robot.surface is not None and robot.surface.is_drawn
+        rays = list(contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn))
+        masks = list(map(without_contradicted, masks, rays))
+        frames = [without(frame, mask, PixelKind.MIXED) for frame, mask in zip(frames, masks, strict=True)]
         before = {view.frame.camera: view.frame for view in self.window.newest}
         frames, steady = zip(
             *(
@@ -130,16 +135,20 @@ class SceneFitter:
         seen = self.seen = list(zip(frames, masks, strict=True))
         if self.descent.background is None:
             self.descent.background = self._behind(views)
-        self.people.take_in(self.occupancy, frames)
+        self.people.take_in(self.occupancy, [without(*one, PixelKind.CONTRADICTED) for one in seen])
         unanswered = self._each(lambda one: unanswered_points(one[0], one[1].robot_depth, config), seen)
+        for frame, found in zip(frames, rays, strict=True):
+            self.occupancy.mark_unseen(found.points(frame, config, is_blank=False), Unseen.CONTRADICTED)
+            self.occupancy.mark_unseen(found.points(frame, config, is_blank=True), Unseen.UNANSWERED)
         for points in chain.from_iterable(unanswered):
-            self.occupancy.mark_unanswered(points)
+            self.occupancy.mark_unseen(points, Unseen.UNANSWERED)
         self.occupancy.keep_edges(lost_edges(seen, robot, config))
         self._carry(robot)
         if robot is not None:
             pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]
             self.occupancy.label_robot(robot.centers, robot.radii, pixels)
             self.occupancy.forget_hidden(robot.centers, robot.radii, robot.distance)
+            explain_unseen(self.occupancy, seen, robot)
         removed = self._remove(relabel(self.buffer, self.occupancy, robot, seen), self._floating(views))
         filled = self._seed(views, masks)
         is_first = self.descent.num_iterations == 0 and bool(self.buffer.is_alive.any())

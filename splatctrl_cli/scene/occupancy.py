@@ -10,9 +10,9 @@ from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
-from splatctrl_cli.voxels import MOST_VOXELS, SOLID, SWEPT, UNANSWERED, Balls, KnownVoxels, LostEdges, OccupancyGrid
+from splatctrl_cli.voxels import MOST_VOXELS, SOLID, SWEPT, Balls, KnownVoxels, LostEdges, OccupancyGrid, Unseen
 
-MAX_STEPS = UNANSWERED - 1  # time steps that `last_seen` tells apart
+MAX_STEPS = min(Unseen) - 1  # time steps that `last_seen` tells apart
 
 
 class OccupancyMap:
@@ -65,7 +65,7 @@ class OccupancyMap:
         """
         if len(self.step_stamps_ns) == MAX_STEPS:
             self.step_stamps_ns = self.step_stamps_ns[::2]
-            is_step = self.last_seen != UNANSWERED
+            is_step = self.last_seen < min(Unseen)
             self.last_seen[is_step] -= self.last_seen[is_step] // 2  # (n + 1) // 2, without an overflow
         self.step_stamps_ns.append(min(frame.stamp_ns for frame in frames))
 
@@ -95,12 +95,30 @@ class OccupancyMap:
             max_range=self.config.max_range,
         )
 
-    def mark_unanswered(self, points: Float64) -> None:
-        """Of the voxels that hold points (K, 3) [m], world: what was never seen was looked at without an answer."""
+    def mark_unseen(self, points: Float64, reason: Unseen) -> None:
+        """Of the voxels that hold points (K, 3) [m], world: those that were never seen were not, for this reason,
+        unless one of the last two was known already.
+        """
         cells = np.floor((points - self.origin) / self.config.voxel + 0.5).astype(np.int64)
         i, j, k = cells[np.all((cells >= 0) & (cells < self.last_seen.shape), axis=1)].T
-        is_never = self.last_seen[i, j, k] == 0
-        self.last_seen[i[is_never], j[is_never], k[is_never]] = UNANSWERED
+        before = self.last_seen[i, j, k]
+        is_never = (before == 0) | (before >= min(Unseen)) & (before < Unseen.CONTRADICTED)
+        self.last_seen[i[is_never], j[is_never], k[is_never]] = reason
+
+    def unexplained(self, centers: Float64, radii: Float64) -> NDArray[np.intp]:
+        """Flat indices (K,) of the voxels in spheres (S, 3), (S,) [m] that were never seen, for a reason that may
+        pass.
+        """
+        is_near = np.zeros_like(self.entity)
+        mark_spheres(self._packed, is_near, centers, radii, 1, self.num_threads)
+        voxels = np.flatnonzero(is_near)
+        last = self.last_seen.reshape(-1)[voxels]
+        is_open = (last == 0) | (last >= Unseen.OUT_OF_VIEW) & (last < Unseen.CONTRADICTED)
+        return np.asarray(voxels[is_open])
+
+    def explain(self, voxels: NDArray[np.intp], reasons: NDArray[np.uint16]) -> None:
+        """Why voxels of flat indices (K,) were never seen: `Unseen` (K,)."""
+        self.last_seen.reshape(-1)[voxels] = reasons
 
     def keep_edges(self, edges: Mapping[str, LostEdges]) -> None:
         """By camera, instead of those of its image before; within the grid alone."""

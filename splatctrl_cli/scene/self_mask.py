@@ -34,7 +34,7 @@ from splatctrl_cli.scene.time_steps import AuditRow
 
 class PixelKind(IntEnum):
     """What a depth pixel shows. MIXED: beside the robot, a depth that is evidence of nothing. DOUBTED: an object
-    there, if another frame measured it.
+    there, if another frame measured it. CONTRADICTED: behind what another frame measured on its ray.
     """
 
     NOTHING = 0
@@ -42,6 +42,7 @@ class PixelKind(IntEnum):
     ROBOT = 2
     MIXED = 3
     DOUBTED = 4
+    CONTRADICTED = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,10 +279,10 @@ def of_label(mask: SelfMask, label: Label) -> Bool:
     return np.asarray(mask.kinds == (PixelKind.ROBOT if label == Label.ROBOT else PixelKind.OBJECT))
 
 
-def without_mixed(frame: RgbdFrame, mask: SelfMask) -> RgbdFrame:
-    """The frame without the depth of its mixed pixels, which lies on no surface."""
-    is_mixed = mask.kinds == PixelKind.MIXED
-    return replace(frame, depth=np.where(is_mixed, np.float32(0.0), frame.depth)) if is_mixed.any() else frame
+def without(frame: RgbdFrame, mask: SelfMask, kind: PixelKind) -> RgbdFrame:
+    """The frame without the depth of its pixels of a kind, which lies on no surface."""
+    is_of_it = mask.kinds == kind
+    return replace(frame, depth=np.where(is_of_it, np.float32(0.0), frame.depth)) if is_of_it.any() else frame
 
 
 def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_SIGMAS) -> Float32:

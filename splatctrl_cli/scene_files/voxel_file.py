@@ -14,20 +14,21 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
 from splatctrl_cli.records import Label, UInt8
 from splatctrl_cli.voxels import (
+    FIRST_REASON,
     MOST_VOXELS,
     NO_EDGES,
-    UNANSWERED,
     Balls,
     KnownVoxels,
     LostEdges,
     OccupancyGrid,
     SeenVoxels,
+    Unseen,
     VoxelState,
 )
 
 _HEADER = 1 << 22  # bytes
 _MOST_EDGES = 1 << 26  # bytes
-_SHORT = 0xFF  # `UNANSWERED` in one byte
+_WIDE = 0xFF00  # by which `Unseen` in two bytes is larger than in one
 _GRID: Mapping[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": np.uint16, "entity": np.uint8}
 _EVIDENCE = ("last_seen", "unrepresented", "unrepresented_labels")
 _STATES, _OCCUPANCY, _OURS = "the voxel states of a snapshot", "an occupancy grid of ours", "a voxel file of ours"
@@ -69,7 +70,8 @@ def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.gen
         "voxel": known.grid.voxel,
         "shape": list(known.last_seen.shape),
         "last_seen": "1 + index into step_stamps_ns of the last time step with depth through or on it, 0 never, "
-        "the largest number: looked at in vain",
+        "from 0xF0 of one byte or 0xFFF0 of two on: why never",
+        "unseen": {reason.name.lower(): int(reason) & 0xFF for reason in Unseen},
         "unrepresented": "centres (K, 3) [m] of voxels that are occupied, not the robot, and have no splat",
         "edges": "centre and radius (K, 4) [m] of balls in which a surface may go on where its edge was lost",
         "step_stamps_ns": known.step_stamps_ns.tolist(),
@@ -81,7 +83,7 @@ def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
     """The arrays that both files have in common; last_seen in one byte where that holds it: twice as fast."""
     balls = known.unrepresented
     return {
-        "last_seen": known.last_seen.astype(np.uint8 if len(known.step_stamps_ns) < _SHORT else np.uint16),
+        "last_seen": known.last_seen.astype(np.uint8 if len(known.step_stamps_ns) < FIRST_REASON else np.uint16),
         "unrepresented": balls.centers,
         "unrepresented_labels": balls.labels,
         "edges": np.column_stack([known.edges.centers, known.edges.radii]),
@@ -202,18 +204,20 @@ def _grid_of_states(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
 
 
 def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) -> NDArray[Any]:
-    """As it was stored, in one byte or two, of which the largest number says that a camera looked in vain.
+    """As it was stored, in one byte or two, of which the largest numbers say why a voxel was never seen.
 
     Raises ValueError for another shape, or time steps that there are not.
     """
     is_short = stored.dtype == np.uint8
     stored = _voxels(stored, "last_seen", np.uint8 if is_short else np.uint16, header)
-    if is_short and num_steps >= _SHORT:  # as older versions wrote it: the largest number is a time step too
-        stored = stored.astype(np.uint16)
-    is_late, is_unanswered = stored > num_steps, stored == np.iinfo(stored.dtype).max
-    if np.count_nonzero(is_late) > np.count_nonzero(is_unanswered):
-        latest = stored[is_late & ~is_unanswered].max()
-        raise ValueError(f"last_seen: expected at most {num_steps} time steps, got {latest}")
+    is_old = "unseen" not in header  # then the largest number alone is none of a time step
+    if is_short and num_steps >= FIRST_REASON:  # as older versions wrote it
+        is_none = (stored == 0xFF) & (num_steps < 0xFF)
+        stored = np.where(is_none, np.uint16(Unseen.NO_RETURN), stored.astype(np.uint16))
+    highest = int(np.iinfo(stored.dtype).max)
+    is_late = (stored > num_steps) & (stored < (highest if is_old else highest & ~0xF))
+    if is_late.any():
+        raise ValueError(f"last_seen: expected at most {num_steps} time steps, got {stored[is_late].max()}")
     return stored
 
 
@@ -221,7 +225,7 @@ def _widened(last_seen: NDArray[Any]) -> NDArray[np.uint16]:
     """In two bytes."""
     wide = last_seen.astype(np.uint16)
     if last_seen.dtype == np.uint8:
-        wide[last_seen == _SHORT] = UNANSWERED
+        wide[last_seen >= FIRST_REASON] += _WIDE
     return wide
 
 

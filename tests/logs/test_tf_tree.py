@@ -38,6 +38,17 @@ def moving_tree() -> TfTree:
     return tree
 
 
+def test_static_transforms_that_differ_hold_each_from_its_stamp_on() -> None:
+    """A camera that was moved between two takes, in whatever order the log has them."""
+    for stamps in ((10, 20, 20), (20, 20, 10)):
+        tree = TfTree()
+        for stamp, x in zip(stamps, (0.1, 0.3, 0.2) if stamps[0] == 10 else (0.3, 0.2, 0.1), strict=True):
+            tree.add("world", "camera", stamp, np.array([x, 0, 0]), IDENTITY, static=True)
+        found = [tree.lookup("world", "camera", stamp) for stamp in (0, 10, 19, 20, 99)]
+        assert [None if T is None else T[0, 3] for T in found] == [0.1, 0.1, 0.1, 0.2, 0.2]
+        assert tree.notes == ["tf: world -> camera is static and changes; each holds from its stamp on"]
+
+
 def test_a_moving_frame_is_interpolated_and_a_static_one_holds_always() -> None:
     T = moving_tree().lookup("world", "camera", 500_000_000)
     assert T is not None

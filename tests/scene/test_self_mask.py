@@ -21,7 +21,7 @@ from splatctrl_cli.scene.self_mask import (
     self_mask,
     settled,
     voted,
-    without_mixed,
+    without,
 )
 from tests.plain import plain_frame
 
@@ -115,8 +115,8 @@ def test_a_depth_between_the_robot_and_the_floor_at_its_outline_is_mixed_and_lef
     view = frame(depth)
     mask = self_mask(view, robot(), CONFIG)
     assert (mask.kinds[edge] == PixelKind.MIXED).all()
-    assert not without_mixed(view, mask).depth[edge].any()
-    assert without_mixed(view, mask).depth[~SHOWN].all()
+    assert not without(view, mask, PixelKind.MIXED).depth[edge].any()
+    assert without(view, mask, PixelKind.MIXED).depth[~SHOWN].all()
 
 
 @pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.MIXED), (3, PixelKind.OBJECT)])

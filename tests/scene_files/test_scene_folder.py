@@ -25,7 +25,7 @@ from splatctrl_cli.scene_files.voxel_file import (
     write_states,
 )
 from splatctrl_cli.sources.source import describe
-from splatctrl_cli.voxels import SWEPT, UNANSWERED, LostEdges, OccupancyGrid
+from splatctrl_cli.voxels import SWEPT, EvidenceClass, LostEdges, OccupancyGrid, Unseen
 from tests.plain import known, plain_grid, plain_splats
 
 
@@ -161,7 +161,7 @@ def test_a_snapshot_keeps_what_was_known_of_each_voxel(tmp_path: Path) -> None:
         read_states(tmp_path / "b.npz")
 
 
-@pytest.mark.parametrize("num_steps", [2, 254, 255, 300])
+@pytest.mark.parametrize("num_steps", [2, 239, 240, 255, 300])
 def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_path: Path, num_steps: int) -> None:
     want = replace(
         known(grid(), unrepresented=[[0.0, 0.25, 0.4]], label=Label.HUMAN),
@@ -169,14 +169,20 @@ def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_pa
         last_seen=np.zeros((3, 4, 5), np.uint16),
         edges=LostEdges(centers=np.array([[0.0, 0.5, 1.0]], np.float32), radii=np.array([0.25], np.float32)),
     )
-    want.last_seen[1, 2, 3], want.last_seen[0, 0, 0], want.last_seen[2, 0, 1] = num_steps, 1, UNANSWERED
-    points = want.grid.origin + 0.05 * np.array([[1.4, 1.6, 3.0], [0.0, 0.4, 0.0], [2.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    want.last_seen[1, 2, 3], want.last_seen[0, 0, 0], want.last_seen[2, 0, 1] = num_steps, 1, Unseen.UNANSWERED
+    want.last_seen[0, 0, 1] = Unseen.SWEPT
+    points = want.grid.origin + 0.05 * np.array(
+        [[1.4, 1.6, 3.0], [0.0, 0.4, 0.0], [2.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [9.0, 0.0, 0.0]]
+    )
+    seen_ns, free = [10 * (num_steps - 1), 0, -1, -1, -1, -1], EvidenceClass.FREE
+    why = [EvidenceClass.UNANSWERED, EvidenceClass.SWEPT, EvidenceClass.OUT_OF_VIEW, EvidenceClass.OUTSIDE]
+    wanted = [seen_ns, [free, free, *why]]
     write_states(tmp_path / "a.npz", want, want.grid.states(0.3, 0.7))
     write_occupancy(tmp_path / "b.npz", want)
     for again in (read_known_states(tmp_path / "a.npz"), read_known_occupancy(tmp_path / "b.npz")):
         assert again is not None
         assert (again.last_seen == want.last_seen).all()
-        assert again.seen.last_seen_ns(points).tolist() == [10 * (num_steps - 1), 0, -1, -1]
+        assert [each.tolist() for each in again.seen.look(points)] == wanted
         assert again.unrepresented.centers.tolist() == want.unrepresented.centers.tolist()
         assert again.unrepresented.labels.tolist() == [Label.HUMAN]
         assert again.unrepresented.radius == pytest.approx(0.025 * 3**0.5)
@@ -184,9 +190,8 @@ def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_pa
         assert (again.edges.centers.tolist(), again.edges.radii.tolist()) == ([[0.0, 0.5, 1.0]], [0.25])
     for name in ("a.npz", "b.npz"):
         seen = read_seen(tmp_path / name)
-        assert seen is not None and seen.last_seen.dtype == (np.uint8 if num_steps < 255 else np.uint16)
-        assert seen.last_seen_ns(points).tolist() == [10 * (num_steps - 1), 0, -1, -1]
-        assert seen.unanswered == pytest.approx(want.grid.origin + 0.05 * np.array([[2, 0, 1]]))
+        assert seen is not None and seen.last_seen.dtype == (np.uint8 if num_steps < 240 else np.uint16)
+        assert [each.tolist() for each in seen.look(points)] == wanted
         assert (seen.edges.centers.tolist(), seen.edges.radii.tolist()) == ([[0.0, 0.5, 1.0]], [0.25])
 
 

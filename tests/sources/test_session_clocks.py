@@ -243,5 +243,5 @@ def test_a_static_transform_that_changes_is_noted(tmp_path: Path) -> None:
         return [message, (message[0] + 1, message[1], message[2], maker.T[message[2]](transforms=[other]))]
 
     source = open_source(make_part(tmp_path / "log.mcap", LogRecipe(), moved))
-    assert source.loss.notes == ["tf: cam0_link -> cam0_optical is static and changes; the last one holds"]
+    assert source.loss.notes == ["tf: cam0_link -> cam0_optical is static and changes; each holds from its stamp on"]
     assert frames_of(list(source.records()))[0].T_world_camera[2, 3] == pytest.approx(0.7)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
@@ -17,9 +18,11 @@ from tools.hunt.clearance import TrueArm, interpolated, least_clearance
 from tools.hunt.families import CAMERAS, FAMILIES, Draft
 from tools.hunt.faults import Fault
 from tools.hunt.observability import observable
+from tools.hunt.outcome import word_of
 from tools.hunt.recording import Recorder, Shown
-from tools.hunt.trial import Trial, config_of, draw, family_of, record, true_robot
+from tools.hunt.trial import BEFORE_CAMERAS, Trial, box_of, config_of, draw, family_of, record, true_robot
 from tools.hunt.world import (
+    BOX,
     DURATION_S,
     NUM_FRAMES,
     World,
@@ -212,13 +215,78 @@ def test_each_family_spoils_or_places_something(family: str) -> None:
         draft = FAMILIES[family](np.random.default_rng(seed))
         is_clean = draft.fault == Fault() and draft.tool is None and draft.cameras == CAMERAS
         is_clean &= draft.distance == 1 and not draft.settings
-        assert is_clean == (family in ("benign", "thin", "touch", "visit", "people"))
+        is_clean &= draft.box_gap is None
+        assert is_clean == (family in ("benign", "thin", "touch", "visit", "people", "still"))
+
+
+def drawn(model: RobotModel, family: str, seed: int = 500) -> Trial:
+    return draw(seed, next(i for i in range(40) if family_of(seed, i) == family), model)
+
+
+@pytest.mark.parametrize("repeats_color", [True, False])
+def test_repeated_frames_have_new_stamps_and_the_depth_of_the_last_one(
+    repeats_color: bool, model: RobotModel, tmp_path: Path
+) -> None:
+    still = Motion(times=np.array([0.0, 0.6, 2.5]), waypoints=np.array([START, START, START + 0.2]))
+    shown = shown_of(world_of(in_view(), still), Fault(repeated=6, repeats_color=repeats_color), model, tmp_path)
+    frames = [r for r in open_source(tmp_path / "log.mcap").records() if isinstance(r, RgbdFrame)]
+    mine = [frame for frame in frames if frame.camera == "cam0"]
+    assert len({frame.stamp_ns for frame in mine}) == NUM_FRAMES
+    assert all((frame.depth == mine[5].depth).all() for frame in mine[6:])
+    assert all((frame.color == mine[5].color).all() == repeats_color for frame in mine[9:])
+    assert shown.target[:, :6].any() and not shown.target[:, 6:].any() and not shown.depth[:, 6:].any()
+
+
+@pytest.mark.parametrize("fault", [Fault(beyond=0.4), Fault(instead=4.0)])
+def test_a_target_measured_behind_its_place_is_seen_where_its_rays_meet_the_table(
+    fault: Fault, model: RobotModel, tmp_path: Path
+) -> None:
+    shown = shown_of(world_of(in_view()), fault, model, tmp_path)
+    assert shown.target.any() and (shown.target <= shown.target_outline).all()
+    (frame, *_) = [r for r in open_source(tmp_path / "log.mcap").records() if isinstance(r, RgbdFrame)]
+    assert fault.instead is None or np.isclose(frame.depth.max(), 4.0, atol=1e-3)
+    high = world_of(ball(np.array([0.55, 0.1, 0.6])))
+    (tmp_path / "high").mkdir()
+    assert not shown_of(high, Fault(beyond=0.15), model, tmp_path / "high").target.any()  # in free space above it
+
+
+def test_a_small_motion_is_small_and_its_ball_behind_the_arm(model: RobotModel) -> None:
+    trial = drawn(model, "small")
+    q = positions_of(trial.world.motion, np.array([at_s(0.0), at_s(DURATION_S)]))
+    arm = TrueArm(model, None, trial.world.body)
+    assert np.linalg.norm(np.diff(arm.marks(q), axis=0), axis=2).max() < 0.2
+    place, marks = trial.world.targets[0].T_world_shape[:3, 3], arm.marks(q).reshape(-1, 3)
+    eyes = np.mean([camera.T_world_camera[:3, 3] for camera in trial.world.cameras], axis=0)
+    assert np.linalg.norm(marks - place, axis=1).min() < 0.25
+    away = place - marks
+    assert (away @ (BEFORE_CAMERAS - eyes) > 0.5 * np.linalg.norm(away, axis=1)).any()
+
+
+def test_a_box_ends_before_the_plate(model: RobotModel) -> None:
+    trial = drawn(model, "box")
+    (plate,) = trial.world.targets
+    assert trial.draft.box_gap is not None
+    assert box_of(trial).upper[0] == pytest.approx(
+        plate.T_world_shape[0, 3] - plate.size[0] / 2 - trial.draft.box_gap
+    )
+    assert box_of(drawn(model, "still")) is BOX
+
+
+@pytest.mark.parametrize(("how", "word"), [("", "safe"), ("proven", "safe"), ("waived", "waived")])
+def test_what_passed_by_a_waiver_is_no_safe_run(how: str, word: str) -> None:
+    passed, failed = (Reason(outcome=outcome, sentence="") for outcome in (Outcome.PASSED, Outcome.FAILED))
+    assert word_of(verdict_of("replay", [passed], how=how)).word == word
+    assert word_of(verdict_of("replay", [failed], how=how)).word == "failed"
 
 
 def test_seeds_below_a_hundred_keep_their_families() -> None:
     """Rows of campaigns are drawn again by seed and index."""
     assert [family_of(99, index) for index in (13, 14, 15)] == ["people", "benign", "benign"]
     assert [family_of(100, index) for index in (13, 14, 18, 19)] == ["people", "behind", "benign", "benign"]
+    assert [family_of(499, index) for index in (17, 18, 19)] == ["settings", "benign", "benign"]
+    assert [family_of(500, index) for index in (17, 18, 24, 25, 26)] == [
+        *("settings", "frozen", "still", "benign", "benign")
+    ]
 
 
 def test_settings_that_a_run_draws_are_those_of_its_configuration(model: RobotModel) -> None:
@@ -346,7 +414,8 @@ def test_a_target_that_returns_no_depth_is_a_hole_or_disclaimed(model: RobotMode
     shown = shown_of(world, Fault(dark=1.0), model, tmp_path)
     assert judged(draft_of(Fault()), world, shown, model) == (True, "a hole")
     beside = replace(shown, target_hole=np.zeros_like(shown.target_hole))
-    assert judged(draft_of(Fault()), world, beside, model) == (False, "returns no depth")
+    assert judged(draft_of(Fault()), world, beside, model) == (True, "dark, in space never seen")
+    assert judged(draft_of(Fault(beyond=0.3)), world, beside, model) == (False, "measured in free space")
 
 
 def test_what_is_narrower_than_half_a_pixel_is_disclaimed(model: RobotModel, tmp_path: Path) -> None:

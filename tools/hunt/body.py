@@ -14,6 +14,7 @@ PART_SHARE = 0.20  # of the others, in which the arm has an unmodelled part
 SPREADS, FATTENINGS = (0.005, 0.08), (0.0, 3.0)  # [px] of the depth imagers
 IMAGER = 640  # [px] their width, whatever that of the images
 WIDTH, STEREO_WIDTH = 96, 128  # [px] of the images
+FAULTLESS = ("benign", "still")  # families
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +57,7 @@ class Body:
 
 
 def draw_body(seed: int, index: int, family: str) -> Body:
-    """The body of a run; benign runs have no unmodelled part, and a camera on the hand no bracket before it."""
+    """The body of a run; faultless runs have no unmodelled part, and a camera on the hand no bracket before it."""
     rng = np.random.default_rng([seed, index, 3])
     if seed < FIRST_OF_STEREO or rng.random() < PLAIN_SHARE:
         return Body()
@@ -64,4 +65,4 @@ def draw_body(seed: int, index: int, family: str) -> Body:
     name, has_part = str(rng.choice(names)), rng.random() < PART_SHARE
     spread, fattening = float(rng.uniform(*SPREADS)), float(rng.uniform(*FATTENINGS))
     depth = StereoDepth(spread=spread, fattening=(fattening / 3, fattening), width=IMAGER)
-    return Body(is_slim=True, parts=(name,) if has_part and family != "benign" else (), depth=depth)
+    return Body(is_slim=True, parts=(name,) if has_part and family not in FAULTLESS else (), depth=depth)

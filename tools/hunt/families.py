@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Float64
 from splatctrl_cli.simulate.arm import Capsule
 from splatctrl_cli.simulate.primitives import Primitive
@@ -22,7 +23,10 @@ class Draft:
     second: when [s] the target is near the arm, None for any time; cameras: that are recorded; touches_first: the
     target may be at the arm from the first moment on; people: names that masks show; only_audit: nothing to drive;
     only_closed: always driven. distance: of the cameras, as a share of the usual; has_wrist: beside them one rides on
-    the hand; settings: of the configuration, by key.
+    the hand; settings: of the configuration, by key. turn: of the motion, as a share of the usual. towards: from
+    where the target comes to the arm: the side that the cameras do not see (`behind`), the x axis, or any; from_link:
+    the share of the arm, from its base, that it does not come to. box_gap [m]: by how much the workspace ends before
+    the target. max_map_age [s]: that the user allows.
     """
 
     kind: str
@@ -41,6 +45,11 @@ class Draft:
     distance: float = 1.0
     has_wrist: bool = False
     settings: tuple[tuple[str, float], ...] = ()
+    turn: float = 1.0
+    towards: str = ""
+    from_link: float = 0.5
+    box_gap: float | None = None
+    max_map_age: float | None = None
 
 
 def target(rng: np.random.Generator, size: float = 1.0) -> Make:
@@ -326,6 +335,81 @@ def settings(rng: np.random.Generator) -> Draft:
     return replace(draft, kind=" ".join(names), strength=chosen[0][1], settings=chosen)
 
 
+def frozen(rng: np.random.Generator) -> Draft:
+    """Every camera's last image comes again with new stamps, or its depth does, while a thing comes to the arm."""
+    first = int(rng.integers(3, NUM_FRAMES - 5))
+    base, repeats_color = target(rng), rng.random() < 0.5
+    since = first / 5.0 + float(rng.uniform(0.0, 0.3))
+
+    def make(place: Float64) -> Made:
+        return (during(base(place)[0], since, None),)
+
+    fault = Fault(repeated=first, repeats_color=repeats_color)
+    kind = "image" if repeats_color else "depth"
+    return Draft(kind=kind, strength=first / 5.0, make=make, fault=fault, turn=_turn(rng), only_audit=True)
+
+
+def too_far(rng: np.random.Generator) -> Draft:
+    """A shiny target is measured far behind its place, or with the largest depth that the format has."""
+    kind = ("shiny", "instead")[int(rng.integers(2))]
+    if kind == "shiny":
+        beyond = float(rng.uniform(0.15, 0.7))
+        return Draft(kind=kind, strength=beyond, make=target(rng), fault=Fault(beyond=beyond))
+    instead = float(rng.choice([4.0, 5.0, 65.535]))
+    return Draft(kind=kind, strength=instead, make=target(rng), fault=Fault(instead=instead))
+
+
+def small(rng: np.random.Generator) -> Draft:
+    """A motion of a few centimetres, one or two cameras, and a ball behind the arm where none of them sees."""
+    cameras = tuple(sorted(rng.choice(CAMERAS, size=1 + int(rng.random() < 0.4), replace=False).tolist()))
+    radius = float(rng.uniform(0.02, 0.04))
+    solid = floating("target", "sphere", (radius,), np.zeros(3), rng)
+    return Draft(
+        kind=f"{len(cameras)} cameras", strength=2e3 * radius, make=lambda place: (shifted(solid, place),),
+        cameras=cameras, turn=float(rng.uniform(0.03, 0.15)), towards="behind",
+        from_link=float(rng.choice([0.25, 0.5])), touches_first=True,
+    )  # fmt: skip
+
+
+def box(rng: np.random.Generator) -> Draft:
+    """The workspace ends a little before a plate that all cameras show."""
+    size = (float(rng.uniform(0.01, 0.03)), float(rng.uniform(0.25, 0.5)), float(rng.uniform(0.25, 0.5)))
+    solid = floating("target", "box", size, np.zeros(3), rng, UP)
+
+    def make(place: Float64) -> Made:
+        return (replace(solid, T_world_shape=pose_at(place)),)
+
+    gap = float(rng.uniform(-0.01, 0.03))
+    return Draft(kind="plate", strength=1e3 * gap, make=make, towards="x", box_gap=gap, only_audit=True)
+
+
+def waiver(rng: np.random.Generator) -> Draft:
+    """Cameras that give no depth for long, and a user who allows a map of any age."""
+    draft = frames(rng)
+    while draft.kind != "blind":
+        draft = frames(rng)
+    return replace(draft, max_map_age=100.0, only_audit=True)
+
+
+def dark(rng: np.random.Generator) -> Draft:
+    """A target that returns no depth to any camera, beside any part of the arm, which may rest."""
+    cameras = CAMERAS if rng.random() < 0.5 else tuple(sorted(rng.choice(CAMERAS, size=2, replace=False).tolist()))
+    return Draft(
+        kind=f"{len(cameras)} cameras", strength=1.0, make=target(rng), fault=Fault(dark=1.0), cameras=cameras,
+        turn=_turn(rng), from_link=0.25, touches_first=True,
+    )  # fmt: skip
+
+
+def still(rng: np.random.Generator) -> Draft:
+    """Nothing is wrong, and the arm moves by centimetres."""
+    return replace(benign(rng), turn=float(rng.uniform(0.03, 0.15)), touches_first=True)
+
+
+def _turn(rng: np.random.Generator) -> float:
+    """The usual motion, or a small one."""
+    return 1.0 if rng.random() < 0.5 else float(rng.uniform(0.03, 0.2))
+
+
 SETTINGS = {  # integers are rounded
     "occupancy.self_mask_tolerance": (0.006, 0.06),
     "occupancy.depth_error": (0.003, 0.03),
@@ -371,9 +455,17 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Draft]] = {
     "far": far,
     "wrist": wrist,
     "settings": settings,
+    "frozen": frozen,
+    "too far": too_far,
+    "small": small,
+    "box": box,
+    "waiver": waiver,
+    "dark": dark,
+    "still": still,
 }
 ORDER = (*FAMILIES, "benign")  # by turns; benign twice, as its share of green is a gate
 LATER = ("behind", "far", "wrist", "settings")  # not in the campaigns of seeds below 100
+NEWEST = ("frozen", "too far", "small", "box", "waiver", "dark", "still")  # not in those of seeds below 500
 
 
 def _standing(solid: Primitive, kind: str, size: tuple[float, ...], place: Float64) -> Primitive:

@@ -21,7 +21,9 @@ class Fault:
     states; dark: share of the target's pixels without depth; speckle: that share is lost pixel by pixel; max_range
     [m] of the depth camera; edge [m]: steps of depth beside which edge_share of the pixels are lost; latency [s] of
     the map; order, offset [rad], in_degrees: how joint positions are logged. spheres_kept, spheres_shrunk [m],
-    longer: joint and by how much [m] the model's link differs; max_splats.
+    longer: joint and by how much [m] the model's link differs; max_splats. repeated: the frame from which on every
+    camera's last image comes again, its depth alone or its colour too (repeats_color); beyond [m]: how far behind its
+    place the target is measured; instead [m]: the depth that is written for none on it.
     """
 
     depth_scale: Mapping[str, float] = field(default_factory=dict)
@@ -44,6 +46,10 @@ class Fault:
     spheres_shrunk: float = 0.0
     longer: tuple[int, float] | None = None
     max_splats: int | None = None
+    repeated: int | None = None
+    repeats_color: bool = True
+    beyond: float = 0.0
+    instead: float | None = None
 
     def logged(self, q: Float64) -> Float64:
         """What a log says (T, J) of true joint positions (T, J)."""
@@ -69,6 +75,11 @@ class Fault:
         T = T_world_camera @ turn
         T[:3, 3] += error[:3]
         return T
+
+    @property
+    def is_beyond(self) -> bool:
+        """Whether the target is measured behind its place."""
+        return self.beyond > 0 or self.instead is not None
 
     @property
     def is_of_model(self) -> bool:

@@ -5,7 +5,8 @@
 2. Clocks: an image of a wrong camera shows the arm while it moves.
 3. The robot's model: too few or too small spheres always (the URDF has the surface); what else is wrong with the
    model or the joints, and a part that it has not, only where images show the arm.
-4. The target: what stands there from the beginning has returned depth in two frame sets (or the only one) before
+4. The target: what stands there from the beginning has returned depth (of one that is measured behind its place, on
+   rays through the table) in two frame sets (or the only one) before
    the arm came nearest; or it is wide (4 cm), returns none, and is a hole in two frame sets, with depth of other
    things all around it; or no image shows it, and it is so wide that it stands in unknown space. Disclaimed is what
    returns no depth before something else that returns none, or beside the arm; and what is narrower than half a
@@ -49,7 +50,10 @@ def observable(
     recorded motion was nearest.
     """
     fault = _of_fault(draft, world, shown)
-    return fault if not fault.holds else _of_target(world, shown, frame_clearance, least_ns, is_audit)
+    if not fault.holds:
+        return fault
+    is_beyond = draft.fault.is_beyond
+    return _of_target(world, shown, frame_clearance, least_ns, is_audit=is_audit, is_beyond=is_beyond)
 
 
 def _of_fault(draft: Draft, world: World, shown: Shown) -> Observable:
@@ -78,7 +82,9 @@ def _sees_arm(shown: Shown, rows: list[int], frames: np.ndarray) -> bool:
     return bool(np.count_nonzero(shown.arm[rows][:, frames] >= NUM_ARM_PIXELS) >= 3)
 
 
-def _of_target(world: World, shown: Shown, frame_clearance: np.ndarray, least_ns: int, is_audit: bool) -> Observable:
+def _of_target(
+    world: World, shown: Shown, frame_clearance: np.ndarray, least_ns: int, *, is_audit: bool, is_beyond: bool
+) -> Observable:
     pixels = shown.target.sum(axis=0)
     is_before = shown.stamps <= least_ns if is_audit else np.ones(len(pixels), dtype=bool)
     seen = (pixels >= NUM_PIXELS) & is_before
@@ -93,8 +99,10 @@ def _of_target(world: World, shown: Shown, frame_clearance: np.ndarray, least_ns
         is_wide = width >= WIDE
         if is_wide and np.count_nonzero(shown.target_hole.max(axis=0)[is_before] >= NUM_PIXELS) >= num_enough:
             return Observable(holds=True, rule="a hole")
+        if is_beyond:
+            return Observable(holds=False, rule="measured in free space")
         if shown.target_outline[:, is_before].sum() >= NUM_PIXELS:
-            return Observable(holds=False, rule="returns no depth")
+            return Observable(holds=is_wide, rule="dark, in space never seen" if is_wide else "returns no depth")
         return Observable(holds=is_wide, rule="space never seen" if is_wide else "no depth from it")
     if not is_audit and any(target.track is not None for target in world.targets):
         return Observable(holds=False, rule="moves between two frame sets")

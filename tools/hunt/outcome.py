@@ -6,7 +6,7 @@ from pathlib import Path
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict
 
-WORDS = ("safe", "failed", "contact", "not evaluable", "refused")
+WORDS = ("safe", "waived", "failed", "contact", "not evaluable", "refused")
 LONGEST = 90  # characters of a reason
 
 
@@ -19,12 +19,14 @@ class Word:
 
 
 def word_of(verdict: Verdict) -> Word:
-    """What a verdict says; a failure other than contact is `failed`."""
+    """What a verdict says; a failure other than contact is `failed`, what passed by a waiver `waived`."""
     first = verdict.decisive[0] if verdict.decisive else None
     reason = "" if first is None else f"{first.criterion}: {first.sentence}"[:LONGEST]
     if verdict.outcome is Outcome.FAILED:
         return Word(word="contact" if verdict.label == "contact" else "failed", reason=reason)
-    return Word(word="safe" if verdict.outcome is Outcome.PASSED else "not evaluable", reason=reason)
+    if verdict.outcome is Outcome.PASSED:
+        return Word(word="waived" if verdict.how == "waived" else "safe", reason=reason)
+    return Word(word="not evaluable", reason=reason)
 
 
 def refused(error: SplatCtrlError, folder: Path) -> Word:

@@ -26,6 +26,7 @@ WRIST = "wrist"  # the camera on the hand
 NEAREST = 0.2  # [m] that it measures
 MOST_OF_RING = 0.9  # a few pixels beside edges are lost by any camera
 ARM_TEXTURE = Texture(pattern="checks", feature=0.05, dark=PALETTE["shell"][0], bright=PALETTE["shell"][1], seed=20)
+TRACE = 0.10  # [m] by which depth lies behind what is there, so that other cameras contradict it
 SAME_SURFACE = 0.02  # [m] two cameras see the same place
 
 
@@ -58,6 +59,7 @@ class Recorder:
         self._arm, self._target, self._outline, self._hole, self._depth = (
             np.zeros(shape, dtype=np.int64) for _ in range(5)
         )
+        self._newest: dict[int, tuple[np.ndarray, Float32]] = {}  # colour and depth of each camera's last image
         self._first: list[Float32] = [np.zeros((0, 0), np.float32)] * len(self._names)
 
     def write(self, path: Path) -> Shown:
@@ -127,15 +129,27 @@ class Recorder:
         is_target, is_arm = _nearer(exact, without_target), _nearer(exact, without_arm)
         measured = self._measured(exact, camera, (*self._seed, number, index), rng)
         measured = np.where(is_target & _lost(fault, exact.shape, rng), 0, measured)
+        if fault.is_beyond:
+            farther = measured + fault.beyond if fault.instead is None else np.full_like(measured, fault.instead)
+            measured = np.where(is_target & (measured > 0), farther, measured)
         if camera.name == WRIST:
             measured = np.where(measured < NEAREST, 0, measured)
         if (camera.name, index) in fault.blind:
             measured = np.zeros_like(measured)
         wrong = measured * fault.depth_scale.get(camera.name, 1.0) + fault.depth_bias.get(camera.name, 0.0)
         depth = np.where(measured > 0, np.maximum(wrong, 0), 0).astype(np.float32)
-        self._arm[number, index] = np.count_nonzero(is_arm & (depth > 0))
-        self._target[number, index] = np.count_nonzero(is_target & (depth > 0))
-        self._depth[number, index] = np.count_nonzero(depth > 0)
+        if fault.repeated is not None and index >= fault.repeated:
+            before_color, depth = self._newest[number]
+            color = before_color if fault.repeats_color else color
+        self._newest[number] = color, depth
+        is_told = (depth > 0) & (fault.repeated is None or index < fault.repeated)
+        is_of_target = is_target & is_told
+        if fault.is_beyond:  # a ray through the table is the trace
+            behind = renderer.depth([])
+            is_of_target &= (behind > 0) & (depth > behind + TRACE)
+        self._arm[number, index] = np.count_nonzero(is_arm & is_told)
+        self._target[number, index] = np.count_nonzero(is_of_target)
+        self._depth[number, index] = np.count_nonzero(is_told)
         self._outline[number, index] = np.count_nonzero(is_target)
         if _is_enclosed(is_target, (depth > 0) & ~is_arm):
             self._hole[number, index] = np.count_nonzero(is_target)

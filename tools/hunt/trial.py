@@ -19,7 +19,7 @@ from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays import files, inputs
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.records import Intrinsics, SphereSet
+from splatctrl_cli.records import Box, Float64, Intrinsics, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, coverage_of_solids
 from splatctrl_cli.robot.link_meshes import Solid
 from splatctrl_cli.robot.model import RobotModel
@@ -30,7 +30,7 @@ from splatctrl_cli.simulate.render import Camera
 from splatctrl_cli.sources.source import open_source
 from tools.hunt.body import draw_body
 from tools.hunt.clearance import TOLERANCE, Positions, TrueArm, interpolated, least_clearance
-from tools.hunt.families import FAMILIES, LATER, ORDER, Draft
+from tools.hunt.families import FAMILIES, LATER, NEWEST, ORDER, Draft
 from tools.hunt.faults import spheres_yaml
 from tools.hunt.observability import MARGIN, TOLERATED, Observable, observable
 from tools.hunt.outcome import Word, refused, word_of
@@ -38,6 +38,7 @@ from tools.hunt.recording import Recorder, Shown
 from tools.hunt.world import (
     BOX,
     DURATION_S,
+    TURN,
     Made,
     World,
     at_s,
@@ -51,10 +52,12 @@ from tools.hunt.world import (
 _COVERAGES: dict[object, CoverageReport] = {}  # of the robot used last
 
 FIRST_OF_ALL = 100  # the first seed whose campaigns have all families
+FIRST_OF_NEWEST = 500  # the same of those that came last
+BEFORE_CAMERAS = np.array([0.32, 0.0, 0.27])  # [m] about where they look
 MODES = ("audit", "closed-loop")
 CLOSED_SHARE = 0.3
 SPLATS = 3000  # hold every surface of these scenes
-SHARES = {"benign": (0.22, 0.10)}  # of targets drawn into contact, and inside the margin
+SHARES = {"benign": (0.22, 0.10), "still": (0.22, 0.10)}  # of targets drawn into contact, and inside the margin
 OTHER_SHARES = (0.62, 0.16)
 
 
@@ -105,7 +108,8 @@ class Row:
 
 def family_of(seed: int, index: int) -> str:
     """Families by turns."""
-    order = ORDER if seed >= FIRST_OF_ALL else [name for name in ORDER if name not in LATER]
+    left_out = (*(LATER if seed < FIRST_OF_ALL else ()), *(NEWEST if seed < FIRST_OF_NEWEST else ()))
+    order = [name for name in ORDER if name not in left_out]
     return order[index % len(order)]
 
 
@@ -118,7 +122,7 @@ def draw(seed: int, index: int, model: RobotModel) -> Trial:
         draft = FAMILIES[family](rng)
         arm = TrueArm(model, draft.tool, body)
         everywhere = draw_cameras(rng, body.width)
-        motion = draw_motion(rng, model, arm, everywhere)
+        motion = draw_motion(rng, model, arm, everywhere, draft.turn * TURN)
         cameras = tuple(_seen_from(camera, draft) for camera in everywhere if camera.name in draft.cameras)
         if wish < contact:
             clearance = -float(rng.uniform(0.001, 0.025))
@@ -128,7 +132,10 @@ def draw(seed: int, index: int, model: RobotModel) -> Trial:
         if draft.carried is not None:
             targets: Made = (_carried(draft, motion, model, body.palm),)
         else:
-            found = placed(rng, draft.make, motion, arm, cameras, clearance=clearance, second=second)
+            found = placed(
+                rng, draft.make, motion, arm, cameras,
+                clearance=clearance, second=second, towards=_towards(draft, cameras), from_link=draft.from_link,
+            )  # fmt: skip
             start = motion.at(0.0)[0][None]
             if found is None or (
                 not draft.touches_first and arm.clearances(found, np.array([at_s(0.0)]), start)[0] < 0.04
@@ -232,7 +239,7 @@ def _judged(trial: Trial, folder: Path, device: str = "cpu") -> tuple[Word, Repl
                     config=config,
                     urdf=robot[0],
                     spheres=robot[1],
-                    box=BOX,
+                    box=box_of(trial),
                     threads=1,
                     device=device,
                 )
@@ -250,6 +257,8 @@ def _judged(trial: Trial, folder: Path, device: str = "cpu") -> tuple[Word, Repl
                 worst_frames=0,
                 threads=1,
             )
+            if trial.draft.max_map_age is not None:
+                request = replace(request, max_map_age=trial.draft.max_map_age)
             result = replay(request)
         return word_of(result.verdict), result
     except SplatCtrlError as error:
@@ -283,6 +292,23 @@ def _evidence(trial: Trial, arm: TrueArm, shown: Shown) -> Observable:
         least_ns=least_ns,
         is_audit=trial.mode == "audit",
     )
+
+
+def _towards(draft: Draft, cameras: Sequence[Camera]) -> Float64 | None:
+    """The place (3,) [m] from which the target comes; None for anywhere."""
+    if draft.towards == "behind":  # as far on the other side as the cameras are
+        middle = np.mean([camera.T_world_camera[:3, 3] for camera in cameras], axis=0)
+        return np.asarray(BEFORE_CAMERAS + 3.0 * (BEFORE_CAMERAS - middle))
+    return np.array([100.0, 0.0, 0.5]) if draft.towards == "x" else None
+
+
+def box_of(trial: Trial) -> Box:
+    """The workspace that the user gives."""
+    if trial.draft.box_gap is None:
+        return BOX
+    (plate,) = trial.world.targets
+    face = plate.T_world_shape[0, 3] - plate.size[0] / 2
+    return Box(lower=BOX.lower, upper=np.array([face - trial.draft.box_gap, *BOX.upper[1:]]))
 
 
 def _carried(draft: Draft, motion: Motion, model: RobotModel, palm: float) -> Primitive:

@@ -85,18 +85,21 @@ def table() -> Primitive:
     return _solid("table", "box", (1.5, 1.5, 0.05), np.array([0.35, 0.0, -0.025]), np.random.default_rng(1))
 
 
-def draw_motion(rng: np.random.Generator, model: RobotModel, arm: TrueArm, cameras: Sequence[Camera]) -> Motion:
+def draw_motion(
+    rng: np.random.Generator, model: RobotModel, arm: TrueArm, cameras: Sequence[Camera], turn: Float64 = TURN
+) -> Motion:
     """One stroke, at rest at first and at the end, that keeps off the table, itself, the limits and the borders, the
-    hand in view of two cameras.
+    hand in view of two cameras; turn (7,) [rad]: from start to end at most.
     """
+    least = 0.5 * float(np.linalg.norm(turn) / np.linalg.norm(TURN))
     pairs, radii = model.self_pairs(), model.sphere_set.radii
     for _ in range(400):
         start = CENTRE + rng.uniform(-1, 1, 7) * SPREAD
-        end = start + rng.uniform(-1, 1, 7) * TURN
+        end = start + rng.uniform(-1, 1, 7) * turn
         begin, stop = rng.uniform(0.5, 0.8), rng.uniform(2.3, 2.8)
         motion = Motion(times=np.array([0.0, begin, stop]), waypoints=np.array([start, start, end]))
         q = positions_of(motion, samples()[::2])
-        if np.any(q < model.lower + 0.05) or np.any(q > model.upper - 0.05) or np.linalg.norm(end - start) < 0.5:
+        if np.any(q < model.lower + 0.05) or np.any(q > model.upper - 0.05) or np.linalg.norm(end - start) < least:
             continue
         centers = model.sphere_centers_batch(q)
         gaps = np.linalg.norm(centers[:, pairs[:, 0]] - centers[:, pairs[:, 1]], axis=2)
@@ -216,11 +219,14 @@ def placed(
     *,
     clearance: float,
     second: float,
+    towards: Float64 | None = None,
+    from_link: float = 0.5,
 ) -> Made | None:
     """The target where the arm's least clearance to it is `clearance` [m], near the arm at a time [s], in the view
     of two cameras or of all; None where no such place was found.
 
-    It is drawn towards a point of the arm from half a metre beside it, by bisection.
+    It is drawn towards a point of the arm from half a metre beside it, by bisection; from `towards` (3,), a point or
+    where there is none anywhere beside. from_link: the share of the arm, from its base, that is no such point.
     """
     stamps = samples()
     q = positions_of(motion, stamps)
@@ -230,9 +236,11 @@ def placed(
         return float(arm.clearances(make(place), stamps, q).min())
 
     for _ in range(12):
-        mark = marks[int(rng.integers(len(marks) // 2, len(marks)))]  # of the forearm and the hand
+        mark = marks[int(rng.integers(int(from_link * len(marks)), len(marks)))]  # of the forearm and the hand
         angle = rng.uniform(-np.pi, np.pi)
         away = np.array([np.cos(angle), np.sin(angle), 0.0])
+        if towards is not None:
+            away = (towards - mark) / np.linalg.norm(towards - mark)
         near, far = mark, mark + 0.02 * away
         while least(far) < clearance and np.linalg.norm(far - mark) < 0.6:
             near, far = far, far + 0.06 * away

@@ -11,7 +11,7 @@ from splatctrl_cli.jobs.replays.inputs import LoggedStates
 from splatctrl_cli.jobs.replays.metrics import Metrics
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
-from splatctrl_cli.records import Bool
+from splatctrl_cli.records import Float64
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
 BROKEN, UNKNOWN = "failed", "*not evaluable*"  # as the table of the criteria has them
@@ -66,11 +66,7 @@ def mm(metres: float) -> str:
     return f"{1e3 * metres:.1f} mm"
 
 
-def nearby(judged: Judged, column: str, which: Bool | None = None) -> tuple[float, float, int] | None:
-    """The largest value of what was known about the arm, of some states (T,) or all, when [s], and over how many
-    states; None without one.
-    """
-    values = judged.replay.near[column]
-    values = values if which is None else np.where(which, values, np.nan)
+def nearby(judged: Judged, values: Float64) -> tuple[float, float, int] | None:
+    """The largest of values (T,) about the arm, when [s], and over how many states; None without one."""
     num = int(np.isfinite(values).sum())
     return (float(np.nanmax(values)), seconds_at(judged, int(np.nanargmax(values))), num) if num else None

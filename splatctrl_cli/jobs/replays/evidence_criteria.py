@@ -1,16 +1,15 @@
 """Criteria of a replay's verdict: whether the evidence reaches."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from splatctrl_cli.config.fixed import (
-    BEYOND,
     BLIND,
     COARSE_VOXEL,
     HIDDEN,
     MISPLACED,
-    SOME_UNSEEN,
     UNSEEN,
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
@@ -24,68 +23,149 @@ from splatctrl_cli.jobs.replays.criteria_input import (
     seconds_at,
 )
 from splatctrl_cli.jobs.replays.time_criteria import clocks, evidence_age, judged_time, map_age
+from splatctrl_cli.voxels import EvidenceClass
 
-NEAR_PLACES = (  # columns of `NearFigures`, the least [m] allowed (None: the margin), what is said, what helps
-    (
-        "hidden",  # one side of a thing says little of where the other ends
-        HIDDEN,
-        "space that no camera saw is {margin} from the arm, the margin, and {} from a surface of the map: it may go "
-        "on there, allowed {allowed}",
-        "add a camera that sees that side",
+
+@dataclass(frozen=True, kw_only=True)
+class Limit:
+    """A row of the table of evidence. asked: of what, in the documentation's words, and why. column: of
+    `NEAR_COLUMNS`, with the class that is its part; most: the largest share allowed, or least [m]: the least distance
+    (0: the margin); words, remedy: what is said.
+    """
+
+    asked: str
+    why: str
+    column: str
+    part: EvidenceClass | None = None
+    most: float | None = None
+    least: float = 0.0
+    words: str
+    remedy: str
+
+    @property
+    def docs(self) -> str:
+        """The row of the documentation's table, its cells separated by |."""
+        within = f"at most {100 * self.most:g} %" if self.most is not None else ""
+        distance = f"more than {1e3 * self.least:g} mm" if self.least else "more than the margin"
+        return f"{self.asked} | {within or distance} | {self.why}"
+
+
+LIMITS = (
+    Limit(
+        asked="never seen, of all points within the margin",
+        why="three cameras leave up to 42 %; a lone one, beside an arm that hardly moves, 52 % and more",
+        column="unseen",
+        most=UNSEEN,
+        words="of the space within the margin of the arm was never seen by a camera",
+        remedy="add a camera that sees where the arm goes",
     ),
-    (
-        "beyond",  # and where the arm comes to nothing but the unseen, a whole thing may stand
-        BEYOND,
-        "a part of the arm comes to space of which cameras saw less than a tenth, {} from a surface of the map: it "
-        "may go on there, allowed {allowed}",
-        "add a camera that sees where the arm goes",
+    Limit(
+        asked="never seen, of the points nearest to one link",
+        why="a link that comes to nothing but unseen space may meet a whole thing there",
+        column="blind",
+        most=BLIND,
+        words="of the space within the margin of one link was never seen by a camera",
+        remedy="add a camera that sees where that link goes",
     ),
-    (
-        "unanswered",
-        None,
-        "cameras looked at a place {} from the arm and got no depth from it, margin {margin}",
-        "a dark, shiny or clear thing may stand there: add a camera that gets depth there",
+    Limit(
+        asked="never seen, from a surface of the map",
+        why="one side of a thing says little of where the other ends",
+        column="beside",
+        least=HIDDEN,
+        words="space within the margin of the arm that no camera saw is {} from a surface of the map, allowed "
+        "{allowed}: it may go on there",
+        remedy="add a camera that sees that side",
     ),
-    (
-        "edge",
-        None,
-        "the edge of a surface was lost {} from the arm, margin {margin}: it may go on for a pixel",
-        "keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
+    Limit(
+        asked="unanswered, from the arm",
+        why="a dark, shiny or clear thing stands where depth was due and none came",
+        column="nearest",
+        part=EvidenceClass.UNANSWERED,
+        words="cameras looked at a place {} from the arm and got no depth from it, margin {allowed}",
+        remedy="a dark, shiny or clear thing may stand there: add a camera that gets depth there",
     ),
+    Limit(
+        asked="contradicted, from the arm",
+        why="a shiny thing is measured far behind its place",
+        column="nearest",
+        part=EvidenceClass.CONTRADICTED,
+        words="{} from the arm, margin {allowed}, a camera measures through what another one sees",
+        remedy="a shiny thing may stand there: add a camera that sees it, or check depth scale and poses",
+    ),
+    Limit(
+        asked="depth edge, from the arm",
+        why="a surface may go on for a pixel where its edge was lost",
+        column="nearest",
+        part=EvidenceClass.DEPTH_EDGE,
+        words="the edge of a surface was lost {} from the arm, margin {allowed}: it may go on for a pixel",
+        remedy="keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
+    ),
+    Limit(
+        asked="outside of the workspace, from the arm",
+        why="what stands there is in no map",
+        column="nearest",
+        part=EvidenceClass.OUTSIDE,
+        words="the workspace of the map ends {} from the arm, margin {allowed}",
+        remedy="reconstruct with a larger --box",
+    ),
+)
+PROOF = Limit(
+    asked="neither free nor swept, with `--require-proof`",
+    why="such a run would be safe by an assumption",
+    column="assumed",
+    most=0.0,
+    words="of the space within the margin of the arm was assumed to be free, as --require-proof does not allow",
+    remedy="add cameras until every side of the arm is seen, or let the arm pass there",
 )
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
-    """Cameras saw at least 53 % of the space around the moving arm; where they saw less than two thirds, at most 9 %
-    of the moving spheres come to space of which less than a tenth was seen; at most `--max-unknown` of the sphere
-    centres are in space never seen; the margin about the arm reaches no unseen space within 30 mm of a surface, or
-    within 100 mm about a sphere that comes to nine tenths unseen space, no place where cameras looked and got no
-    depth, and no pixel without depth into which a surface beside it may go on. A baked field needs its channel
+    """Every point within the margin of the arm has one class of evidence, and each class keeps its limit (the table
+    below); at most `--max-unknown` of the sphere centres are in space never seen. A baked field needs its channel
     `observed`.
     """
-    for column, allowed, least, words in (
-        ("unseen", UNSEEN, 0.0, "of the space about the arm that the motion comes to was never seen by a camera"),
-        (
-            "blind",
-            BLIND,
-            SOME_UNSEEN,
-            "of the moving spheres come to space of which a camera never saw more than a tenth",
-        ),
-    ):
-        near = nearby(judged, column, judged.replay.near["unseen"] >= least)
-        if near is not None and near[0] > allowed:
-            yield lacking(
-                sentence=f"{100 * near[0]:.0f} % {words}, allowed {100 * allowed:g} %",
-                value=near[0],
-                threshold=allowed,
-                time_s=near[1],
-                remedy="add a camera that sees where the arm goes",
-                count=near[2],
-            )
-        elif near is not None:
-            yield held(f"{100 * near[0]:.0f} % {words}", near[0], allowed, "", near[2])
-    yield from _near_places(judged)
+    for limit in (*LIMITS, *((PROOF,) if judged.request.require_proof else ())):
+        yield from _within(judged, limit)
     yield from _unknown_share(judged)
+
+
+def _within(judged: Judged, limit: Limit) -> Iterator[Reason]:
+    """Whether a limit is kept, and where it is broken most."""
+    near = judged.replay.near
+    values = near[limit.column] if limit.part is None else near[limit.column][:, limit.part]
+    if limit.most is not None:
+        worst = nearby(judged, values)
+        if worst is None:
+            return
+        words = f"{100 * worst[0]:.0f} % {limit.words}"
+        if worst[0] <= limit.most:
+            yield held(words, worst[0], limit.most, "", worst[2])
+            return
+        yield lacking(
+            sentence=f"{words}, allowed {100 * limit.most:g} %",
+            value=worst[0],
+            threshold=limit.most,
+            time_s=worst[1],
+            remedy=limit.remedy,
+            count=worst[2],
+        )
+        return
+    allowed = limit.least or judged.replay.margin
+    if not np.any(values <= allowed):
+        return
+    at = int(np.nanargmin(values))
+    place = near["beside_place"][at] if limit.part is None else near["places"][at].reshape(-1, 3)[limit.part]
+    yield lacking(
+        sentence=limit.words.format(mm(values[at]), allowed=mm(allowed)),
+        value=float(values[at]),
+        threshold=allowed,
+        unit="m",
+        time_s=seconds_at(judged, at),
+        place=tuple(place.tolist()),
+        cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*place),
+        remedy=limit.remedy,
+        count=int((values <= allowed).sum()),
+    )
 
 
 def _unknown_share(judged: Judged) -> Iterator[Reason]:
@@ -107,28 +187,6 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
         remedy="add a camera, or give a larger --max-unknown",
         count=judged.num_states,
     )
-
-
-def _near_places(judged: Judged) -> Iterator[Reason]:
-    """Places near the arm that the map says too little of: each kind nearer than is allowed."""
-    margin = judged.replay.margin
-    for column, least, sentence, remedy in NEAR_PLACES:
-        distance, allowed = judged.replay.near[column], margin if least is None else least
-        if not np.any(distance <= allowed):
-            continue
-        worst = int(np.nanargmin(distance))
-        place = judged.replay.near[f"{column}_place"][worst]
-        yield lacking(
-            sentence=sentence.format(mm(max(distance[worst], 0.0)), margin=mm(margin), allowed=mm(allowed)),
-            value=float(distance[worst]),
-            threshold=allowed,
-            unit="m",
-            time_s=seconds_at(judged, worst),
-            place=tuple(place.tolist()),
-            cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*place),
-            remedy=remedy,
-            count=int((distance <= allowed).sum()),
-        )
 
 
 def map_error(judged: Judged) -> Iterator[Reason]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import NEXT_SCENE_NS
@@ -23,9 +24,9 @@ from splatctrl_cli.field.grid_field import GridField, exact_channel
 from splatctrl_cli.field.obstacles import NO_SPLAT, ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Parts, sha256
 from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, Index, Label, SplatSet
+from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, Index, Label, SplatSet, UInt8
 from splatctrl_cli.scene_files.scene_folder import open_scene
-from splatctrl_cli.voxels import SWEPT, Balls, OccupancyGrid, SeenVoxels, VoxelState
+from splatctrl_cli.voxels import SWEPT, Balls, EvidenceClass, OccupancyGrid, SeenVoxels, VoxelState
 
 Key = TypeVar("Key", bound=Hashable)
 BY_CAMERA = (VoxelState.FREE, VoxelState.UNCERTAIN, VoxelState.OCCUPIED)  # voxels that a camera saw
@@ -143,11 +144,7 @@ def from_grid(path: Path) -> KnownScene:
     barrier = GridField(grid)
     states = grid.channels.get("observed")
     observed = None if states is None else observed_lookup(states.astype("uint8"), grid.origin, grid.voxel)
-    seen = (
-        None
-        if observed is None
-        else Seen(last_ns=lambda points: np.where(np.isin(observed(points), BY_CAMERA), 0, -1))
-    )
+    seen = None if observed is None else _seen_in_grid(observed, grid)
     fields = KnownFields(
         barrier=barrier,
         distances={
@@ -219,12 +216,21 @@ def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0
 
 def seen_of(voxels: SeenVoxels) -> Seen:
     """What the space about an arm is asked for."""
-    return Seen(
-        last_ns=voxels.last_seen_ns,
-        unanswered=voxels.unanswered,
-        voxel=voxels.voxel,
-        edges=np.column_stack([voxels.edges.centers, voxels.edges.radii]).astype(np.float64),
-    )
+    edges = np.column_stack([voxels.edges.centers, voxels.edges.radii]).astype(np.float64)
+    return Seen(look=voxels.look, edges=edges, origin=voxels.origin, voxel=voxels.voxel)
+
+
+def _seen_in_grid(observed: Observed, grid: DistanceGrid) -> Seen:
+    """What a baked grid says: whether a camera ever saw a place, and nothing of when or why not. That the robot's
+    spheres, which stick out, were in it says nothing of what is beside them.
+    """
+
+    def look(points: Float64) -> tuple[NDArray[np.int64], UInt8]:
+        is_seen = np.isin(observed(points), BY_CAMERA)
+        classes = np.where(is_seen, EvidenceClass.FREE, EvidenceClass.OUT_OF_VIEW).astype(np.uint8)
+        return np.where(is_seen, np.int64(0), np.int64(-1)), classes
+
+    return Seen(look=look, origin=grid.origin, voxel=grid.voxel)
 
 
 def known_space(occupancy: OccupancyGrid) -> Observed:

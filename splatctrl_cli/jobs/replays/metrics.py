@@ -50,6 +50,7 @@ from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.jobs.replays.standstill_baseline import BESIDE, FIGURES, STANDSTILL, separation_figures
 from splatctrl_cli.jobs.replays.state_store import RUNGS
 from splatctrl_cli.records import Bool, Float64
+from splatctrl_cli.voxels import EvidenceClass
 
 Metrics = dict[str, float | None]
 Counts = dict[str, int]
@@ -89,10 +90,12 @@ def _exact(replay: Replay) -> Float64:
     return replay.audit.clearance["exact"].distance
 
 
-def _of(columns: str, name: str) -> Callable[[Replay], Float64]:
-    """Reads a column of the replay's figures: `between`, `near`, `strain`, `divergence`, or those of a controller."""
+def _of(columns: str, name: str, part: int | None = None) -> Callable[[Replay], Float64]:
+    """Reads a column of the replay's figures, or a part of one: `between`, `near`, `strain`, `divergence`, or those
+    of a controller.
+    """
     figures = attrgetter(columns)
-    return lambda replay: figures(replay)[name]
+    return lambda replay: figures(replay)[name] if part is None else figures(replay)[name][:, part]
 
 
 def _intervals(replay: Replay) -> int:
@@ -172,10 +175,17 @@ OF_STATES: Declared = (
     folded("min_clearance_between", LEAST, _of("between", "lower"), scale=GAP, shown=NEAREST),
     folded("min_clearance_splats", LEAST, _of("between", "represented"), scale=GAP, shown=NEAREST),
     folded("max_unseen_share", LARGEST, _of("near", "unseen"), scale=BAD_SHARE),
-    folded("max_blind_share", LARGEST, _of("near", "blind"), scale=BAD_SHARE),
-    folded("min_unanswered", LEAST, _of("near", "unanswered"), num_states, scale=GAP),
-    folded("min_hidden", LEAST, _of("near", "hidden"), num_states, scale=GAP),
-    folded("min_beyond", LEAST, _of("near", "beyond"), num_states, scale=GAP),
+    folded("max_unseen_share_of_link", LARGEST, _of("near", "blind"), scale=BAD_SHARE),
+    folded("max_assumed_share", LARGEST, _of("near", "assumed"), scale=BAD_SHARE),
+    folded("min_unseen_to_surface", LEAST, _of("near", "beside"), num_states, scale=GAP),
+    *(
+        figure
+        for kind in EvidenceClass
+        for figure in (
+            folded(f"max_share_{kind.name.lower()}", LARGEST, _of("near", "shares", kind), scale=BAD_SHARE),
+            folded(f"min_distance_{kind.name.lower()}", LEAST, _of("near", "nearest", kind), num_states, scale=GAP),
+        )
+    ),
     folded("max_evidence_age_s", LARGEST, _of("near", "age"), scale=AGE),
     _single("unjudged_s", lambda r: float(r.between["unbounded"].sum()) + r.lead_in_s, _intervals, AGE),
     folded(

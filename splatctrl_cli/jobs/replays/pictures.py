@@ -16,6 +16,7 @@ from splatctrl_cli.report.replay_pictures import (
     clearance_picture,
     commands_picture,
     divergence_picture,
+    evidence_picture,
     open_loop_picture,
 )
 
@@ -29,7 +30,8 @@ ROWS = ("scene", "self", "limit")  # kinds of rows that shape a command
 
 
 def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
-    """Write clearance.png; of a controller commands.png, in open loop open_loop.png, in closed loop divergence.png.
+    """Write clearance.png, and evidence.png where that is known; of a controller commands.png, in open loop
+    open_loop.png, in closed loop divergence.png.
 
     seconds: (T,) since the first state.
     """
@@ -41,6 +43,8 @@ def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
     if replay.closed_loop is not None and replay.start_time_s > 0:
         title += f", from {replay.start_time_s:.2f} s of the log"
     clearance_picture(folder / "clearance.png", seconds, curves, replay.margin, title, happened)
+    if np.isfinite(shares := replay.near["shares"]).any():
+        evidence_picture(folder / "evidence.png", seconds, shares)
     if replay.kept_steps is not None:
         broken = frozenset({EventKind.ROW_BROKEN})
         kinds, rows = (INTERVENTIONS, ROWS) if replay.outside is None else (broken, tuple(broken))

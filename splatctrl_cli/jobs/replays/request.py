@@ -32,7 +32,8 @@ class ReplayRequest:
     the way, on `device`) says what is known of the scene. base: pose of the URDF's root in world, x, y, z, qx, qy,
     qz, qw; locked: values [rad or m] of joints that no log moves. Times in
     seconds; start_time may be FIRST_MAP. evidence: a camera, or every how many frame sets, that did not train the
-    scene and bounds its error; with require_evidence no verdict passes without. controller: a user's own class,
+    scene and bounds its error; with require_evidence no verdict passes without, with require_proof none where space
+    about the arm was assumed to be free. controller: a user's own class,
     ``module:Class``, or controller_command: a program (docs/controllers.md). report_only: the verdict alone does
     not set the exit code.
     """
@@ -70,6 +71,7 @@ class ReplayRequest:
     max_map_age: float = 1.0
     evidence: str | None = None
     require_evidence: bool = False
+    require_proof: bool = False
     controller: str | None = None
     controller_command: str | None = None
     controller_step_limit: float = STEP_LIMIT

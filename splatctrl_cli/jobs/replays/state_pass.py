@@ -1,7 +1,7 @@
 """States of a replay as they come, block by block: measured, explained, and kept in files."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
@@ -14,7 +14,7 @@ from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
 from splatctrl_cli.control.fixed_parts import FixedParts
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
 from splatctrl_cli.control.limits import MotionLimits
-from splatctrl_cli.control.near_space import NearFigures, NearSpace, Seen
+from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace, Seen
 from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.jobs.replays.hindsight import Hindsight, NewerDepth
@@ -24,10 +24,13 @@ from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_gaps
+from splatctrl_cli.voxels import EvidenceClass
 
-NEAR_NAMES = tuple(field.name for field in fields(NearFigures))
-NEAR_DISTANCES = ("unanswered", "hidden", "beyond", "edge")  # of them, each with its place
-AGES = ("age", "ahead")  # of them, where times of seeing are known
+KINDS = len(EvidenceClass)
+NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # of what was known about the arm, and their shapes at a state
+    **dict.fromkeys(("age", "ahead", "unseen", "blind", "assumed", "beside"), ()),
+    **{"beside_place": (3,), "shares": (KINDS,), "nearest": (KINDS,), "places": (KINDS * 3,)},
+}
 
 
 class ReplayRecord:
@@ -37,7 +40,7 @@ class ReplayRecord:
     between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), 1 where that is
     the clearance of a posture on the way instead (`met`), the time [s] that nobody can bound (`unbounded`), the
     clearance [m] of the body at the state (`surface`), and that of the spheres to the splats alone (`represented`).
-    near: what was known about the arm (the columns of `NearFigures`), NaN at states that were not looked at.
+    near: what was known about the arm (`NEAR_COLUMNS`), NaN at states that were not looked at.
     hindsight: what later depth says of times without any; newer_depth: of states that a late map judged. strain:
     velocity and acceleration as shares of their limits. closest: of pairs of links that keep less than the
     margin asked for, how near they came [m] and the stamp; nothing of those that stayed apart.
@@ -81,7 +84,7 @@ class ReplayRecord:
             np.asarray(model.velocity_limit),
             np.broadcast_to(limit, model.velocity_limit.shape) if limit.any() else None,
         )
-        self.near, self._near = Figures(), NearSpace(model, config.control.margin)
+        self.near, self._near = Figures(), NearSpace(model, config.control.margin, max_map_age)
         self._posture_before: Float64 | None = None  # at the end of the last block
         self.hindsight = Hindsight(scene, self._near, config.control.margin, self._clearance_in)
         self.newer_depth = NewerDepth(scene, config.control.margin - SLIGHTLY_UNDER, self._clearance_in)
@@ -238,7 +241,7 @@ class ReplayRecord:
         if known is self._last_scene:
             return
         self._last_scene, before, self._seen_before = known, self._seen_before, self._scene.seen_at(stamp)
-        was_seen = None if before is None else lambda places: before.last_ns(places) >= 0
+        was_seen = None if before is None else lambda places: before.look(places)[0] >= 0
         self._fixed.look(known.distances["exact"], part.position[0], was_seen)
 
     @property
@@ -249,7 +252,7 @@ class ReplayRecord:
     def _look_around(self, part: AuditTrace) -> None:
         """What was known of the space about the arm, at some of the states and on the way there."""
         num = len(part.stamp_ns)
-        columns = {name: np.full((num, 3) if "place" in name else num, np.nan) for name in NEAR_NAMES}
+        columns = {name: np.full((num, *shape), np.nan) for name, shape in NEAR_COLUMNS.items()}
         if self._scene.has_seen_times:
             self.hindsight.add(part.stamp_ns, part.position)
         for at, is_timed in self._near.due(part.stamp_ns, self._model.sphere_centers_batch(part.position)).items():
@@ -259,16 +262,12 @@ class ReplayRecord:
                 exact = self._scene.at(stamp).distances["exact"]
                 before, q = part.position[at - 1] if at else self._posture_before, part.position[at]
                 way = self._near.on_the_way(before, q) if before is not None and self._is_continuous else ()
-                figures, *others = (self._near.look(stamp, each, known, exact) for each in (q, *way))
-                for name in NEAR_NAMES if is_timed else ():
-                    if self._scene.has_seen_times or name not in AGES:
-                        columns[name][at] = getattr(figures, name)
-                for name in NEAR_DISTANCES:
-                    nearest = min((figures, *others), key=attrgetter(name))
-                    columns[name][at], place = getattr(nearest, name), getattr(nearest, f"{name}_place")
-                    columns[f"{name}_place"][at] = place
+                accounts = [self._near.look(stamp, each, known, exact) for each in (q, *way)]
+                for name, value in _folded(accounts).items():
+                    columns[name][at] = value
                 if is_timed and self._scene.has_seen_times:
-                    self.hindsight.looked(stamp, figures.age)
+                    columns["age"][at], columns["ahead"][at] = accounts[0].age, accounts[0].ahead
+                    self.hindsight.looked(stamp, accounts[0].age)
         self._posture_before = part.position[-1]
         self.near.append(**columns)
 
@@ -293,3 +292,20 @@ class ReplayRecord:
             for state, obstacle in zip(states.tolist(), obstacles, strict=True):
                 found[state] = obstacle
         return found
+
+
+def _folded(accounts: Sequence[Account]) -> dict[str, float | Float64]:
+    """The shares at a state; of it and of the postures on the way the most that is unseen, and how near it comes."""
+    shares, nearest = (np.array([getattr(each, name) for each in accounts]) for name in ("shares", "nearest"))
+    least, places = nearest.argmin(axis=0), np.array([each.places for each in accounts])
+    beside = min(accounts, key=attrgetter("beside"))
+    return {
+        "shares": shares[0],
+        "nearest": nearest.min(axis=0),
+        "places": places[least, np.arange(KINDS)].ravel(),
+        "unseen": float(shares[:, NEVER_SEEN].sum(axis=1).max()),
+        "blind": max(each.blind for each in accounts),
+        "assumed": max(each.assumed for each in accounts),
+        "beside": beside.beside,
+        "beside_place": beside.beside_place,
+    }

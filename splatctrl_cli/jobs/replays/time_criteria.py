@@ -27,7 +27,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
     not count; a baked field does not say when it was seen (a note).
     """
     yield from _unwatched(judged)
-    ahead = nearby(judged, "ahead")
+    ahead = nearby(judged, judged.replay.near["ahead"])
     allowed = SAME_MOMENT_NS / 1e9  # the frames of one time step lie apart
     if ahead is not None and ahead[0] > allowed:
         yield lacking(
@@ -39,7 +39,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             remedy="a state is judged by what was known then: reconstruct with snapshots, or check the clocks",
             count=ahead[2],
         )
-    near = nearby(judged, "age")
+    near = nearby(judged, judged.replay.near["age"])
     if near is not None and near[0] > judged.request.max_map_age:
         yield lacking(
             sentence=f"the newest depth near the arm is {near[0]:.2f} s old, allowed "

@@ -1,6 +1,7 @@
 """Criteria of a replay's verdict on made-up figures: those that a whole run seldom breaks alone."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,10 +15,12 @@ from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.replays import evidence_criteria as evidence
 from splatctrl_cli.jobs.replays.control_criteria import controller
 from splatctrl_cli.jobs.replays.motion_criteria import surface_clearance
+from splatctrl_cli.jobs.replays.state_pass import NEAR_COLUMNS
+from splatctrl_cli.voxels import EvidenceClass
 
 NUM = 11
 UNKNOWN = np.full(NUM, np.nan)
-NOTHING_NEAR = dict.fromkeys(("unseen", "blind", "age", "ahead", "unanswered", "hidden", "beyond", "edge"), UNKNOWN)
+NOTHING_NEAR = {name: np.full((NUM, *shape), np.nan) for name, shape in NEAR_COLUMNS.items()}
 
 
 def judged(**replay: Any) -> Any:
@@ -41,7 +44,13 @@ def judged(**replay: Any) -> Any:
     return SimpleNamespace(
         replay=SimpleNamespace(**run | replay),
         request=SimpleNamespace(
-            max_map_age=1.0, max_unknown=0.05, config=Config(), field=None, follow=True, twist_topic=None
+            max_map_age=1.0,
+            max_unknown=0.05,
+            require_proof=False,
+            config=Config(),
+            field=None,
+            follow=True,
+            twist_topic=None,
         ),
         inputs=SimpleNamespace(source=SimpleNamespace(loss=SimpleNamespace(conflicting_states=0), has_clock=True)),
         metrics={"unknown_share": 0.0, "num_scene_hits": 0},
@@ -148,34 +157,59 @@ def test_the_surface_must_keep_the_whole_map_error(miss: float, outcome: Outcome
     assert outcomes(evidence.map_error, judged(map_error=found)) == [outcome]
 
 
+EVIDENCE = EvidenceClass
+STRICT = (EVIDENCE.UNANSWERED, EVIDENCE.CONTRADICTED, EVIDENCE.DEPTH_EDGE, EVIDENCE.OUTSIDE)
+
+
+def near_a(kind: EvidenceClass, distance: float) -> dict[str, Any]:
+    """At one state a place of a class is so far [m] from the arm."""
+    nearest, places = np.full((NUM, len(EVIDENCE)), np.inf), np.zeros((NUM, 3 * len(EVIDENCE)))
+    nearest[4, kind] = distance
+    places[4, 3 * kind : 3 * kind + 3] = 0.25
+    return NOTHING_NEAR | {"nearest": nearest, "places": places}
+
+
+def beside_a_surface(distance: float) -> dict[str, Any]:
+    """At one state unseen space is so far [m] from a surface of the map."""
+    near = np.where(np.arange(NUM) == 4, distance, np.inf)
+    return NOTHING_NEAR | {"beside": near, "beside_place": np.full((NUM, 3), 0.25)}
+
+
 @pytest.mark.parametrize(
-    ("column", "distance", "count"),
+    ("near", "distance", "count"),
     [
-        ("hidden", 0.031, 0),
-        ("hidden", 0.029, 1),
-        ("hidden", -0.004, 1),
-        ("beyond", 0.101, 0),
-        ("beyond", 0.099, 1),
-        ("unanswered", 0.021, 0),
-        ("unanswered", 0.019, 1),
-        ("edge", 0.021, 0),
-        ("edge", 0.019, 1),
+        (beside_a_surface, 0.031, 0),
+        (beside_a_surface, 0.029, 1),
+        *((partial(near_a, kind), distance, int(distance < 0.02)) for kind in STRICT for distance in (0.021, 0.019)),
+        *((partial(near_a, kind), 0.0, 0) for kind in EVIDENCE if kind not in STRICT),
     ],
 )
 def test_a_place_of_which_too_little_is_known_near_the_arm_is_no_evidence(
-    column: str, distance: float, count: int
+    near: Callable[[float], dict[str, Any]], distance: float, count: int
 ) -> None:
-    near = np.where(np.arange(NUM) == 4, distance, np.inf)
-    place = np.full((NUM, 3), 0.25)
-    run = judged(near=NOTHING_NEAR | {column: near, f"{column}_place": place})
+    run = judged(near=near(distance))
     found = [r for r in evidence.known_space(run) if r.outcome is Outcome.NOT_EVALUABLE]
     assert [r.count for r in found] == [1] * count
     assert not found or (found[0].time_s, found[0].place) == (pytest.approx(0.4), (0.25, 0.25, 0.25))
-    assert not found or f"{1e3 * max(distance, 0):.1f} mm" in found[0].sentence
+    assert not found or f"{1e3 * distance:.1f} mm" in found[0].sentence
 
 
-@pytest.mark.parametrize("column", ["unanswered", "edge"])
-def test_the_arm_in_such_a_place_is_no_evidence_without_a_margin_either(column: str) -> None:
-    near = np.where(np.arange(NUM) == 4, 0.0, np.inf)
-    run = judged(margin=0.0, near=NOTHING_NEAR | {column: near, f"{column}_place": np.zeros((NUM, 3))})
+@pytest.mark.parametrize("kind", STRICT)
+def test_the_arm_in_such_a_place_is_no_evidence_without_a_margin_either(kind: EvidenceClass) -> None:
+    run = judged(margin=0.0, near=near_a(kind, 0.0))
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == 1
+
+
+@pytest.mark.parametrize(("column", "allowed"), [("unseen", evidence.UNSEEN), ("blind", evidence.BLIND)])
+@pytest.mark.parametrize(("more", "count"), [(-0.01, 0), (0.01, 1)])
+def test_more_that_no_camera_saw_is_no_evidence(column: str, allowed: float, more: float, count: int) -> None:
+    share = np.where(np.arange(NUM) == 4, allowed + more, 0.1)
+    run = judged(near=NOTHING_NEAR | {column: share})
+    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
+
+
+@pytest.mark.parametrize(("is_asked", "count"), [(False, 0), (True, 1)])
+def test_space_that_was_assumed_to_be_free_is_no_proof(is_asked: bool, count: int) -> None:
+    run = judged(near=NOTHING_NEAR | {"assumed": np.full(NUM, 0.01)})
+    run.request.require_proof = is_asked
+    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count

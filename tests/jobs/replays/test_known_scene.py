@@ -18,7 +18,7 @@ from splatctrl_cli.jobs.replays.state_pass import ReplayRecord
 from splatctrl_cli.jobs.studies.problems import simulated_arm
 from splatctrl_cli.records import Float64
 from splatctrl_cli.scene.posture import posture_of
-from splatctrl_cli.voxels import SWEPT, VoxelState
+from splatctrl_cli.voxels import SWEPT, EvidenceClass, VoxelState
 from tests.cli.replay_desk import SECOND
 from tests.jobs.stage import FAR, Stage, decisive, passing
 from tests.plain import plain_grid
@@ -65,16 +65,20 @@ def test_the_space_about_the_arm_is_asked_between_states_that_are_far_apart(is_c
         median_radius=0.01,
         obstacles=lambda points: (nothing,) * len(points),
     )
-    seen = Seen(last_ns=lambda points: np.zeros(len(points), np.int64), edges=np.array([[*edge, 1e-3]]))
+    seen = Seen(
+        look=lambda points: (np.zeros(len(points), np.int64), np.zeros(len(points), np.uint8)),
+        edges=np.array([[*edge, 1e-3]]),
+    )
     scene = KnownScene(
         at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={}, seen_at=lambda _: seen
     )
     record = ReplayRecord(model, scene, config=Config(), max_map_age=1.0, is_continuous=is_continuous)
     record.measured(np.array([0, SECOND // 10]), np.array([q - turn, q + turn]), np.zeros((2, 7)))
-    first, second = record.near["edge"]
+    first, second = record.near["nearest"][:, EvidenceClass.DEPTH_EDGE]
     assert first > 0.02
     assert (second == 0.0) if is_continuous else (second > 0.02)
-    assert np.isinf(second) or record.near["edge_place"][1] == pytest.approx(edge)
+    place = record.near["places"][1].reshape(-1, 3)[EvidenceClass.DEPTH_EDGE]
+    assert np.isinf(second) or place == pytest.approx(edge)
 
 
 def test_what_spheres_leave_uncovered_is_not_taken_from_a_surface_that_is_measured() -> None:
@@ -163,5 +167,5 @@ def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_
         write_npz(field / "field.npz", replace(grid, channels=kept))
         code, verdict = stage.replayed("--field", str(field))
         assert (code, decisive(verdict)) == (5, {"known space": "not evaluable"})
-        words = "what cameras saw is not recorded" if state is None else "100 % of the space about the arm"
+        words = "what cameras saw is not recorded" if state is None else "100 % of the space within the margin"
         assert words in verdict["sentence"]

@@ -1,0 +1,105 @@
+"""Rays through what another camera measures: into a shiny thing that is measured behind its place, or a dark one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.config.fixed import CONTRADICTED, CONTRADICTING_PIXELS
+from splatctrl_cli.records import Float32, RgbdFrame
+from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
+from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, object_mask
+from splatctrl_cli.voxels import EvidenceClass
+from tests.scene.wall import HEIGHT, INTRINSICS, WORKSPACE, frame
+
+CONFIG = OccupancyConfig()
+BLOCK = 0.1  # [m] high, 0.2 m wide
+BESIDE = 0.15  # [m] from one camera to the other
+
+
+def block_measured_at(depth: float, *, x: float = 0.0, camera: str = "cam0") -> RgbdFrame:
+    """The floor and a block on it, of which a camera measures another depth."""
+    seen = frame(block=BLOCK, x=x, camera=camera)
+    seen.depth[seen.depth < HEIGHT] = depth
+    return seen
+
+
+def masks_of(*frames: RgbdFrame) -> list[tuple[RgbdFrame, SelfMask]]:
+    return [(seen, object_mask(seen)) for seen in frames]
+
+
+@pytest.mark.parametrize(("behind", "is_wrong"), [(CONTRADICTED + 0.02, True), (CONTRADICTED - 0.02, False)])
+def test_depth_far_behind_what_another_camera_measures_is_contradicted(behind: float, is_wrong: bool) -> None:
+    """The floor about it shows through a pixel of the block that lies under the floor."""
+    shiny, other = block_measured_at(HEIGHT + behind), frame(x=BESIDE, camera="cam1")
+    found, none = contradicted(masks_of(shiny, other), is_drawn=False)
+    is_block = shiny.depth > HEIGHT
+    assert not none.until.any()
+    pixels = found.pixels(shiny.depth.shape)
+    assert pixels.any() == is_wrong and not (pixels & ~is_block).any()
+    assert not is_wrong or pixels.sum() > 0.7 * is_block.sum()
+    mask = without_contradicted(object_mask(shiny), found)
+    assert ((mask.kinds == PixelKind.CONTRADICTED) == pixels).all()
+    points = found.points(shiny, CONFIG, is_blank=False)
+    assert bool(len(points)) == is_wrong and not len(found.points(shiny, CONFIG, is_blank=True))
+    if is_wrong:  # on the rays of the block and above the floor
+        assert (points[:, 2] > 0).all() and np.abs(points[:, :2]).max() < 0.12
+        assert HEIGHT - CONFIG.min_range - 0.01 < points[:, 2].max() <= HEIGHT - CONFIG.min_range
+
+
+def test_a_camera_without_depth_where_another_measures_a_surface_looked_in_vain() -> None:
+    dark, other = block_measured_at(0.0), frame(x=BESIDE, camera="cam1")
+    found, _ = contradicted(masks_of(dark, other), is_drawn=False)
+    points = found.points(dark, CONFIG, is_blank=True)
+    assert len(points) and not found.pixels(dark.depth.shape).any()
+    assert np.linalg.norm(points - [0.0, 0.0, BLOCK / 2], axis=1).min() < CONFIG.voxel
+
+
+def test_where_no_camera_has_depth_nothing_is_missing() -> None:
+    """Of a black strip of the floor none returns any."""
+    one, other = frame(), frame(x=BESIDE, camera="cam1")
+    shift = round(BESIDE * INTRINSICS.fx / HEIGHT)
+    one.depth[:, 30:60] = other.depth[:, 30 - shift : 60 - shift] = 0.0
+    assert not any(found.until.any() for found in contradicted(masks_of(one, other), is_drawn=False))
+
+
+def test_a_few_pixels_are_noise() -> None:
+    shiny, other = frame(), frame(x=BESIDE, camera="cam1")
+    side = int(CONTRADICTING_PIXELS**0.5) + 1  # without the outline: one pixel fewer on each side
+    shiny.depth[30 : 30 + side, 40 : 40 + side] = HEIGHT + 0.3
+    found, _ = contradicted(masks_of(shiny, other), is_drawn=False)
+    assert not found.until.any()
+
+
+def drawn(depth: Float32) -> SelfMask:
+    """A robot half a metre before the camera in its block's place, of which only some returned depth."""
+    mask = object_mask(block_measured_at(depth=0.0))
+    robot = np.where(block_measured_at(0.0).depth <= 0, np.float32(0.5), np.float32(0.0))
+    return replace(mask, robot_depth=robot)
+
+
+@pytest.mark.parametrize("is_drawn", [True, False])
+def test_a_robot_that_returns_no_depth_is_hidden_by_something(is_drawn: bool) -> None:
+    dark = block_measured_at(0.0)
+    (found,) = contradicted([(dark, drawn(dark.depth))], is_drawn=is_drawn)
+    points = found.points(dark, CONFIG, is_blank=True)
+    assert bool(len(points)) == is_drawn
+    assert not is_drawn or points[:, 2].min() > HEIGHT - 0.5 - 1e-6
+
+
+def test_a_lone_camera_contradicts_nothing() -> None:
+    (found,) = contradicted(masks_of(block_measured_at(HEIGHT + 0.3)), is_drawn=True)
+    assert not found.until.any()
+
+
+@pytest.mark.parametrize(
+    ("depth", "kind"), [(HEIGHT + 0.3, EvidenceClass.CONTRADICTED), (0.0, EvidenceClass.UNANSWERED)]
+)
+def test_a_fitted_scene_knows_it(depth: float, kind: EvidenceClass) -> None:
+    """A camera beside it sees past the block's foot alone, and the block's inside is not free."""
+    fitter = SceneFitter(SceneConfig(max_splats=300, first_iterations=1, iterations_per_step=1), CONFIG, WORKSPACE)
+    fitter.step([block_measured_at(depth), frame(x=BESIDE, y=0.3, camera="cam1")])
+    _, classes = fitter.known_voxels().seen.look(np.array([[0.0, 0.0, 0.4]]))
+    assert classes.tolist() == [kind]
