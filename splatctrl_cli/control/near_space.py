@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config import fixed
@@ -71,6 +72,7 @@ class NearSpace:
         self._links = np.array(model.sphere_set.links)
         self._names = list(dict.fromkeys(self._links))
         self._surfaces = model.link_distances
+        self._grids = dict[str, tuple[Float64, Float64]]()  # by link, as `_grid_of`
         self._next_ns = -(2**63)
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres when they were last looked about
 
@@ -162,11 +164,35 @@ class NearSpace:
             is_asked = gap <= reach
             if name in self._surfaces and is_asked.any():
                 T_link_world = invert_transform(self._model.frame_pose(q, str(name)))
-                gap[is_asked] = self._surfaces[name](transform_points(T_link_world, points[is_asked]))
+                gap[is_asked] = self._gap_to(str(name), transform_points(T_link_world, points[is_asked]))
             is_inside |= gap <= 0
             is_nearer = is_asked & (gap < gaps) & bool(self._moving[own].any())
             gaps[is_nearer], links[is_nearer] = gap[is_nearer], number
         return np.where(is_inside, -np.abs(gaps), gaps), links
+
+    def _gap_to(self, name: str, points: Float64) -> Float64:
+        """Signed distance (Q,) [m] of points (Q, 3) in a link's frame to its surface, near it to about a millimetre:
+        from nodes half of `NEAR_LATTICE` apart.
+        """
+        if name not in self._grids:
+            self._grids[name] = self._grid_of(name)
+        lower, values = self._grids[name]
+        at = (points - lower) / (fixed.NEAR_LATTICE / 2)
+        return np.asarray(map_coordinates(values, at.T, order=1, mode="nearest"))
+
+    def _grid_of(self, name: str) -> tuple[Float64, Float64]:
+        """A corner (3,) [m] of nodes about a link, in its frame, and their distances to its surface."""
+        step, own, reach = fixed.NEAR_LATTICE, self._links == name, self._margin + 2 * fixed.NEAR_LATTICE
+        centers, radii = self._model.sphere_set.centers[own], self._radii[own, None] + reach
+        lower = (centers - radii).min(axis=0)
+        num = np.ceil(((centers + radii).max(axis=0) - lower) / step).astype(int) + 1
+        nodes, fine = (np.moveaxis(np.indices(size), 0, -1) for size in (num, 2 * num - 1))
+        coarse = self._surfaces[name]((lower + step * nodes).reshape(-1, 3), None).reshape(num)
+        values = map_coordinates(coarse, fine.reshape(-1, 3).T / 2, order=1)
+        is_near = np.abs(values) < reach
+        near = lower + step / 2 * fine.reshape(-1, 3)[is_near]
+        values[is_near] = self._surfaces[name](near, values[is_near] > 2 * step)
+        return lower, values.reshape(2 * num - 1)
 
     def _nearest_edge(self, q: Float64, centers: Float64, edges: Float64) -> tuple[float, Float64]:
         """How near the arm comes to balls (K, 4) [m], 0 where it meets one, and that ball's centre."""

@@ -311,8 +311,10 @@ class RobotModel:
         }
 
     @property
-    def link_distances(self) -> dict[str, Callable[[Float64], Float64]]:
-        """By link with triangles: points (Q, 3) in its frame -> signed distance (Q,) [m] to all of its geometry."""
+    def link_distances(self) -> dict[str, Callable[[Float64, Bool | None], Float64]]:
+        """By link with triangles: points (Q, 3) in its frame, and which are known to be outside (Q,) -> signed
+        distance (Q,) [m] to all of its geometry.
+        """
         links = {self.surface.links[number] for number in self.surface.trees}
         return {link: partial(self.surface.distance_to, link) for link in sorted(links)}
 

@@ -233,10 +233,12 @@ class RobotSurface:
                 least = np.minimum(least, np.where(is_inside, -found, found))
         return least
 
-    def distance_to(self, link: str, points: Float64) -> Float64:
-        """Signed distance (Q,) [m] of points (Q, 3) in a link's frame to its triangles, solids and carried boxes."""
+    def distance_to(self, link: str, points: Float64, outside: Bool | None = None) -> Float64:
+        """Signed distance (Q,) [m] of points (Q, 3) in a link's frame to its triangles, solids and carried boxes;
+        those `outside` (Q,) are known to be so.
+        """
         still = np.tile(np.eye(4), (len(self.links), 1, 1))
-        return self.distance(still, points, without=[name for name in self.links if name != link])
+        return self.distance(still, points, without=[name for name in self.links if name != link], outside=outside)
 
     def gaps(
         self, link: str, T_world_link: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]

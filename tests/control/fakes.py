@@ -30,7 +30,7 @@ class PlanarArm:
         self.sphere_deficit: Float64 = np.full(5, np.nan)
         self.base_position: Float64 = np.zeros(3)
         self.middle: Float64 = np.zeros(2)
-        self.link_distances: Mapping[str, Callable[[Float64], Float64]] = {}
+        self.link_distances: Mapping[str, Callable[[Float64, Bool | None], Float64]] = {}
         self.pairs = np.array([[0, 3], [0, 4]])
 
     def sphere_centers(self, q: Float64) -> Float64:
@@ -136,7 +136,7 @@ class ThinArm(PlanarArm):
         T[:3, 3] = 0.0 if frame == "upper" else self.lengths[0] * _unit(q[0])
         return T
 
-    def _distance(self, link: str, points: Float64) -> Float64:
+    def _distance(self, link: str, points: Float64, outside: Bool | None = None) -> Float64:
         own = np.array(self.sphere_set.links) == link
         away = np.linalg.norm(points[:, None] - self.sphere_set.centers[own], axis=2)
         return np.asarray((away - self.sphere_set.radii[own] + 0.02).min(axis=1))

@@ -132,7 +132,7 @@ def test_the_space_beside_a_link_with_triangles_is_that_beside_its_surface() -> 
     NearSpace(arm, 0.03).look(0, LATER, Seen(look=remember))
     gaps = np.linalg.norm(asked[0][:, None] - arm.sphere_centers(LATER), axis=2) - arm.sphere_set.radii
     nearest = (gaps[:, 1:] + 0.02).min(axis=1)
-    assert nearest.min() > 0 and nearest.max() <= 0.03 + NEAR_LATTICE / 2 and len(nearest) > 500
+    assert nearest.min() > -1e-3 and nearest.max() < 0.031 + NEAR_LATTICE / 2 and len(nearest) > 500
     assert gaps[:, 0].min() > 0  # outside of the base
 
 
