@@ -42,21 +42,24 @@ class Seen:
 
 @dataclass(frozen=True, kw_only=True)
 class Account:
-    """Of one posture. shares (C,): of the points within the margin, by `EvidenceClass`; assumed: the share of those
-    whose voxels reach into it that nobody saw free and the arm never was in; nearest (C,) [m]: how near one
-    of a class comes to the arm, and places (C, 3) [m], infinite and NaN where there is none. blind: the largest share
-    of never-seen points beside one link. beside [m]: how near a never-seen point is to the map's surfaces, and its
-    place (3,). age [s]: within which `NEAR_FRESH_SHARE` of the seen points were last seen; ahead [s]: by which the
-    last of them was seen after the state; NaN where nothing was seen.
+    """Of one posture.
+
+    shares (C,): of the points within the margin, by `EvidenceClass`; assumed: the share of those whose voxels reach
+    into it that nobody saw free and the arm never was in. nearest (C,) [m]: how near one of a class comes to the arm,
+    and places (C, 3) [m]. beside [m]: how near a never-seen point is to the map's surfaces, and its place (3,);
+    beyond [m]: the same of those about a sphere that comes to almost nothing else (`NEAR_BLIND`). Infinite and NaN
+    where there is none. age [s]: within which `NEAR_FRESH_SHARE` of the seen points were last seen; ahead [s]: by
+    which the last of them was seen after the state; NaN where nothing was seen.
     """
 
     shares: Float64
     assumed: float
     nearest: Float64
     places: Float64
-    blind: float
     beside: float
     beside_place: Float64
+    beyond: float
+    beyond_place: Float64
     age: float
     ahead: float
 
@@ -108,9 +111,9 @@ class NearSpace:
         """What was known about the posture q (J,) at a stamp; distance: of points (Q, 3) from the map's surfaces."""
         centers, step = self._model.sphere_centers(q), _step_of(known.voxel)
         points = self._lattice(known.origin, step, centers)
-        gaps, links = self._gaps(q, centers, points, self._margin + step / 2)
+        gaps, spheres = self._gaps(q, centers, points, self._margin + step / 2)
         is_near = (gaps > 0) & (gaps <= self._margin + step / 2)  # the voxel of a point that far reaches into it
-        points, gaps, links = points[is_near], gaps[is_near], links[is_near]
+        points, gaps, spheres = points[is_near], gaps[is_near], spheres[is_near]
         seen_ns, classes = known.look(points)
         ages, is_seen = (stamp_ns - seen_ns) * 1e-9, seen_ns >= 0
         classes = np.where((classes == EvidenceClass.FREE) & (ages > self._max_age), EvidenceClass.STALE, classes)
@@ -123,17 +126,20 @@ class NearSpace:
         nearest[edge], places[edge] = self._nearest_edge(q, centers, known.edges)
         is_within = gaps <= self._margin
         is_never = is_within & np.isin(classes, NEVER_SEEN)
-        beside = np.where(is_never, away, np.inf)
-        least = int(beside.argmin()) if len(beside) else None
-        num, num_never = (np.bincount(links[which], minlength=len(self._names)) for which in (is_within, is_never))
+        num, num_never = (np.bincount(spheres[which], minlength=len(centers)) for which in (is_within, is_never))
+        is_blind = (num_never >= fixed.NEAR_BLIND * num) & (num >= fixed.NEAR_FEWEST)
+        beside, beside_place = _nearest_of(points[is_never], away[is_never])
+        is_beyond = is_never & is_blind[spheres]
+        beyond, beyond_place = _nearest_of(points[is_beyond], away[is_beyond])
         return Account(
             shares=np.bincount(classes[is_within], minlength=len(EvidenceClass)) / max(num.sum(), 1),
             assumed=float(np.mean(~np.isin(classes, PROVEN))) if len(points) else 0.0,
             nearest=nearest,
             places=places,
-            blind=float(np.max(num_never / np.maximum(num, fixed.NEAR_FEWEST))),
-            beside=np.inf if least is None else float(beside[least]),
-            beside_place=np.full(3, np.nan) if least is None else points[least],
+            beside=beside,
+            beside_place=beside_place,
+            beyond=beyond,
+            beyond_place=beyond_place,
             age=float(np.quantile(ages[is_seen], fixed.NEAR_FRESH_SHARE)) if is_seen.any() else np.nan,
             ahead=max(-float(ages[is_seen].min()), 0.0) if is_seen.any() else np.nan,
         )
@@ -153,12 +159,12 @@ class NearSpace:
 
     def _gaps(self, q: Float64, centers: Float64, points: Float64, reach: float) -> tuple[Float64, Index]:
         """The distance (Q,) [m] of points (Q, 3) to the moving links, infinite beyond `reach` [m], negative within
-        any link; and the number (Q,) of the nearest link.
+        any link; and the number (Q,) of the nearest moving sphere.
         """
         to_spheres = cdist(points, centers) - self._radii
-        gaps, links = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
+        gaps = np.full(len(points), np.inf)
         is_inside = np.zeros(len(points), bool)
-        for number, name in enumerate(self._names):
+        for name in self._names:
             own = self._links == name
             gap = to_spheres[:, own].min(axis=1)
             is_asked = gap <= reach
@@ -166,9 +172,10 @@ class NearSpace:
                 T_link_world = invert_transform(self._model.frame_pose(q, str(name)))
                 gap[is_asked] = self._gap_to(str(name), transform_points(T_link_world, points[is_asked]))
             is_inside |= gap <= 0
-            is_nearer = is_asked & (gap < gaps) & bool(self._moving[own].any())
-            gaps[is_nearer], links[is_nearer] = gap[is_nearer], number
-        return np.where(is_inside, -np.abs(gaps), gaps), links
+            if self._moving[own].any():
+                gaps = np.where(is_asked, np.minimum(gap, gaps), gaps)
+        nearest = np.where(self._moving, to_spheres, np.inf).argmin(axis=1)
+        return np.where(is_inside, -np.abs(gaps), gaps), nearest
 
     def _gap_to(self, name: str, points: Float64) -> Float64:
         """Signed distance (Q,) [m] of points (Q, 3) in a link's frame to its surface, near it to about a millimetre:
@@ -209,6 +216,12 @@ class NearSpace:
 def _step_of(voxel: float) -> float:
     """The lattice's step [m] for voxels [m]: some of them, one, or a part of one."""
     return float(voxel * np.ceil(fixed.NEAR_LATTICE / voxel - 1e-6) / np.ceil(voxel / fixed.NEAR_LATTICE - 1e-6))
+
+
+def _nearest_of(points: Float64, away: Float64) -> tuple[float, Float64]:
+    """The least of distances (Q,) [m] of points (Q, 3) and its point, infinite and NaN without one."""
+    least = int(away.argmin()) if len(away) else None
+    return (np.inf, np.full(3, np.nan)) if least is None else (float(away[least]), points[least])
 
 
 def _nearest_by(classes: UInt8, gaps: Float64, points: Float64) -> tuple[Float64, Float64]:

@@ -39,7 +39,7 @@ def test_an_audit_measures_every_logged_state(desk: Desk, arm: RobotModel) -> No
     found = [float(row["clearance_exact"]) for row in desk.rows()]
     np.testing.assert_allclose(found, [clearance(arm, s.position) for s in desk.source.states], atol=1e-6)
     assert desk.metrics()["min_clearance"] == pytest.approx(min(found), abs=1e-8)
-    names = {"steps.csv", "events.json", "summary.json", "clearance.png", "run.json", "states.json"}
+    names = {"steps.csv", "events.json", "summary.json", "clearance.png", "run.json", "states.json", "evidence.png"}
     assert {path.name for path in (desk.folder / "out").iterdir()} == names
 
 

@@ -42,13 +42,10 @@ def test_the_account_is_that_of_the_reference() -> None:
     arm = PlanarArm()
     found = NearSpace(arm, 0.03).look(0, LATER, seen_by(half_seen))
     beside = points_beside(arm, LATER, 0.03, NEAR_LATTICE)
-    hidden = [(gap, link) for point, gap, link in beside if point[2] < 0]
+    hidden = [gap for point, gap, _ in beside if point[2] < 0]
     assert len(beside) > 100
     assert found.shares.sum() == pytest.approx(1.0)
     assert found.shares[EvidenceClass.HIDDEN_BY_ARM] == pytest.approx(len(hidden) / len(beside))
-    names, all_names = ([link for *_, link in those] for those in (hidden, beside))
-    of_links = [names.count(name) / all_names.count(name) for name in ("upper", "fore")]
-    assert found.blind == pytest.approx(max(of_links))
     wide = points_beside(arm, LATER, 0.03 + NEAR_LATTICE / 2, NEAR_LATTICE)
     assert found.assumed == pytest.approx(sum(point[2] < 0 for point, *_ in wide) / len(wide))
     nearest = min(gap for point, gap, _ in wide if point[2] < 0)
@@ -167,7 +164,7 @@ def test_a_robot_within_its_own_base_has_nothing_beside_it() -> None:
     arm = PlanarArm()
     arm.sphere_set.radii[0] = 5.0  # the base swallows all of the arm
     found = NearSpace(arm, 0.03).look(0, FIRST, seen_by(half_seen))
-    assert not found.shares.any() and np.isnan(found.age) and (found.assumed, found.blind) == (0.0, 0.0)
+    assert not found.shares.any() and np.isnan(found.age) and (found.assumed, found.beyond) == (0.0, np.inf)
 
 
 def test_a_lost_edge_is_as_near_as_its_ball() -> None:
@@ -207,6 +204,18 @@ def test_unseen_space_is_as_near_to_a_surface_as_by_the_reference(height: float)
     never = [height - point[2] for point, *_ in points_beside(arm, LATER, 0.03, NEAR_LATTICE) if point[2] <= height]
     assert found.beside == (pytest.approx(min(never), abs=1e-8) if never else np.inf)
     assert bool(never) == (height > -0.3)
+
+
+@pytest.mark.parametrize(("height", "is_blind"), [(0.0, False), (0.2, True)])
+def test_a_sphere_that_comes_to_the_unseen_alone_has_a_distance_of_its_own(height: float, is_blind: bool) -> None:
+    """Under a sheet that is seen from above alone: of 4 cm spheres most of the space about them, or all."""
+
+    def above(points: Float64) -> UInt8:
+        return np.where(points[:, 2] > height, np.uint8(EvidenceClass.FREE), np.uint8(EvidenceClass.OUT_OF_VIEW))
+
+    found = NearSpace(PlanarArm(), 0.03).look(0, LATER, seen_by(above), lambda points: height - points[:, 2] + 1e-9)
+    assert np.isfinite(found.beside) and found.beyond == (found.beside if is_blind else np.inf)
+    assert not is_blind or found.beyond == pytest.approx(height - found.beyond_place[2], abs=1e-8)
 
 
 def test_what_lies_within_a_surface_of_the_map_is_surface() -> None:

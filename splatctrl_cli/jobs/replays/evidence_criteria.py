@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.config.fixed import (
-    BLIND,
+    BEYOND,
     COARSE_VOXEL,
     HIDDEN,
     MISPLACED,
@@ -60,14 +60,6 @@ LIMITS = (
         remedy="add a camera that sees where the arm goes",
     ),
     Limit(
-        asked="never seen, of the points nearest to one link",
-        why="a link that comes to nothing but unseen space may meet a whole thing there",
-        column="blind",
-        most=BLIND,
-        words="of the space within the margin of one link was never seen by a camera",
-        remedy="add a camera that sees where that link goes",
-    ),
-    Limit(
         asked="never seen, from a surface of the map",
         why="one side of a thing says little of where the other ends",
         column="beside",
@@ -75,6 +67,15 @@ LIMITS = (
         words="space within the margin of the arm that no camera saw is {} from a surface of the map, allowed "
         "{allowed}: it may go on there",
         remedy="add a camera that sees that side",
+    ),
+    Limit(
+        asked="never seen, as nine tenths of the points about a sphere of the arm, from a surface of the map",
+        why="where the arm comes to nothing but the unseen, a whole thing may stand",
+        column="beyond",
+        least=BEYOND,
+        words="a part of the arm comes to space of which cameras saw less than a tenth, {} from a surface of the "
+        "map: it may go on there, allowed {allowed}",
+        remedy="add a camera that sees where the arm goes",
     ),
     Limit(
         asked="unanswered, from the arm",
@@ -154,7 +155,7 @@ def _within(judged: Judged, limit: Limit) -> Iterator[Reason]:
     if not np.any(values <= allowed):
         return
     at = int(np.nanargmin(values))
-    place = near["beside_place"][at] if limit.part is None else near["places"][at].reshape(-1, 3)[limit.part]
+    place = near[f"{limit.column}_place"][at] if limit.part is None else near["places"][at].reshape(-1, 3)[limit.part]
     yield lacking(
         sentence=limit.words.format(mm(values[at]), allowed=mm(allowed)),
         value=float(values[at]),

@@ -28,8 +28,8 @@ from splatctrl_cli.voxels import EvidenceClass
 
 KINDS = len(EvidenceClass)
 NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # of what was known about the arm, and their shapes at a state
-    **dict.fromkeys(("age", "ahead", "unseen", "blind", "assumed", "beside"), ()),
-    **{"beside_place": (3,), "shares": (KINDS,), "nearest": (KINDS,), "places": (KINDS * 3,)},
+    **dict.fromkeys(("age", "ahead", "unseen", "assumed", "beside", "beyond"), ()),
+    **{"beside_place": (3,), "beyond_place": (3,), "shares": (KINDS,), "nearest": (KINDS,), "places": (KINDS * 3,)},
 }
 
 
@@ -298,14 +298,15 @@ def _folded(accounts: Sequence[Account]) -> dict[str, float | Float64]:
     """The shares at a state; of it and of the postures on the way the most that is unseen, and how near it comes."""
     shares, nearest = (np.array([getattr(each, name) for each in accounts]) for name in ("shares", "nearest"))
     least, places = nearest.argmin(axis=0), np.array([each.places for each in accounts])
-    beside = min(accounts, key=attrgetter("beside"))
+    beside, beyond = (min(accounts, key=attrgetter(name)) for name in ("beside", "beyond"))
     return {
         "shares": shares[0],
         "nearest": nearest.min(axis=0),
         "places": places[least, np.arange(KINDS)].ravel(),
         "unseen": float(shares[:, NEVER_SEEN].sum(axis=1).max()),
-        "blind": max(each.blind for each in accounts),
         "assumed": max(each.assumed for each in accounts),
         "beside": beside.beside,
         "beside_place": beside.beside_place,
+        "beyond": beyond.beyond,
+        "beyond_place": beyond.beyond_place,
     }

@@ -169,17 +169,19 @@ def near_a(kind: EvidenceClass, distance: float) -> dict[str, Any]:
     return NOTHING_NEAR | {"nearest": nearest, "places": places}
 
 
-def beside_a_surface(distance: float) -> dict[str, Any]:
+def from_a_surface(column: str, distance: float) -> dict[str, Any]:
     """At one state unseen space is so far [m] from a surface of the map."""
     near = np.where(np.arange(NUM) == 4, distance, np.inf)
-    return NOTHING_NEAR | {"beside": near, "beside_place": np.full((NUM, 3), 0.25)}
+    return NOTHING_NEAR | {column: near, f"{column}_place": np.full((NUM, 3), 0.25)}
 
 
 @pytest.mark.parametrize(
     ("near", "distance", "count"),
     [
-        (beside_a_surface, 0.031, 0),
-        (beside_a_surface, 0.029, 1),
+        (partial(from_a_surface, "beside"), 0.031, 0),
+        (partial(from_a_surface, "beside"), 0.029, 1),
+        (partial(from_a_surface, "beyond"), 0.101, 0),
+        (partial(from_a_surface, "beyond"), 0.099, 1),
         *((partial(near_a, kind), distance, int(distance < 0.02)) for kind in STRICT for distance in (0.021, 0.019)),
         *((partial(near_a, kind), 0.0, 0) for kind in EVIDENCE if kind not in STRICT),
     ],
@@ -200,7 +202,7 @@ def test_the_arm_in_such_a_place_is_no_evidence_without_a_margin_either(kind: Ev
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == 1
 
 
-@pytest.mark.parametrize(("column", "allowed"), [("unseen", evidence.UNSEEN), ("blind", evidence.BLIND)])
+@pytest.mark.parametrize(("column", "allowed"), [("unseen", evidence.UNSEEN)])
 @pytest.mark.parametrize(("more", "count"), [(-0.01, 0), (0.01, 1)])
 def test_more_that_no_camera_saw_is_no_evidence(column: str, allowed: float, more: float, count: int) -> None:
     share = np.where(np.arange(NUM) == 4, allowed + more, 0.1)

@@ -9,7 +9,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict, held, verdict_of
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.replays import evidence_criteria
-from splatctrl_cli.jobs.replays.evidence_criteria import NEAR_PLACES
+from splatctrl_cli.jobs.replays.evidence_criteria import LIMITS
 from splatctrl_cli.jobs.studies import judge, trial
 from splatctrl_cli.jobs.studies.maps import Map
 from splatctrl_cli.jobs.studies.problem_run import FALSE_GREEN, SETTINGS, verdict_on_trials
@@ -57,7 +57,7 @@ def test_the_back_of_a_thing_that_the_arm_at_rest_hid_from_all_cameras_is_not_sa
 ) -> None:
     """Once driven and judged safe: 9 mm from a cylinder of which the map has the far side, 70 mm away."""
     if not sees:  # without that rule it would still pass
-        monkeypatch.setattr(evidence_criteria, "NEAR_PLACES", [p for p in NEAR_PLACES if p[0] != "beyond"])
+        monkeypatch.setattr(evidence_criteria, "LIMITS", [limit for limit in LIMITS if limit.column != "beyond"])
     hidden_back = read_problem("tabletop-0388", None)
     views = views_of(hidden_back, 2, width=320, num_steps=5)
     rig = Rig(problem=hidden_back, views=views, config=SETTINGS, threads=1, stopwatch=Stopwatch())
