@@ -40,7 +40,7 @@ class Unseen(IntEnum):
 
 
 class EvidenceClass(IntEnum):
-    """What is known of a point beside the arm at a time; exactly one of these."""
+    """What is known of a point beside the arm at one time. Each point has exactly one class."""
 
     FREE = 0  # a camera got depth through or on it, not too long ago
     SWEPT = 1  # never seen, but the robot's body was there
@@ -161,8 +161,8 @@ class SeenVoxels:
     edges: LostEdges = NO_EDGES
 
     def look(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], UInt8]:
-        """Of points (Q, 3) [m], world: the stamps (Q,) [ns] at which their voxels were last seen, -1 never; and the
-        `EvidenceClass` (Q,), of what was ever seen `FREE`.
+        """When the voxels of points (Q, 3) [m], world, were last seen, and their class: stamps (Q,) [ns], -1 for
+        never; `EvidenceClass` (Q,), `FREE` for all that was ever seen.
         """
         cell = np.floor((points - self.origin) / self.voxel + 0.5)
         is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)

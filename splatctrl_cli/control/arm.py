@@ -18,9 +18,8 @@ class ArmModel(Protocol):
     most, per radian (or metre) of each joint. self_allowance (P,) [m]: how much less than the margin asked for each
     of `self_pairs` keeps. surface_gaps: by link with triangles, of all `links` or some, its clearance (T,) [m] at
     postures (T, J). link_distances: by link with triangles, the signed distance (Q,) [m] of points (Q, 3) in its
-    frame to all of its geometry, some of which (Q,) are known to be outside. chain: its bodies and spheres as the
-    kernels walk them, None where only its methods
-    know.
+    frame to all of its geometry, some of which (Q,) may be known to be outside. chain: its bodies and spheres as
+    the kernels walk them, None where only its methods know.
     """
 
     @property

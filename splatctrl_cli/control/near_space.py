@@ -22,7 +22,6 @@ NEVER_SEEN = (
     *(EvidenceClass.HIDDEN_BY_ARM, EvidenceClass.HIDDEN_BY_THING, EvidenceClass.OUT_OF_VIEW),
     *(EvidenceClass.NO_RETURN, EvidenceClass.CONTRADICTED, EvidenceClass.UNANSWERED),
 )
-PROVEN = (EvidenceClass.FREE, EvidenceClass.SWEPT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,24 +41,24 @@ class Seen:
 
 @dataclass(frozen=True, kw_only=True)
 class Account:
-    """Of one posture.
+    """What was known of the space beside the arm in one posture.
 
-    shares (C,): of the points within the margin, by `EvidenceClass`; assumed: the share of those whose voxels reach
-    into it that nobody saw free and the arm never was in. nearest (C,) [m]: how near one of a class comes to the arm,
-    and places (C, 3) [m]. beside [m]: how near a never-seen point is to the map's surfaces, and its place (3,);
-    beyond [m]: the same of those about a sphere that comes to almost nothing else (`NEAR_BLIND`). Infinite and NaN
-    where there is none. age [s]: within which `NEAR_FRESH_SHARE` of the seen points were last seen; ahead [s]: by
-    which the last of them was seen after the state; NaN where nothing was seen.
+    shares (C,): of the points within the margin, by `EvidenceClass`. assumed: the share that is not free, of the
+    points whose voxels reach into the margin. nearest (C,) [m]: how near each class comes to the arm, and places
+    (C, 3) [m]. unseen_to_surface [m]: how near a never-seen point is to the map's surfaces, and its place (3,).
+    blind_to_surface [m]: the same of points about a sphere that comes to almost nothing else (`NEAR_BLIND`). Infinite
+    and NaN where there is none. age [s]: within which `NEAR_FRESH_SHARE` of the seen points were last seen. ahead
+    [s]: how long after the state the last of them was seen. NaN where nothing was seen.
     """
 
     shares: Float64
     assumed: float
     nearest: Float64
     places: Float64
-    beside: float
-    beside_place: Float64
-    beyond: float
-    beyond_place: Float64
+    unseen_to_surface: float
+    unseen_place: Float64
+    blind_to_surface: float
+    blind_place: Float64
     age: float
     ahead: float
 
@@ -128,18 +127,18 @@ class NearSpace:
         is_never = is_within & np.isin(classes, NEVER_SEEN)
         num, num_never = (np.bincount(spheres[which], minlength=len(centers)) for which in (is_within, is_never))
         is_blind = (num_never >= fixed.NEAR_BLIND * num) & (num >= fixed.NEAR_FEWEST)
-        beside, beside_place = _nearest_of(points[is_never], away[is_never])
-        is_beyond = is_never & is_blind[spheres]
-        beyond, beyond_place = _nearest_of(points[is_beyond], away[is_beyond])
+        to_unseen, unseen_place = _nearest_of(points[is_never], away[is_never])
+        is_in_blind = is_never & is_blind[spheres]
+        to_blind, blind_place = _nearest_of(points[is_in_blind], away[is_in_blind])
         return Account(
             shares=np.bincount(classes[is_within], minlength=len(EvidenceClass)) / max(num.sum(), 1),
-            assumed=float(np.mean(~np.isin(classes, PROVEN))) if len(points) else 0.0,
+            assumed=float(np.mean(classes != EvidenceClass.FREE)) if len(points) else 0.0,
             nearest=nearest,
             places=places,
-            beside=beside,
-            beside_place=beside_place,
-            beyond=beyond,
-            beyond_place=beyond_place,
+            unseen_to_surface=to_unseen,
+            unseen_place=unseen_place,
+            blind_to_surface=to_blind,
+            blind_place=blind_place,
             age=float(np.quantile(ages[is_seen], fixed.NEAR_FRESH_SHARE)) if is_seen.any() else np.nan,
             ahead=max(-float(ages[is_seen].min()), 0.0) if is_seen.any() else np.nan,
         )
@@ -202,7 +201,7 @@ class NearSpace:
         return lower, values.reshape(2 * num - 1)
 
     def _nearest_edge(self, q: Float64, centers: Float64, edges: Float64) -> tuple[float, Float64]:
-        """How near the arm comes to balls (K, 4) [m], 0 where it meets one, and that ball's centre."""
+        """The least distance [m] of the arm to balls (K, 4) [m], at least 0, and the centre (3,) of that ball."""
         reach = self._margin + np.max(edges[:, 3], initial=0.0)
         around = self._radii.max() + reach
         moving = centers[self._moving]

@@ -312,8 +312,8 @@ class RobotModel:
 
     @property
     def link_distances(self) -> dict[str, Callable[[Float64, Bool | None], Float64]]:
-        """By link with triangles: points (Q, 3) in its frame, and which are known to be outside (Q,) -> signed
-        distance (Q,) [m] to all of its geometry.
+        """By link with triangles, its signed distance (Q,) [m] as a function. It takes points (Q, 3) in the link's
+        frame, and a mask (Q,) of those that are known to be outside, or None.
         """
         links = {self.surface.links[number] for number in self.surface.trees}
         return {link: partial(self.surface.distance_to, link) for link in sorted(links)}

@@ -33,7 +33,7 @@ class Contradicted:
     is_blank: Bool
 
     def pixels(self, shape: tuple[int, ...]) -> Bool:
-        """Those (H, W) that have depth."""
+        """The contradicted pixels (H, W) that have depth."""
         out = np.zeros(shape, bool)
         blocks = np.kron((self.until > 0) & ~self.is_blank, np.ones((self.side, self.side), bool))
         out[: blocks.shape[0], : blocks.shape[1]] = blocks

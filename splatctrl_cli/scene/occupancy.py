@@ -96,8 +96,8 @@ class OccupancyMap:
         )
 
     def mark_unseen(self, points: Float64, reason: Unseen) -> None:
-        """Of the voxels that hold points (K, 3) [m], world: those that were never seen were not, for this reason,
-        unless one of the last two was known already.
+        """Note why no camera saw the voxels that hold points (K, 3) [m], world. A voxel keeps what it has where one
+        did, or where it is contradicted or unanswered already.
         """
         cells = np.floor((points - self.origin) / self.config.voxel + 0.5).astype(np.int64)
         i, j, k = cells[np.all((cells >= 0) & (cells < self.last_seen.shape), axis=1)].T
@@ -106,9 +106,7 @@ class OccupancyMap:
         self.last_seen[i[is_never], j[is_never], k[is_never]] = reason
 
     def unexplained(self, centers: Float64, radii: Float64) -> NDArray[np.intp]:
-        """Flat indices (K,) of the voxels in spheres (S, 3), (S,) [m] that were never seen, for a reason that may
-        pass.
-        """
+        """Flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m] whose reason may change."""
         is_near = np.zeros_like(self.entity)
         mark_spheres(self._packed, is_near, centers, radii, 1, self.num_threads)
         voxels = np.flatnonzero(is_near)

@@ -204,16 +204,16 @@ def _grid_of_states(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
 
 
 def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) -> NDArray[Any]:
-    """As it was stored, in one byte or two, of which the largest numbers say why a voxel was never seen.
+    """`last_seen` as it was stored, in one byte or two. Its largest numbers say why a voxel was never seen.
 
     Raises ValueError for another shape, or time steps that there are not.
     """
     is_short = stored.dtype == np.uint8
     stored = _voxels(stored, "last_seen", np.uint8 if is_short else np.uint16, header)
-    is_old = "unseen" not in header  # then the largest number alone is none of a time step
-    if is_short and num_steps >= FIRST_REASON:  # as older versions wrote it
+    is_old = "unseen" not in header  # then only the largest number is no time step, and means `UNANSWERED`
+    if is_short and num_steps >= FIRST_REASON:
         is_none = (stored == 0xFF) & (num_steps < 0xFF)
-        stored = np.where(is_none, np.uint16(Unseen.NO_RETURN), stored.astype(np.uint16))
+        stored = np.where(is_none, np.uint16(Unseen.UNANSWERED), stored.astype(np.uint16))
     highest = int(np.iinfo(stored.dtype).max)
     is_late = (stored > num_steps) & (stored < (highest if is_old else highest & ~0xF))
     if is_late.any():

@@ -67,7 +67,7 @@ def test_every_point_has_one_class_at_its_own_distance() -> None:
 
         found = NearSpace(arm, 0.06).look(0, LATER, seen_by(around))
         assert (found.nearest[kind], found.places[kind].tolist()) == (pytest.approx(gap), place.tolist())
-        assert (found.shares[kind] > 0) and (found.assumed > 0) == (kind != EvidenceClass.SWEPT)
+        assert found.shares[kind] > 0 and found.assumed > 0
 
 
 def test_what_was_seen_too_long_ago_is_stale() -> None:
@@ -164,7 +164,7 @@ def test_a_robot_within_its_own_base_has_nothing_beside_it() -> None:
     arm = PlanarArm()
     arm.sphere_set.radii[0] = 5.0  # the base swallows all of the arm
     found = NearSpace(arm, 0.03).look(0, FIRST, seen_by(half_seen))
-    assert not found.shares.any() and np.isnan(found.age) and (found.assumed, found.beyond) == (0.0, np.inf)
+    assert not found.shares.any() and np.isnan(found.age) and (found.assumed, found.blind_to_surface) == (0.0, np.inf)
 
 
 def test_a_lost_edge_is_as_near_as_its_ball() -> None:
@@ -189,7 +189,7 @@ def test_an_unseen_pocket_anywhere_within_a_wide_margin_is_found(away: float) ->
         return np.where(is_there, np.uint8(EvidenceClass.HIDDEN_BY_THING), np.uint8(EvidenceClass.FREE))
 
     found = NearSpace(arm, 0.1).look(0, LATER, seen_by(but_there), lambda points: np.full(len(points), 0.01))
-    assert found.beside == 0.01 and np.linalg.norm(found.beside_place - place) < 0.02
+    assert found.unseen_to_surface == 0.01 and np.linalg.norm(found.unseen_place - place) < 0.02
 
 
 @pytest.mark.parametrize("height", [-0.3, 0.0, 0.05, 0.4])
@@ -202,7 +202,7 @@ def test_unseen_space_is_as_near_to_a_surface_as_by_the_reference(height: float)
 
     found = NearSpace(arm, 0.03).look(0, LATER, seen_by(above), lambda points: height - points[:, 2] + 1e-9)
     never = [height - point[2] for point, *_ in points_beside(arm, LATER, 0.03, NEAR_LATTICE) if point[2] <= height]
-    assert found.beside == (pytest.approx(min(never), abs=1e-8) if never else np.inf)
+    assert found.unseen_to_surface == (pytest.approx(min(never), abs=1e-8) if never else np.inf)
     assert bool(never) == (height > -0.3)
 
 
@@ -214,16 +214,18 @@ def test_a_sphere_that_comes_to_the_unseen_alone_has_a_distance_of_its_own(heigh
         return np.where(points[:, 2] > height, np.uint8(EvidenceClass.FREE), np.uint8(EvidenceClass.OUT_OF_VIEW))
 
     found = NearSpace(PlanarArm(), 0.03).look(0, LATER, seen_by(above), lambda points: height - points[:, 2] + 1e-9)
-    assert np.isfinite(found.beside) and found.beyond == (found.beside if is_blind else np.inf)
-    assert not is_blind or found.beyond == pytest.approx(height - found.beyond_place[2], abs=1e-8)
+    assert np.isfinite(found.unseen_to_surface) and found.blind_to_surface == (
+        found.unseen_to_surface if is_blind else np.inf
+    )
+    assert not is_blind or found.blind_to_surface == pytest.approx(height - found.blind_place[2], abs=1e-8)
 
 
 def test_what_lies_within_a_surface_of_the_map_is_surface() -> None:
     found = NearSpace(PlanarArm(), 0.03).look(0, LATER, seen_by(half_seen), lambda points: points[:, 2])
     assert found.shares[EvidenceClass.HIDDEN_BY_ARM] == 0.0 and found.shares[EvidenceClass.SURFACE] > 0.3
-    assert found.beside == np.inf
+    assert found.unseen_to_surface == np.inf
 
 
 def test_a_map_that_answers_nowhere_hides_nothing() -> None:
     found = NearSpace(PlanarArm(), 0.03).look(SECOND, LATER, seen_by(half_seen), lambda p: np.full(len(p), np.nan))
-    assert found.beside == np.inf
+    assert found.unseen_to_surface == np.inf

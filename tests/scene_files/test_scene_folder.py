@@ -195,6 +195,19 @@ def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_pa
         assert (seen.edges.centers.tolist(), seen.edges.radii.tolist()) == ([[0.0, 0.5, 1.0]], [0.25])
 
 
+@pytest.mark.parametrize("num_steps", [2, 245])
+def test_the_largest_number_of_an_older_file_is_looked_at_in_vain(tmp_path: Path, num_steps: int) -> None:
+    """In one byte, where 240 and more were time steps as well."""
+    header = {"origin": [0, 0, 0], "voxel": 0.1, "shape": [1, 1, 3], "step_stamps_ns": list(range(num_steps))}
+    last_seen = np.array([[[num_steps, 0, 0xFF]]], np.uint8)
+    np.savez(tmp_path / "a.npz", header=np.array(json.dumps(header)), last_seen=last_seen)
+    seen = read_seen(tmp_path / "a.npz")
+    assert seen is not None
+    stamps_ns, classes = seen.look(np.array([[0.0, 0.0, 0.1 * k] for k in range(3)]))
+    assert stamps_ns.tolist() == [num_steps - 1, -1, -1]
+    assert classes.tolist() == [EvidenceClass.FREE, EvidenceClass.OUT_OF_VIEW, EvidenceClass.UNANSWERED]
+
+
 def test_voxel_files_of_an_older_version_are_read_without_evidence(tmp_path: Path) -> None:
     header = {"origin": [0, 0, 0], "voxel": 0.1, "shape": [1, 1, 1]}
     np.savez(tmp_path / "a.npz", header=np.array(json.dumps(header)), states=np.full((1, 1, 1), 2, np.uint8))

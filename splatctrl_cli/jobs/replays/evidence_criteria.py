@@ -62,7 +62,7 @@ LIMITS = (
     Limit(
         asked="never seen, from a surface of the map",
         why="one side of a thing says little of where the other ends",
-        column="beside",
+        column="unseen_to_surface",
         least=HIDDEN,
         words="space within the margin of the arm that no camera saw is {} from a surface of the map, allowed "
         "{allowed}: it may go on there",
@@ -71,7 +71,7 @@ LIMITS = (
     Limit(
         asked="never seen, as nine tenths of the points about a sphere of the arm, from a surface of the map",
         why="where the arm comes to nothing but the unseen, a whole thing may stand",
-        column="beyond",
+        column="blind_to_surface",
         least=BEYOND,
         words="a part of the arm comes to space of which cameras saw less than a tenth, {} from a surface of the "
         "map: it may go on there, allowed {allowed}",
@@ -111,7 +111,7 @@ LIMITS = (
     ),
 )
 PROOF = Limit(
-    asked="neither free nor swept, with `--require-proof`",
+    asked="not free, with `--require-proof`",
     why="such a run would be safe by an assumption",
     column="assumed",
     most=0.0,
@@ -131,12 +131,14 @@ def known_space(judged: Judged) -> Iterator[Reason]:
 
 
 def _within(judged: Judged, limit: Limit) -> Iterator[Reason]:
-    """Whether a limit is kept, and where it is broken most."""
+    """What a limit says of a run: it is kept, or where it is broken most. Without any figure only a proof fails."""
     near = judged.replay.near
     values = near[limit.column] if limit.part is None else near[limit.column][:, limit.part]
     if limit.most is not None:
         worst = nearby(judged, values)
         if worst is None:
+            if limit is PROOF:
+                yield lacking(sentence="what cameras saw of the space about the arm, and when, is not recorded")
             return
         words = f"{100 * worst[0]:.0f} % {limit.words}"
         if worst[0] <= limit.most:
@@ -155,7 +157,8 @@ def _within(judged: Judged, limit: Limit) -> Iterator[Reason]:
     if not np.any(values <= allowed):
         return
     at = int(np.nanargmin(values))
-    place = near[f"{limit.column}_place"][at] if limit.part is None else near["places"][at].reshape(-1, 3)[limit.part]
+    places = near[f"{limit.column}_place"] if limit.part is None else near["places"].reshape(len(values), -1, 3)
+    place = places[at] if limit.part is None else places[at, limit.part]
     yield lacking(
         sentence=limit.words.format(mm(values[at]), allowed=mm(allowed)),
         value=float(values[at]),

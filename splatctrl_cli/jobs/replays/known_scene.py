@@ -221,12 +221,10 @@ def seen_of(voxels: SeenVoxels) -> Seen:
 
 
 def _seen_in_grid(observed: Observed, grid: DistanceGrid) -> Seen:
-    """What a baked grid says: whether a camera ever saw a place, and nothing of when or why not. That the robot's
-    spheres, which stick out, were in it says nothing of what is beside them.
-    """
+    """What a baked grid says: whether a camera ever saw a place. It does not say when, or why not."""
 
     def look(points: Float64) -> tuple[NDArray[np.int64], UInt8]:
-        is_seen = np.isin(observed(points), BY_CAMERA)
+        is_seen = np.isin(observed(points), BY_CAMERA)  # the robot's spheres stick out: swept by them is not seen
         classes = np.where(is_seen, EvidenceClass.FREE, EvidenceClass.OUT_OF_VIEW).astype(np.uint8)
         return np.where(is_seen, np.int64(0), np.int64(-1)), classes
 

@@ -176,8 +176,8 @@ OF_STATES: Declared = (
     folded("min_clearance_splats", LEAST, _of("between", "represented"), scale=GAP, shown=NEAREST),
     folded("max_unseen_share", LARGEST, _of("near", "unseen"), scale=BAD_SHARE),
     folded("max_assumed_share", LARGEST, _of("near", "assumed"), scale=BAD_SHARE),
-    folded("min_unseen_to_surface", LEAST, _of("near", "beside"), num_states, scale=GAP),
-    folded("min_blind_to_surface", LEAST, _of("near", "beyond"), num_states, scale=GAP),
+    folded("min_unseen_to_surface", LEAST, _of("near", "unseen_to_surface"), num_states, scale=GAP),
+    folded("min_blind_to_surface", LEAST, _of("near", "blind_to_surface"), num_states, scale=GAP),
     *(
         figure
         for kind in EvidenceClass

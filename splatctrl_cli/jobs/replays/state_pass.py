@@ -28,8 +28,14 @@ from splatctrl_cli.voxels import EvidenceClass
 
 KINDS = len(EvidenceClass)
 NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # of what was known about the arm, and their shapes at a state
-    **dict.fromkeys(("age", "ahead", "unseen", "assumed", "beside", "beyond"), ()),
-    **{"beside_place": (3,), "beyond_place": (3,), "shares": (KINDS,), "nearest": (KINDS,), "places": (KINDS * 3,)},
+    **dict.fromkeys(("age", "ahead", "unseen", "assumed", "unseen_to_surface", "blind_to_surface"), ()),
+    **{
+        "unseen_to_surface_place": (3,),
+        "blind_to_surface_place": (3,),
+        "shares": (KINDS,),
+        "nearest": (KINDS,),
+        "places": (KINDS * 3,),
+    },
 }
 
 
@@ -265,7 +271,9 @@ class ReplayRecord:
                 accounts = [self._near.look(stamp, each, known, exact) for each in (q, *way)]
                 for name, value in _folded(accounts).items():
                     columns[name][at] = value
-                if is_timed and self._scene.has_seen_times:
+                if not self._scene.has_seen_times:
+                    columns["assumed"][at] = np.nan  # space that was once free may not be now
+                elif is_timed:
                     columns["age"][at], columns["ahead"][at] = accounts[0].age, accounts[0].ahead
                     self.hindsight.looked(stamp, accounts[0].age)
         self._posture_before = part.position[-1]
@@ -295,18 +303,18 @@ class ReplayRecord:
 
 
 def _folded(accounts: Sequence[Account]) -> dict[str, float | Float64]:
-    """The shares at a state; of it and of the postures on the way the most that is unseen, and how near it comes."""
+    """The shares at a state; of it and of the postures on the way, the largest unseen share and least distances."""
     shares, nearest = (np.array([getattr(each, name) for each in accounts]) for name in ("shares", "nearest"))
     least, places = nearest.argmin(axis=0), np.array([each.places for each in accounts])
-    beside, beyond = (min(accounts, key=attrgetter(name)) for name in ("beside", "beyond"))
+    unseen, blind = (min(accounts, key=attrgetter(f"{name}_to_surface")) for name in ("unseen", "blind"))
     return {
         "shares": shares[0],
         "nearest": nearest.min(axis=0),
         "places": places[least, np.arange(KINDS)].ravel(),
         "unseen": float(shares[:, NEVER_SEEN].sum(axis=1).max()),
         "assumed": max(each.assumed for each in accounts),
-        "beside": beside.beside,
-        "beside_place": beside.beside_place,
-        "beyond": beyond.beyond,
-        "beyond_place": beyond.beyond_place,
+        "unseen_to_surface": unseen.unseen_to_surface,
+        "unseen_to_surface_place": unseen.unseen_place,
+        "blind_to_surface": blind.blind_to_surface,
+        "blind_to_surface_place": blind.blind_place,
     }

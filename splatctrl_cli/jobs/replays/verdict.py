@@ -55,13 +55,11 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
 
 
 def _how(judged: Judged) -> str:
-    """By waivers, or proven: at every state that is asked about, cameras saw all space within the margin free, or
-    the arm itself was there.
-    """
+    """How a safe run passed: waived, proven or neither. Proven: cameras saw all space within the margin free."""
     if any(waivers(judged.request)):
         return "waived"
-    assumed, age = (nearby(judged, judged.replay.near[name]) for name in ("assumed", "age"))
-    return "proven" if assumed is not None and assumed[0] <= 0 and age is not None else ""
+    assumed = nearby(judged, judged.replay.near["assumed"])
+    return "proven" if assumed is not None and assumed[0] <= 0 else ""
 
 
 def _notes(judged: Judged) -> Iterator[str]:
@@ -72,10 +70,10 @@ def _notes(judged: Judged) -> Iterator[str]:
         yield f"{len(close)} fixed spheres stand within the margin of their surroundings"
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
         yield f"{judged.replay.lead_in_s:.2f} s before the first map are left out"
-    assumed = nearby(judged, judged.replay.near["assumed"])
-    if assumed is None:
+    unseen, assumed = (nearby(judged, judged.replay.near[name]) for name in ("unseen", "assumed"))
+    if unseen is None:
         yield "space about the arm not judged"
-    elif assumed[0] > 0:
+    if assumed is not None and assumed[0] > 0:
         yield f"at most {100 * assumed[0]:.0f} % of the space within the margin of the arm was assumed to be free"
     if nearby(judged, judged.replay.near["age"]) is None:
         yield "age of the evidence about the arm not judged"

@@ -172,16 +172,17 @@ def near_a(kind: EvidenceClass, distance: float) -> dict[str, Any]:
 def from_a_surface(column: str, distance: float) -> dict[str, Any]:
     """At one state unseen space is so far [m] from a surface of the map."""
     near = np.where(np.arange(NUM) == 4, distance, np.inf)
-    return NOTHING_NEAR | {column: near, f"{column}_place": np.full((NUM, 3), 0.25)}
+    place = {f"{column}_to_surface_place": np.full((NUM, 3), 0.25)}
+    return NOTHING_NEAR | {f"{column}_to_surface": near} | place
 
 
 @pytest.mark.parametrize(
     ("near", "distance", "count"),
     [
-        (partial(from_a_surface, "beside"), 0.031, 0),
-        (partial(from_a_surface, "beside"), 0.029, 1),
-        (partial(from_a_surface, "beyond"), 0.101, 0),
-        (partial(from_a_surface, "beyond"), 0.099, 1),
+        (partial(from_a_surface, "unseen"), 0.031, 0),
+        (partial(from_a_surface, "unseen"), 0.029, 1),
+        (partial(from_a_surface, "blind"), 0.101, 0),
+        (partial(from_a_surface, "blind"), 0.099, 1),
         *((partial(near_a, kind), distance, int(distance < 0.02)) for kind in STRICT for distance in (0.021, 0.019)),
         *((partial(near_a, kind), 0.0, 0) for kind in EVIDENCE if kind not in STRICT),
     ],
@@ -210,8 +211,9 @@ def test_more_that_no_camera_saw_is_no_evidence(column: str, allowed: float, mor
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
 
 
+@pytest.mark.parametrize("assumed", [0.01, np.nan], ids=["assumed", "not recorded"])
 @pytest.mark.parametrize(("is_asked", "count"), [(False, 0), (True, 1)])
-def test_space_that_was_assumed_to_be_free_is_no_proof(is_asked: bool, count: int) -> None:
-    run = judged(near=NOTHING_NEAR | {"assumed": np.full(NUM, 0.01)})
+def test_space_that_was_assumed_to_be_free_is_no_proof(is_asked: bool, count: int, assumed: float) -> None:
+    run = judged(near=NOTHING_NEAR | {"assumed": np.full(NUM, assumed)})
     run.request.require_proof = is_asked
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count

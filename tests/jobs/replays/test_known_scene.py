@@ -156,7 +156,9 @@ def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_
     stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
     code, verdict = stage.judged_by_field(FAR, moment_ns=SECOND)
     assert (code, decisive(verdict)) == (0, {})
-    assert "age of the evidence about the arm not judged" in verdict["sentence"]
+    assert "age of the evidence about the arm not judged" in verdict["sentence"] and verdict["how"] == ""
+    code, asked = stage.replayed("--field", str(stage.desk.folder / "field"), "--require-proof")
+    assert (code, decisive(asked)) == (5, {"known space": "not evaluable"})
     field = stage.desk.folder / "field"
     grid = read_npz(field / "field.npz")
     for state, channels in (

@@ -57,7 +57,9 @@ def test_the_back_of_a_thing_that_the_arm_at_rest_hid_from_all_cameras_is_not_sa
 ) -> None:
     """Once driven and judged safe: 9 mm from a cylinder of which the map has the far side, 70 mm away."""
     if not sees:  # without that rule it would still pass
-        monkeypatch.setattr(evidence_criteria, "LIMITS", [limit for limit in LIMITS if limit.column != "beyond"])
+        monkeypatch.setattr(
+            evidence_criteria, "LIMITS", [limit for limit in LIMITS if limit.column != "blind_to_surface"]
+        )
     hidden_back = read_problem("tabletop-0388", None)
     views = views_of(hidden_back, 2, width=320, num_steps=5)
     rig = Rig(problem=hidden_back, views=views, config=SETTINGS, threads=1, stopwatch=Stopwatch())
