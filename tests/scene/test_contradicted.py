@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import CONTRADICTED, CONTRADICTING_PIXELS
+from splatctrl_cli.config.fixed import CONTRADICTED
 from splatctrl_cli.records import Float32, RgbdFrame
 from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
 from splatctrl_cli.scene.fitter import SceneFitter
@@ -65,12 +65,12 @@ def test_where_no_camera_has_depth_nothing_is_missing() -> None:
     assert not any(found.until.any() for found in contradicted(masks_of(one, other), is_drawn=False))
 
 
-def test_a_few_pixels_are_noise() -> None:
+@pytest.mark.parametrize(("side", "is_noise"), [(3, True), (4, False)])
+def test_fewer_than_four_pixels_within_their_outline_are_noise(side: int, is_noise: bool) -> None:
     shiny, other = frame(), frame(x=BESIDE, camera="cam1")
-    side = int(CONTRADICTING_PIXELS**0.5) + 1  # without the outline: one pixel fewer on each side
     shiny.depth[30 : 30 + side, 40 : 40 + side] = HEIGHT + 0.3
     found, _ = contradicted(masks_of(shiny, other), is_drawn=False)
-    assert not found.until.any()
+    assert found.until.any() != is_noise
 
 
 def drawn(depth: Float32) -> SelfMask:

@@ -115,8 +115,8 @@ PROOF = Limit(
     why="such a run would be safe by an assumption",
     column="assumed",
     most=0.0,
-    words="of the space within the margin of the arm was assumed to be free, as --require-proof does not allow",
-    remedy="add cameras until every side of the arm is seen, or let the arm pass there",
+    words="of the space within the margin of the arm was assumed to be free",
+    remedy="add cameras until every side of the arm is seen, or leave --require-proof out",
 )
 
 
