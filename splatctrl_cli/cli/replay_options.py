@@ -23,6 +23,7 @@ from splatctrl_cli.cli.parser import MAX_SECONDS, either, group, option, real, w
 from splatctrl_cli.config.fixed import GOLDEN_TOLERANCE
 
 MODES = ("audit", "open-loop", "closed-loop")
+UNSEEN_IS = ("judge", "occupied")
 BASELINES = ("standstill", "birrt", "birrt-ik", "qp-ik")
 STEP_LIMIT = 10.0  # [s]
 
@@ -127,6 +128,12 @@ REPLAY = (  # what people use, and in groups the rest
             " of every K-th frame set",
         ),
         option("--require-evidence", "not evaluable (exit 5) without a bound on the map's error"),
+        option(
+            "--unseen",
+            "space beside the arm that no camera saw free is judged by a table (docs/verdict.md), or is an obstacle",
+            UNSEEN_IS,
+            "judge",
+        ),
         option("--require-proof", "not evaluable (exit 5) where space beside the arm was assumed to be free"),
         *DISAGREEMENT,
     ),

@@ -1,7 +1,8 @@
 """Criteria of a replay's verdict: whether the evidence reaches."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -13,8 +14,9 @@ from splatctrl_cli.config.fixed import (
     UNSEEN,
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
-from splatctrl_cli.evaluate.verdict import Criterion, Reason, held, lacking
+from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
 from splatctrl_cli.jobs.replays.criteria_input import (
+    MARGIN,
     UNKNOWN,
     Judged,
     least_of,
@@ -22,6 +24,7 @@ from splatctrl_cli.jobs.replays.criteria_input import (
     nearby,
     seconds_at,
 )
+from splatctrl_cli.jobs.replays.request import OCCUPIED
 from splatctrl_cli.jobs.replays.time_criteria import clocks, evidence_age, judged_time, map_age
 from splatctrl_cli.voxels import EvidenceClass
 
@@ -29,14 +32,14 @@ from splatctrl_cli.voxels import EvidenceClass
 @dataclass(frozen=True, kw_only=True)
 class Limit:
     """A row of the table of evidence. asked: of what, in the documentation's words, and why. column: of
-    `NEAR_COLUMNS`, with the class that is its part; most: the largest share allowed, or least [m]: the least distance
+    `NEAR_COLUMNS`, of several classes the least; most: the largest share allowed, or least [m]: the least distance
     (0: the margin); words, remedy: what is said.
     """
 
     asked: str
     why: str
     column: str
-    part: EvidenceClass | None = None
+    parts: tuple[EvidenceClass, ...] = ()
     most: float | None = None
     least: float = 0.0
     words: str
@@ -81,7 +84,7 @@ LIMITS = (
         asked="unanswered, from the arm",
         why="a dark, shiny or clear thing stands where depth was due and none came",
         column="nearest",
-        part=EvidenceClass.UNANSWERED,
+        parts=(EvidenceClass.UNANSWERED,),
         words="cameras looked at a place {} from the arm and got no depth from it, margin {allowed}",
         remedy="a dark, shiny or clear thing may stand there: add a camera that gets depth there",
     ),
@@ -89,7 +92,7 @@ LIMITS = (
         asked="contradicted, from the arm",
         why="a shiny thing is measured far behind its place",
         column="nearest",
-        part=EvidenceClass.CONTRADICTED,
+        parts=(EvidenceClass.CONTRADICTED,),
         words="{} from the arm, margin {allowed}, a camera measures through what another one sees",
         remedy="a shiny thing may stand there: add a camera that sees it, or check depth scale and poses",
     ),
@@ -97,7 +100,7 @@ LIMITS = (
         asked="depth edge, from the arm",
         why="a surface may go on for a pixel where its edge was lost",
         column="nearest",
-        part=EvidenceClass.DEPTH_EDGE,
+        parts=(EvidenceClass.DEPTH_EDGE,),
         words="the edge of a surface was lost {} from the arm, margin {allowed}: it may go on for a pixel",
         remedy="keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
     ),
@@ -105,18 +108,18 @@ LIMITS = (
         asked="outside of the workspace, from the arm",
         why="what stands there is in no map",
         column="nearest",
-        part=EvidenceClass.OUTSIDE,
+        parts=(EvidenceClass.OUTSIDE,),
         words="the workspace of the map ends {} from the arm, margin {allowed}",
         remedy="reconstruct with a larger --box",
     ),
 )
 PROOF = Limit(
-    asked="not free, with `--require-proof`",
+    asked="not free, with `--require-proof` or `--unseen occupied`, from the arm",
     why="such a run would be safe by an assumption",
-    column="assumed",
-    most=0.0,
-    words="of the space within the margin of the arm was assumed to be free",
-    remedy="add cameras until every side of the arm is seen, or leave --require-proof out",
+    column="nearest",
+    parts=tuple(kind for kind in EvidenceClass if kind is not EvidenceClass.FREE),
+    words="space that no camera saw free in time is {} from the arm, margin {allowed}",
+    remedy="add cameras until every side of the arm is seen",
 )
 
 
@@ -125,26 +128,33 @@ def known_space(judged: Judged) -> Iterator[Reason]:
     below); at most `--max-unknown` of the sphere centres are in space never seen. A baked field needs its channel
     `observed`.
     """
-    for limit in (*LIMITS, *((PROOF,) if judged.request.require_proof else ())):
+    for limit in LIMITS:
         yield from _within(judged, limit)
+    if judged.request.unseen == OCCUPIED:
+        yield from _within(judged, PROOF, partial(failed, label=MARGIN))
+    elif judged.request.require_proof:
+        yield from _within(judged, PROOF)
     yield from _unknown_share(judged)
 
 
-def _within(judged: Judged, limit: Limit) -> Iterator[Reason]:
-    """What a limit says of a run: it is kept, or where it is broken most. Without any figure only a proof fails."""
+def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
+    """What a limit says of a run: it is kept, or where it is `broken` most. Without any figure there is no proof."""
     near = judged.replay.near
-    values = near[limit.column] if limit.part is None else near[limit.column][:, limit.part]
+    values, parts = near[limit.column], np.array(limit.parts, int)
+    nearest = parts[values[:, parts].argmin(axis=1)] if limit.parts else parts
+    if limit.parts:
+        values = values[:, parts].min(axis=1)
+    if limit is PROOF and np.isnan(near["assumed"]).all():
+        yield lacking(sentence="what cameras saw of the space about the arm, and when, is not recorded")
     if limit.most is not None:
         worst = nearby(judged, values)
         if worst is None:
-            if limit is PROOF:
-                yield lacking(sentence="what cameras saw of the space about the arm, and when, is not recorded")
             return
         words = f"{100 * worst[0]:.0f} % {limit.words}"
         if worst[0] <= limit.most:
             yield held(words, worst[0], limit.most, "", worst[2])
             return
-        yield lacking(
+        yield broken(
             sentence=f"{words}, allowed {100 * limit.most:g} %",
             value=worst[0],
             threshold=limit.most,
@@ -157,9 +167,9 @@ def _within(judged: Judged, limit: Limit) -> Iterator[Reason]:
     if not np.any(values <= allowed):
         return
     at = int(np.nanargmin(values))
-    places = near[f"{limit.column}_place"] if limit.part is None else near["places"].reshape(len(values), -1, 3)
-    place = places[at] if limit.part is None else places[at, limit.part]
-    yield lacking(
+    places = near["places"].reshape(len(values), -1, 3)
+    place = places[at, nearest[at]] if limit.parts else near[f"{limit.column}_place"][at]
+    yield broken(
         sentence=limit.words.format(mm(values[at]), allowed=mm(allowed)),
         value=float(values[at]),
         threshold=allowed,

@@ -21,6 +21,7 @@ from splatctrl_cli.simulate.truth import Truth
 
 MODES = ("audit", "open-loop", "closed-loop")
 FIRST_MAP = "first-map"  # a start time: that of the first map
+JUDGE, OCCUPIED = "judge", "occupied"  # space that no camera saw free: judged by a table, or an obstacle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +34,7 @@ class ReplayRequest:
     qz, qw; locked: values [rad or m] of joints that no log moves. Times in
     seconds; start_time may be FIRST_MAP. evidence: a camera, or every how many frame sets, that did not train the
     scene and bounds its error; with require_evidence no verdict passes without, with require_proof none where space
-    about the arm was assumed to be free. controller: a user's own class,
+    about the arm was assumed to be free; unseen: `JUDGE` or `OCCUPIED`. controller: a user's own class,
     ``module:Class``, or controller_command: a program (docs/controllers.md). report_only: the verdict alone does
     not set the exit code.
     """
@@ -72,6 +73,7 @@ class ReplayRequest:
     evidence: str | None = None
     require_evidence: bool = False
     require_proof: bool = False
+    unseen: str = JUDGE
     controller: str | None = None
     controller_command: str | None = None
     controller_step_limit: float = STEP_LIMIT

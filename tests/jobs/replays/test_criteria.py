@@ -47,6 +47,7 @@ def judged(**replay: Any) -> Any:
             max_map_age=1.0,
             max_unknown=0.05,
             require_proof=False,
+            unseen="judge",
             config=Config(),
             field=None,
             follow=True,
@@ -211,9 +212,17 @@ def test_more_that_no_camera_saw_is_no_evidence(column: str, allowed: float, mor
     assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
 
 
-@pytest.mark.parametrize("assumed", [0.01, np.nan], ids=["assumed", "not recorded"])
-@pytest.mark.parametrize(("is_asked", "count"), [(False, 0), (True, 1)])
-def test_space_that_was_assumed_to_be_free_is_no_proof(is_asked: bool, count: int, assumed: float) -> None:
-    run = judged(near=NOTHING_NEAR | {"assumed": np.full(NUM, assumed)})
-    run.request.require_proof = is_asked
-    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
+@pytest.mark.parametrize("kind", [kind for kind in EvidenceClass if kind not in STRICT])
+@pytest.mark.parametrize(("option", "broken"), [("require_proof", Outcome.NOT_EVALUABLE), ("unseen", Outcome.FAILED)])
+def test_only_free_space_about_the_arm_is_proof(option: str, broken: Outcome, kind: EvidenceClass) -> None:
+    run = judged(near=near_a(kind, 0.01) | {"assumed": np.zeros(NUM)})
+    assert set(outcomes(evidence.known_space, run)) == {Outcome.PASSED}
+    setattr(run.request, option, "occupied")
+    assert (broken in outcomes(evidence.known_space, run)) == (kind is not EvidenceClass.FREE)
+
+
+@pytest.mark.parametrize("option", ["require_proof", "unseen"])
+def test_what_is_not_recorded_is_no_proof(option: str) -> None:
+    run = judged(near=near_a(EvidenceClass.FREE, 0.01))
+    setattr(run.request, option, "occupied")
+    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == 1
