@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from splatctrl_cli.config import Config
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
 from splatctrl_cli.geometry import pose_at
+from splatctrl_cli.jobs.replays.state_pass import NEAR_COLUMNS
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import Capsule, Motion
@@ -275,8 +277,24 @@ def test_a_box_ends_before_the_plate(model: RobotModel) -> None:
 @pytest.mark.parametrize(("how", "word"), [("", "safe"), ("proven", "safe"), ("waived", "waived")])
 def test_what_passed_by_a_waiver_is_no_safe_run(how: str, word: str) -> None:
     passed, failed = (Reason(outcome=outcome, sentence="") for outcome in (Outcome.PASSED, Outcome.FAILED))
-    assert word_of(verdict_of("replay", [passed], how=how)).word == word
-    assert word_of(verdict_of("replay", [failed], how=how)).word == "failed"
+    assert word_of(verdict_of("replay", [passed], how=how), known_near(), 0.02).word == word
+    assert word_of(verdict_of("replay", [failed], how=how), known_near(), 0.02).word == "failed"
+
+
+def known_near(**changes: float) -> Any:
+    """What was known about the arm at one state: all, but for `changes` of the account's columns."""
+    near = {name: np.full((1, *shape), np.inf if "nearest" in name else 0.0) for name, shape in NEAR_COLUMNS.items()}
+    far = {name: np.array([np.inf]) for name in near if name.endswith("_to_surface")}
+    return near | far | {name: np.array([value]) for name, value in changes.items()}
+
+
+def test_a_run_names_the_one_limit_without_which_it_is_safe() -> None:
+    lacking = Reason(outcome=Outcome.NOT_EVALUABLE, sentence="")
+    unseen, both = known_near(unseen=0.9), known_near(unseen=0.9, unseen_to_surface=0.01)
+    assert word_of(verdict_of("replay", [lacking]), unseen, 0.02).only == "unseen"
+    assert word_of(verdict_of("replay", [lacking, lacking]), unseen, 0.02).only == ""
+    assert word_of(verdict_of("replay", [lacking, lacking]), both, 0.02).only == ""
+    assert word_of(verdict_of("replay", [lacking]), known_near(), 0.02).only == ""
 
 
 def test_seeds_below_a_hundred_keep_their_families() -> None:

@@ -61,6 +61,12 @@ def test_the_report_names_false_greens_and_counts_the_benign() -> None:
     assert "1 of 2 safe (50.0 %)" in text
 
 
+def test_the_report_says_what_each_limit_alone_catches_and_costs() -> None:
+    stopped = [row(index=i, outcome="not evaluable", only="unseen", clearance=c) for i, c in enumerate((-0.01, 0.1))]
+    (line,) = (line for line in report([row(), *stopped]) if line.startswith("unseen "))
+    assert line.split() == ["unseen", "1", "0", "1"]
+
+
 def test_the_border_is_safe_by_least_and_broken_by_least() -> None:
     safe = [row(index=i, clearance=0.02 + 0.01 * i) for i in range(30)]
     broken = [row(index=100 + i, outcome="failed", clearance=0.014 - 0.001 * i) for i in range(30)]

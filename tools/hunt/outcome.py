@@ -5,6 +5,8 @@ from pathlib import Path
 
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict
+from splatctrl_cli.jobs.replays.evidence_criteria import LIMITS
+from splatctrl_cli.jobs.replays.state_store import Figures
 
 WORDS = ("safe", "waived", "failed", "contact", "not evaluable", "refused")
 LONGEST = 90  # characters of a reason
@@ -12,21 +14,28 @@ LONGEST = 90  # characters of a reason
 
 @dataclass(frozen=True, kw_only=True)
 class Word:
-    """One of `WORDS`, and the first reason: its criterion, then a colon and a sentence."""
+    """One of `WORDS`, the first reason: its criterion, then a colon and a sentence, and the limit of evidence without
+    which the run would be safe, empty for none.
+    """
 
     word: str
     reason: str
+    only: str = ""
 
 
-def word_of(verdict: Verdict) -> Word:
-    """What a verdict says; a failure other than contact is `failed`, what passed by a waiver `waived`."""
+def word_of(verdict: Verdict, near: Figures, margin: float) -> Word:
+    """What a verdict says, with what was known about the arm; a failure other than contact is `failed`, what passed
+    by a waiver `waived`.
+    """
+    broken = [limit.name for limit in LIMITS if limit.is_broken(near, margin)]
+    only = broken[0] if len(broken) == 1 == len(verdict.decisive) else ""
     first = verdict.decisive[0] if verdict.decisive else None
     reason = "" if first is None else f"{first.criterion}: {first.sentence}"[:LONGEST]
     if verdict.outcome is Outcome.FAILED:
         return Word(word="contact" if verdict.label == "contact" else "failed", reason=reason)
     if verdict.outcome is Outcome.PASSED:
         return Word(word="waived" if verdict.how == "waived" else "safe", reason=reason)
-    return Word(word="not evaluable", reason=reason)
+    return Word(word="not evaluable", reason=reason, only=only)
 
 
 def refused(error: SplatCtrlError, folder: Path) -> Word:

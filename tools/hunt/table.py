@@ -9,6 +9,7 @@ from pathlib import Path
 from scipy.stats import beta
 
 from splatctrl_cli.files.output import write_durably
+from splatctrl_cli.jobs.replays.evidence_criteria import LIMITS
 from tools.hunt.observability import MARGIN, TOLERATED
 from tools.hunt.outcome import WORDS
 from tools.hunt.trial import Row
@@ -62,7 +63,8 @@ def report(rows: Sequence[Row]) -> list[str]:
             there = Counter(row.outcome for row in mine if truth_of(row) == truth)
             head = f"{family:10s} {len(mine):5d}" if truth == TRUTHS[0] else " " * 16
             lines.append(f"{head} {truth:>8s} " + " ".join(f"{there[word]:13d}" for word in OUTCOMES))
-    return [*lines, "", *_greens(rows), "", *_nearest(rows), "", *_benign(rows), "", *_why(rows), "", *_bodies(rows)]
+    parts = (_greens(rows), _nearest(rows), _benign(rows), _why(rows), _limits(rows), _bodies(rows))
+    return [*lines, *(line for part in parts for line in ("", *part))]
 
 
 def border_of(rows: Sequence[Row]) -> list[Row]:
@@ -115,6 +117,15 @@ def _why(rows: Sequence[Row]) -> list[str]:
     ]
 
 
+def _limits(rows: Sequence[Row]) -> list[str]:
+    """By limit of evidence, the runs that would be safe without it: what it alone catches, and what it costs."""
+    lines = [f"{'safe without':20s} " + " ".join(f"{truth:>8s}" for truth in TRUTHS)]
+    for limit in LIMITS:
+        there = Counter(truth_of(row) for row in rows if row.only == limit.name)
+        lines.append(f"{limit.name:20s} " + " ".join(f"{there[truth]:8d}" for truth in TRUTHS))
+    return lines
+
+
 def _bodies(rows: Sequence[Row]) -> list[str]:
     """Outcomes of clear runs and of the others, by the visible arm."""
     lines = [f"{'robot':16s} {'truth':>8s} {'runs':>5s} " + " ".join(f"{word:>13s}" for word in OUTCOMES)]
@@ -164,4 +175,5 @@ def _row(entry: dict[str, str]) -> Row:
         robot=entry.get("robot") or "",  # not in tables of before
         spread=float(entry.get("spread") or 0.0),
         fattening=float(entry.get("fattening") or 0.0),
+        only=entry.get("only") or "",
     )

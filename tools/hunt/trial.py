@@ -77,7 +77,8 @@ class Trial:
 class Row:
     """What came of one run: the verdict, its first reason, and the truth [m].
 
-    robot: the words of its body; spread, fattening [px]: of its stereo depth, 0 where depth is nearly exact.
+    robot: the words of its body; spread, fattening [px]: of its stereo depth, 0 where depth is nearly exact. only:
+    the limit of evidence without which it would be safe.
     """
 
     seed: int
@@ -94,6 +95,7 @@ class Row:
     robot: str = ""
     spread: float = 0.0
     fattening: float = 0.0
+    only: str = ""
 
     @property
     def name(self) -> str:
@@ -185,6 +187,7 @@ def run(seed: int, index: int, device: str = "cpu") -> Row:
         robot=body.words,
         spread=0.0 if body.depth is None else body.depth.spread,
         fattening=0.0 if body.depth is None else body.depth.fattening[1],
+        only=outcome.only,
     )
 
 
@@ -260,7 +263,7 @@ def _judged(trial: Trial, folder: Path, device: str = "cpu") -> tuple[Word, Repl
             if trial.draft.max_map_age is not None:
                 request = replace(request, max_map_age=trial.draft.max_map_age)
             result = replay(request)
-        return word_of(result.verdict), result
+        return word_of(result.verdict, result.replay.near, result.replay.margin), result
     except SplatCtrlError as error:
         return refused(error, folder), None
 

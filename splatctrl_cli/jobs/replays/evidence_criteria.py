@@ -25,7 +25,9 @@ from splatctrl_cli.jobs.replays.criteria_input import (
     seconds_at,
 )
 from splatctrl_cli.jobs.replays.request import OCCUPIED
+from splatctrl_cli.jobs.replays.state_store import Figures
 from splatctrl_cli.jobs.replays.time_criteria import clocks, evidence_age, judged_time, map_age
+from splatctrl_cli.records import Float64
 from splatctrl_cli.voxels import EvidenceClass
 
 
@@ -44,6 +46,21 @@ class Limit:
     least: float = 0.0
     words: str
     remedy: str
+
+    @property
+    def name(self) -> str:
+        """Of its class, else of its column."""
+        return self.parts[0].name.lower() if self.parts else self.column
+
+    def values(self, near: Figures) -> Float64:
+        """(T,) of the figures about the arm, NaN where it was not looked about."""
+        values = near[self.column]
+        return values[:, self.parts].min(axis=1) if self.parts else values
+
+    def is_broken(self, near: Figures, margin: float) -> bool:
+        """By any state; margin [m]."""
+        values = self.values(near)
+        return bool(np.any(values <= (self.least or margin)) if self.most is None else np.any(values > self.most))
 
     @property
     def docs(self) -> str:
@@ -140,10 +157,7 @@ def known_space(judged: Judged) -> Iterator[Reason]:
 def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
     """What a limit says of a run: it is kept, or where it is `broken` most. Without any figure there is no proof."""
     near = judged.replay.near
-    values, parts = near[limit.column], np.array(limit.parts, int)
-    nearest = parts[values[:, parts].argmin(axis=1)] if limit.parts else parts
-    if limit.parts:
-        values = values[:, parts].min(axis=1)
+    values = limit.values(near)
     if limit is PROOF and np.isnan(near["assumed"]).all():
         yield lacking(sentence="what cameras saw of the space about the arm, and when, is not recorded")
     if limit.most is not None:
@@ -151,7 +165,7 @@ def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lackin
         if worst is None:
             return
         words = f"{100 * worst[0]:.0f} % {limit.words}"
-        if worst[0] <= limit.most:
+        if not limit.is_broken(near, judged.replay.margin):
             yield held(words, worst[0], limit.most, "", worst[2])
             return
         yield broken(
@@ -163,12 +177,14 @@ def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lackin
             count=worst[2],
         )
         return
-    allowed = limit.least or judged.replay.margin
-    if not np.any(values <= allowed):
+    if not limit.is_broken(near, judged.replay.margin):
         return
-    at = int(np.nanargmin(values))
-    places = near["places"].reshape(len(values), -1, 3)
-    place = places[at, nearest[at]] if limit.parts else near[f"{limit.column}_place"][at]
+    at, allowed = int(np.nanargmin(values)), limit.least or judged.replay.margin
+    if limit.parts:
+        nearest = min(limit.parts, key=lambda kind: float(near["nearest"][at, kind]))
+        place = near["places"].reshape(len(values), -1, 3)[at, nearest]
+    else:
+        place = near[f"{limit.column}_place"][at]
     yield broken(
         sentence=limit.words.format(mm(values[at]), allowed=mm(allowed)),
         value=float(values[at]),
