@@ -73,7 +73,7 @@ class Limit:
 LIMITS = (
     Limit(
         asked="never seen, of all points within the margin",
-        why="three cameras leave up to 42 %; a lone one, beside an arm that hardly moves, 52 % and more",
+        why="in the hunt, a thing behind the arm was met where it was 50 % or more; three cameras leave less",
         column="unseen",
         most=UNSEEN,
         words="of the space within the margin of the arm was never seen by a camera",
