@@ -14,8 +14,8 @@ LONGEST = 90  # characters of a reason
 
 @dataclass(frozen=True, kw_only=True)
 class Word:
-    """One of `WORDS`, the first reason: its criterion, then a colon and a sentence, and the limit of evidence without
-    which the run would be safe, empty for none.
+    """One of `WORDS`. reason: the first one, its criterion, then a colon and a sentence. only: the limit of evidence
+    that alone keeps the run from being safe, empty without one.
     """
 
     word: str
@@ -24,8 +24,8 @@ class Word:
 
 
 def word_of(verdict: Verdict, near: Figures, margin: float) -> Word:
-    """What a verdict says, with what was known about the arm; a failure other than contact is `failed`, what passed
-    by a waiver `waived`.
+    """A failure other than contact is `failed`, what passed by a waiver `waived`. near: what was known about the arm,
+    with a margin [m].
     """
     broken = [limit.name for limit in LIMITS if limit.is_broken(near, margin)]
     only = broken[0] if len(broken) == 1 == len(verdict.decisive) else ""

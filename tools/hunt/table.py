@@ -118,7 +118,7 @@ def _why(rows: Sequence[Row]) -> list[str]:
 
 
 def _limits(rows: Sequence[Row]) -> list[str]:
-    """By limit of evidence, the runs that would be safe without it: what it alone catches, and what it costs."""
+    """For each limit of evidence, how many runs it alone keeps from being safe, by their truth."""
     lines = [f"{'safe without':20s} " + " ".join(f"{truth:>8s}" for truth in TRUTHS)]
     for limit in LIMITS:
         there = Counter(truth_of(row) for row in rows if row.only == limit.name)

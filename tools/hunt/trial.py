@@ -78,7 +78,7 @@ class Row:
     """What came of one run: the verdict, its first reason, and the truth [m].
 
     robot: the words of its body; spread, fattening [px]: of its stereo depth, 0 where depth is nearly exact. only:
-    the limit of evidence without which it would be safe.
+    the limit of evidence that alone keeps it from being safe.
     """
 
     seed: int

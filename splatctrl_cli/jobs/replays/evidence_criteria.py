@@ -34,8 +34,8 @@ from splatctrl_cli.voxels import EvidenceClass
 @dataclass(frozen=True, kw_only=True)
 class Limit:
     """A row of the table of evidence. asked: of what, in the documentation's words, and why. column: of
-    `NEAR_COLUMNS`, of several classes the least; most: the largest share allowed, or least [m]: the least distance
-    (0: the margin); words, remedy: what is said.
+    `NEAR_COLUMNS`, with the classes of which the least counts; most: the largest share allowed, or least [m]: the
+    least distance (0: the margin); words, remedy: what is said.
     """
 
     asked: str
@@ -49,16 +49,16 @@ class Limit:
 
     @property
     def name(self) -> str:
-        """Of its class, else of its column."""
+        """That of the class it limits, else of its column."""
         return self.parts[0].name.lower() if self.parts else self.column
 
     def values(self, near: Figures) -> Float64:
-        """(T,) of the figures about the arm, NaN where it was not looked about."""
+        """What it limits, at each state (T,); NaN where the space about the arm was not looked at."""
         values = near[self.column]
         return values[:, self.parts].min(axis=1) if self.parts else values
 
     def is_broken(self, near: Figures, margin: float) -> bool:
-        """By any state; margin [m]."""
+        """Whether any state breaks it; margin [m]."""
         values = self.values(near)
         return bool(np.any(values <= (self.least or margin)) if self.most is None else np.any(values > self.most))
 
@@ -73,7 +73,7 @@ class Limit:
 LIMITS = (
     Limit(
         asked="never seen, of all points within the margin",
-        why="in the hunt, a thing behind the arm was met where it was 50 % or more; three cameras leave less",
+        why="faultless recordings of three cameras leave up to 49 %; what this alone finds is met from 50 % on",
         column="unseen",
         most=UNSEEN,
         words="of the space within the margin of the arm was never seen by a camera",
@@ -155,7 +155,9 @@ def known_space(judged: Judged) -> Iterator[Reason]:
 
 
 def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
-    """What a limit says of a run: it is kept, or where it is `broken` most. Without any figure there is no proof."""
+    """The reason that a limit gives: it is kept, or the state that breaks it most, as a reason of the kind `broken`.
+    What was not recorded proves nothing.
+    """
     near = judged.replay.near
     values = limit.values(near)
     if limit is PROOF and np.isnan(near["assumed"]).all():

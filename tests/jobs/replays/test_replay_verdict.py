@@ -203,8 +203,13 @@ def test_what_the_arm_has_about_it_is_said_of_a_safe_run(stage: Stage) -> None:
         code, verdict = stage.judged(*options, scene=stage.scene(f"scene{number}"))
         assert (code, verdict["how"]) == (0, how) and words in verdict["sentence"]
     stage.last_seen = unseen_about(hand, 0.15)
-    code, verdict = stage.judged("--require-proof", scene=stage.scene("asked"))
-    assert (code, decisive(verdict)) == (5, {"known space": "not evaluable"})
+    for options, found in (
+        (("--require-proof",), (5, {"known space": "not evaluable"})),
+        (("--unseen", "occupied"), (1, {"known space": "failed"})),
+    ):
+        code, verdict = stage.judged(*options, scene=stage.scene("asked" + options[0]))
+        assert (code, decisive(verdict)) == found
+    assert verdict["label"] == "margin broken"
 
 
 def test_what_was_known_about_the_arm_is_a_criterion_where_it_suffices_too(stage: Stage) -> None:
