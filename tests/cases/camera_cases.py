@@ -1,0 +1,5 @@
+"""Images, depth and lenses of other drivers."""
+
+from tests.cases.case import Case
+
+CASES: tuple[Case, ...] = ()

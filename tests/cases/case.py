@@ -1,0 +1,52 @@
+"""One small input: how to make it, and what is wanted of it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.cli.main import main
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one call of the command line printed, and its exit code."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def text(self) -> str:
+        """Both streams, as one line without line breaks: messages are wrapped."""
+        return " ".join((self.out + " " + self.err).split())
+
+
+Run = Callable[[Sequence[str | Path]], Result]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """An input by name. `make` writes it into an empty folder, with this project's own writers.
+
+    `examine` gets the folder of the input, an empty one to write to, and what runs the command line. It asserts.
+    `has_shared`: a folder of the same name, made with other people's libraries, may lie beside the real recordings.
+    """
+
+    name: str
+    make: Callable[[Path], None]
+    examine: Callable[[Path, Path, Run], None]
+    has_shared: bool = False
+
+
+def runner(capsys: pytest.CaptureFixture[str]) -> Run:
+    """What calls the command line in this process and gives its code and output."""
+
+    def run(words: Sequence[str | Path]) -> Result:
+        capsys.readouterr()
+        code = main([str(word) for word in words])
+        out, err = capsys.readouterr()
+        return Result(code=code, out=out, err=err)
+
+    return run

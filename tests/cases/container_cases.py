@@ -1,0 +1,5 @@
+"""Containers of other recorders."""
+
+from tests.cases.case import Case
+
+CASES: tuple[Case, ...] = ()

@@ -1,0 +1,5 @@
+"""Robots of other tools: URDF, meshes, sphere files."""
+
+from tests.cases.case import Case
+
+CASES: tuple[Case, ...] = ()
