@@ -13,8 +13,12 @@ __version__ = "0.2.0"
 
 
 def __getattr__(name: str) -> object:
-    if not name.startswith("_"):
+    if name == "__all__" or not name.startswith("_"):
         api = import_module("splatctrl_cli.api")
-        if name in api.__all__:
+        if name in ("__all__", *api.__all__):
             return getattr(api, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *import_module("splatctrl_cli.api").__all__})

@@ -27,6 +27,13 @@ def test_a_name_that_is_not_public_is_an_attribute_error(name: str) -> None:
         getattr(splatctrl_cli, name)
 
 
+def test_the_package_lists_its_public_names_and_a_star_imports_them() -> None:
+    code = "from splatctrl_cli import *; import splatctrl_cli; print(sorted(set(dir()) & set(dir(splatctrl_cli))))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(api.__all__) <= {*re.findall(r"'(\w+)'", done.stdout)}
+    assert set(dir(splatctrl_cli)) >= {*api.__all__, "__version__"}
+
+
 @pytest.mark.parametrize(("module", "names"), [("splatctrl_cli", HEAVY), ("splatctrl_cli.api", LATE)])
 def test_importing_loads_neither_what_is_heavy_nor_what_is_used_late(module: str, names: tuple[str, ...]) -> None:
     code = f"import {module}, sys; print([name for name in {names} if name in sys.modules])"
@@ -63,6 +70,9 @@ def test_the_examples_of_the_page_run_on_the_sample_data(
     assert isinstance(exported, api.ExportResult)
     assert isinstance(scored, api.ScoreResult)
     assert isinstance(found, api.ReplayResult)
+    for result in (made, baked, answered, exported, scored, found, since):
+        verdict = getattr(result, "verdict", None)
+        assert len(repr(result)) < 1200 and (verdict is None or verdict.sentence in repr(result))
     assert made.verdict.outcome is scored.verdict.outcome is api.Outcome.PASSED
     written = {path.name for path in (tmp_path / "api_output").iterdir()}
     assert written == {

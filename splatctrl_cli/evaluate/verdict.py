@@ -2,8 +2,8 @@
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from dataclasses import asdict, dataclass, field, fields, replace
 from enum import StrEnum
 from functools import partial
 from typing import Any, Generic, TypeVar
@@ -21,6 +21,7 @@ class Outcome(StrEnum):
 
 EXIT_CODES = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.NOT_EVALUABLE: 5}
 DAMAGED = 3
+SHORT = 80  # characters of a value that `brief` prints
 _WORST_FIRST = (Outcome.FAILED, Outcome.NOT_EVALUABLE, Outcome.PASSED)  # a definite failure outranks missing evidence
 
 
@@ -111,6 +112,9 @@ class Verdict:
     is_damaged: bool = False
     counts: Mapping[str, int] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        return f"<{self.sentence}>"
+
     @property
     def exit_code(self) -> int:
         """1 failed, 5 not evaluable; passed 0, or 3 where part of the input was lost."""
@@ -195,6 +199,16 @@ def verdict_of(
         is_damaged=is_damaged,
         counts=counts or {},
     )
+
+
+def brief(result: Any) -> str:
+    """Represent a result in a few lines: its verdict, values that are short, and of the others type and size."""
+    shown = []
+    for name, value in ((each.name, getattr(result, each.name)) for each in fields(result)):
+        text, size = repr(value), f" of {len(value)}" if isinstance(value, Sized) else ""
+        is_short = len(text) <= SHORT or isinstance(value, Verdict)
+        shown.append(f"{name}={text if is_short else f'<{type(value).__name__}{size}>'}")
+    return f"{type(result).__name__}({', '.join(shown)})"
 
 
 def noted(criterion: str, sentence: str) -> Reason:

@@ -9,7 +9,7 @@ from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
-from splatctrl_cli.evaluate.verdict import Reason, Verdict, failed, lacking, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, failed, lacking, noted, verdict_of
 from splatctrl_cli.jobs.judged_runs import (
     Judged,
     JudgedRun,
@@ -107,6 +107,8 @@ class CompareResult:
     which then decide instead; differences: settings, versions and inputs by name, before and after; only_after: runs
     that were not there before. metrics: how many of each.
     """
+
+    __repr__ = brief
 
     verdict: Verdict
     verdicts: tuple[VerdictChange, ...]

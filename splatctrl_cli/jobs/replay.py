@@ -8,7 +8,7 @@ from splatctrl_cli.captures.capture_header import ROBOT
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.evaluate.verdict import Verdict, brief
 from splatctrl_cli.evaluate.views import frames_of
 from splatctrl_cli.evaluate.worst_frames import Sight
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
@@ -56,6 +56,8 @@ class ReplayResult:
     verdict: what it comes to; notes: sentences on the robot, the pictures and the log. is_damaged: part of the log
     was lost.
     """
+
+    __repr__ = brief
 
     out: Path
     replay: Replay

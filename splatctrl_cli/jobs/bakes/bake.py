@@ -14,7 +14,7 @@ from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS, LENGTH
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, brief, noted, verdict_of
 from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker
 from splatctrl_cli.field.distance import KERNEL_OF
 from splatctrl_cli.field.grid_cells import LOSS, GridLayout, check_loss
@@ -59,6 +59,8 @@ class BakeResult:
     """The field folder `out`; summary: what a person wants to know of the field; metrics: the figures that a gate can
     name, as in ``run.json``, whose counts of cells the verdict has. seconds: of each stage.
     """
+
+    __repr__ = brief
 
     out: Path
     summary: Mapping[str, Any]

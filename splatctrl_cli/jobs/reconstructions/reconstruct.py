@@ -8,7 +8,7 @@ from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.evaluate.verdict import Verdict, brief
 from splatctrl_cli.files.arrays import savez
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.device import FitDevice
@@ -33,6 +33,8 @@ class ReconstructResult:
     """The scene folder `out`, its metrics and verdict as in ``run.json``, splats removed by reason, and wall time by
     stage [s].
     """
+
+    __repr__ = brief
 
     out: Path
     metrics: Mapping[str, Any]

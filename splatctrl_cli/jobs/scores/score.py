@@ -22,7 +22,7 @@ from splatctrl_cli.evaluate.score_report import (
     report_of_scans,
     score_verdict,
 )
-from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.evaluate.verdict import Verdict, brief
 from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
 from splatctrl_cli.jobs.open_recording import RecordingRequest
@@ -84,6 +84,8 @@ class ScoreResult:
     """report: everything that ``score.json`` holds; the folder `out` where one was asked for; first_view: photo and
     render of the first view that was scored of one scene.
     """
+
+    __repr__ = brief
 
     report: Mapping[str, Any]
     verdict: Verdict
