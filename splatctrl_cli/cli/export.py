@@ -59,6 +59,8 @@ def _lines(result: ExportResult) -> Iterator[str]:
     yield f"{result.file}: {result.num_splats} splats{left_out}, {result.bytes} bytes, {result.format}"
     if result.was_rounded:
         yield f"made isotropic: {_decibels(result.isotropic_psnr)} against the source"
+    if result.origin is not None:
+        yield f"centres are less the origin {result.origin} m: float32 would move them without"
     if result.not_kept:
         yield f"not kept: {', '.join(result.not_kept)}"
     if result.num_outside:

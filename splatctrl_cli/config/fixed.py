@@ -20,6 +20,7 @@ FLOAT_DEPTH_ERROR = 1e-6  # [m] of rounding to such counts at most, else the flo
 CLOUD_RESIDUAL = 0.5  # [px] that 95 % of a cloud's points lie from where its pinhole camera has them, at most
 CLOUD_POINTS = 40  # fewest points that such a camera is fitted to
 REGISTERED_SHARE = 0.25  # of an undistorted image that its lens saw, at least
+WIDEST_RAY = 2.0  # that an image without distortion shows: 63 degrees from the axis
 FARTHEST_RAY = 20.0  # from the optical axis, at a depth of one: 87 degrees
 IMAGES_STEADY = 0.25  # largest departure from the period, in periods, of an interval that counts as steady
 IMAGES_GAP = 1.5  # [periods] from which on an interval of images is a gap
@@ -320,6 +321,12 @@ EXPORT_MIN_PSNR = 80.0  # [dB] of a format that rounds to float32 alone; measure
 EXPORT_DIFFERENCE = 3 / 255  # the last bit can take a splat across the renderer's cut-off of 1/255
 EXPORT_MAX_COLOR = 1e4  # of a sensor's 0 to 1, or of a harmonic; from 1e6 on an isotropic PLY looks otherwise
 EXPORT_VIEWS = 4  # around the scene
+
+# Splat files: numbers that a PLY may hold and splats do not
+CENTER_SHARE = 0.02  # of the splats' size, that float32 may move their centres by: 0.4 mm of 20 mm
+CENTER_LENGTH = 1e-3  # of the longest side of their box, that counts as their size where sigmas are smaller
+SPARSEST = 10.0  # times the spacing: no reconstruction has sigmas that large; in trained ones 0.3 to 2
+SPARSEST_SAMPLE = 2000  # splats by which the spacing is measured
 
 # Calibration: cameras against each other and the robot
 STATES_CLOSE_NS = 100_000_000  # [ns] between a frame and the joint states around it

@@ -67,14 +67,37 @@ class PlyFile:
 
 @dataclass(frozen=True, kw_only=True)
 class _Element:
+    """properties: names and scalar types; of a list those of its length and of its values, with a space between."""
+
     name: str
     count: int
     properties: list[tuple[str, str]]
 
+    @property
+    def has_lists(self) -> bool:
+        return any(" " in kind for _, kind in self.properties)
+
     def dtype(self, path: Path, byte_order: str) -> "np.dtype[Any]":
-        if any(kind == "list" for _, kind in self.properties):
-            raise InputError(f"{path}: element {self.name} has list properties: a mesh, not a table of splats")
-        return np.dtype([(name, byte_order + SCALARS[kind]) for name, kind in self.properties])
+        """Text has more digits than its type may hold: they are kept."""
+        if self.has_lists:
+            raise InputError(f"{path}: element {self.name} has list properties: expected a table of numbers")
+        types = [(name, SCALARS[kind]) for name, kind in self.properties]
+        return np.dtype(
+            [(name, "f8" if (byte_order, kind) == ("=", "f4") else byte_order + kind) for name, kind in types]
+        )
+
+    def end(self, content: bytes, offset: int, byte_order: str) -> int:
+        """Where the element ends that begins at `offset`; beyond `content` where that is cut short."""
+        kinds = [[np.dtype(byte_order + SCALARS[word]) for word in kind.split()] for _, kind in self.properties]
+        if not self.has_lists:
+            return offset + self.count * sum(kind.itemsize for (kind,) in kinds)
+        for _ in range(self.count):
+            for kind, *values in kinds:
+                if offset + kind.itemsize > len(content):
+                    return offset + kind.itemsize
+                num = max(0, int(np.frombuffer(content, kind, 1, offset)[0])) if values else 0
+                offset += kind.itemsize + sum(num * value.itemsize for value in values)
+        return offset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,16 +129,19 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
         )
     check_properties(path, names, required)
     read = _read_ascii if header.format == "ascii" else _read_binary
-    return PlyFile(path=path, rows=read(path, content, header)[element], comments=tuple(header.comments))
+    return PlyFile(path=path, rows=read(path, content, header, wanted), comments=tuple(header.comments))
 
 
 def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) -> None:
     """Raise InputError that names which of the `required` properties are not among `names`."""
     missing = [name for name in required if name not in names]
     if missing:
+        is_named_otherwise = {"opacity", "f_dc_0"} & {*names}
         raise InputError(
             f"{path}: no 3D-GS splat file: missing properties {' '.join(missing)} (it has {' '.join(names)})",
-            remedy="a point cloud or mesh has to be reconstructed first",
+            remedy="write them by these names: scale_* is log(sigma [m]), rot_* a quaternion w x y z, opacity a logit"
+            if is_named_otherwise
+            else "a point cloud or mesh has to be reconstructed first",
         )
 
 
@@ -137,46 +163,40 @@ def write_table(path: Path, rows: NDArray[Any], comments: Mapping[str, str]) -> 
     path.write_bytes(header + rows.tobytes())
 
 
-def _read_binary(path: Path, content: bytes, header: _Header) -> dict[str, NDArray[Any]]:
-    dtypes = {found.name: found.dtype(path, BYTE_ORDERS[header.format]) for found in header.elements}
-    expected = header.length + sum(found.count * dtypes[found.name].itemsize for found in header.elements)
-    if len(content) != expected:
-        what = "cut short" if len(content) < expected else "longer than its header says"
+def _read_binary(path: Path, content: bytes, header: _Header, wanted: _Element) -> NDArray[Any]:
+    byte_order, start, end = BYTE_ORDERS[header.format], 0, header.length
+    dtype = wanted.dtype(path, byte_order)
+    for found in header.elements:
+        start, end = end if found is wanted else start, found.end(content, end, byte_order)
+    if len(content) != end:
+        what = "cut short" if len(content) < end else "longer than its header says"
         raise InputError(
-            f"{path}: {what}: expected {expected} bytes ({header.length} of header and the data it promises), "
+            f"{path}: {what}: expected {end} bytes ({header.length} of header and the data it promises), "
             f"got {len(content)}",
             remedy="copy or write the file again",
         )
-    tables, offset = {}, header.length
-    for found in header.elements:
-        tables[found.name] = np.frombuffer(content, dtypes[found.name], count=found.count, offset=offset)
-        offset += found.count * dtypes[found.name].itemsize
-    return tables
+    return np.frombuffer(content, dtype, count=wanted.count, offset=start)
 
 
-def _read_ascii(path: Path, content: bytes, header: _Header) -> dict[str, NDArray[Any]]:
-    dtypes = {found.name: found.dtype(path, BYTE_ORDERS[header.format]) for found in header.elements}
+def _read_ascii(path: Path, content: bytes, header: _Header, wanted: _Element) -> NDArray[Any]:
     lines = [line.split() for line in content[header.length :].split(b"\n") if line.strip()]
-    expected = sum(found.count for found in header.elements)
+    expected = sum(found.count for found in header.elements if found.properties)
     if len(lines) != expected:
         raise InputError(f"{path}: expected {expected} lines of data, got {len(lines)}")
-    tables, start = {}, 0
-    for found in header.elements:
-        rows = lines[start : start + found.count]
-        start += found.count
-        table = np.zeros(found.count, dtype=dtypes[found.name])
-        bad = next((i for i, row in enumerate(rows) if len(row) != len(found.properties)), None)
-        if bad is not None:
-            raise InputError(
-                f"{path}: {found.name} {bad}: expected {len(found.properties)} numbers, got {len(rows[bad])}"
-            )
-        for index, (name, _) in enumerate(found.properties):
-            try:
-                table[name] = [float(row[index]) for row in rows]
-            except (ValueError, OverflowError) as error:
-                raise InputError(f"{path}: {found.name}: property {name}: {error}") from None
-        tables[found.name] = table
-    return tables
+    start = sum(found.count for found in header.elements[: header.elements.index(wanted)] if found.properties)
+    rows = lines[start : start + wanted.count]
+    table = np.zeros(wanted.count, dtype=wanted.dtype(path, BYTE_ORDERS[header.format]))
+    bad = next((i for i, row in enumerate(rows) if len(row) != len(wanted.properties)), None)
+    if bad is not None:
+        raise InputError(
+            f"{path}: {wanted.name} {bad}: expected {len(wanted.properties)} numbers, got {len(rows[bad])}"
+        )
+    for index, (name, _) in enumerate(wanted.properties):
+        try:
+            table[name] = [float(row[index]) for row in rows]
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"{path}: {wanted.name}: property {name}: {error}") from None
+    return table
 
 
 def _parse_header(path: Path, content: bytes) -> _Header:
@@ -195,8 +215,10 @@ def _parse_header(path: Path, content: bytes) -> _Header:
                 comments.append(line.strip().partition(" ")[2])
             case ["element", name, count] if count.isdigit():
                 elements.append(_Element(name=name, count=int(count), properties=[]))
-            case ["property", "list", _, _, name] if elements:
-                elements[-1].properties.append((name, "list"))
+            case ["property", "list", length, kind, name] if (
+                elements and kind in SCALARS and SCALARS.get(length, "f4")[0] in "iu"
+            ):
+                elements[-1].properties.append((name, f"{length} {kind}"))
             case ["property", kind, name] if elements and kind in SCALARS:
                 if name in (known for known, _ in elements[-1].properties):
                     raise InputError(f"{path}: element {elements[-1].name} names property {name} twice")

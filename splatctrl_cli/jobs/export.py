@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +18,17 @@ from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Lab
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render
 from splatctrl_cli.splat_files.gaussian_ply import REFERENCE_PLY
-from splatctrl_cli.splat_files.splat_format import Differences, SplatFormat, differences, refuse
+from splatctrl_cli.splat_files.splat_format import Comments, Differences, SplatFormat, differences, refuse
 from splatctrl_cli.splat_files.splats import (
     FORMATS,
+    ORIGIN,
     as_gaussians,
     as_splats,
     check_no_shell,
     format_of,
     nearest_splats,
     read_ply,
-    read_splats,
+    read_source,
     write_ply,
 )
 
@@ -57,7 +58,8 @@ class ExportRequest:
 class ExportResult:
     """The file, and what it keeps of its source.
 
-    num_left_out: splats of other labels. not_kept: what the format has no place for; num_outside: Gaussians with a
+    num_left_out: splats of other labels. origin: what was taken off every centre [m], in words, None for nothing.
+    not_kept: what the format has no place for; num_outside: Gaussians with a
     sigma or colour beyond its range, which are put at its edge. differences, and what the format allows of them. Over
     the pixels of all views around the scene: largest_pixel_difference of a colour, an opacity, or a depth over the
     scene's size; psnr [dB], None where the colours are the same; covered_share, where anything shows. isotropic_psnr:
@@ -70,6 +72,7 @@ class ExportResult:
     sha256: str
     num_splats: int
     num_left_out: int
+    origin: str | None = None
     not_kept: tuple[str, ...]
     num_outside: int
     differences: Differences
@@ -105,10 +108,11 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     kind = _format(out, request.layout)
     if os.path.realpath(out) == os.path.realpath(source):
         raise UsageError(f"{out}: is the input itself", remedy="give another --out")
-    splats, comments = read_splats(source)
+    splats, comments, exact = read_source(source)
     check_no_shell(source, comments)  # most formats would lose what tells it from surfaces
     _check_colors(source, splats)
-    selected = splats if request.labels is None else splats.select(np.isin(splats.labels, list(request.labels)))
+    is_chosen = np.isin(splats.labels, [*Label] if request.labels is None else list(request.labels))
+    selected, exact = (splats, exact) if request.labels is None else (splats.select(is_chosen), exact[is_chosen])
     if not len(selected):
         raise NotEvaluableError(f"{source}: no splat to write among {len(splats)}", remedy="give other --labels")
     chosen = nearest_splats(selected) if request.isotropic and isinstance(selected, GaussianSet) else selected
@@ -120,10 +124,12 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     kept = {key: value for key, value in comments.items() if key not in LAYOUT_COMMENTS}
     name = source.name if source.name.isprintable() else ascii(source.name)
     with output_path(out, force=request.force, is_folder=False) as partial:
-        back = _written(partial, kind, chosen, {**kept, "exported_from": f"{name} sha256 {sha256(source)}"})
+        kept |= {"exported_from": f"{name} sha256 {sha256(source)}"}
+        back, said = _written(partial, kind, chosen, kept)
         before, after = _gaussians(chosen), _gaussians(back)
         held, bound = kind.held(before), kind.bound(before)
-        found = _checked_differences(out, held, after, bound)
+        bound = replace(bound, center=bound.center + float(np.abs(exact - before.centers).max()))
+        found = _checked_differences(out, held, after, bound, exact)
         look = _checked_look(out, kind, chosen, back)
         return ExportResult(
             file=out,
@@ -132,7 +138,8 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
             sha256=sha256(partial),
             num_splats=len(chosen),
             num_left_out=len(splats) - len(chosen),
-            not_kept=tuple(_not_kept(chosen, back, held)),
+            origin=comments.get(ORIGIN),
+            not_kept=(*_not_kept(chosen, back, held), *({ORIGIN} & comments.keys() - said.keys())),
             num_outside=_num_outside(before, held),
             differences=found,
             allowed=bound,
@@ -172,24 +179,28 @@ def _check_colors(source: Path, splats: Splats) -> None:
     refuse(str(source), "colour", largest, largest > EXPORT_MAX_COLOR, f"at most {EXPORT_MAX_COLOR:g}")
 
 
-def _written(partial: Path, kind: SplatFormat, splats: Splats, comments: Mapping[str, str]) -> Splats:
+def _written(
+    partial: Path, kind: SplatFormat, splats: Splats, comments: Mapping[str, str]
+) -> tuple[Splats, Comments]:
     """Write the splats and return what reads back; isotropic ones in a PLY keep their density."""
     if isinstance(splats, SplatSet) and kind is FORMATS[".ply"]:
         write_ply(partial, splats, comments)
-        return read_ply(partial)[0]
+        return read_ply(partial)
     kind.write(partial, _gaussians(splats), comments)
-    back = kind.read(partial)[0]
-    return back if isinstance(splats, GaussianSet) else as_splats(back, str(partial))
+    back, said = kind.read(partial)
+    return back if isinstance(splats, GaussianSet) else as_splats(back, str(partial)), said
 
 
 def _gaussians(splats: Splats) -> GaussianSet:
     return as_gaussians(splats) if isinstance(splats, SplatSet) else splats
 
 
-def _checked_differences(out: Path, held: GaussianSet, back: GaussianSet, bound: Differences) -> Differences:
+def _checked_differences(
+    out: Path, held: GaussianSet, back: GaussianSet, bound: Differences, exact: Float64
+) -> Differences:
     if len(held) != len(back) or not np.array_equal(held.labels, back.labels):
         raise WriteError(f"{out}: differs from its source: {len(back)} of {len(held)} splats, or other labels")
-    found = differences(held, back)
+    found = differences(held, back, exact)
     beyond = found.beyond(bound)
     if beyond:
         raise WriteError(f"{out}: differs from its source: {'; '.join(beyond)}")

@@ -3,7 +3,8 @@
 Layout: ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``, all float. ``scale_*`` is log(sigma),
 ``rot_*`` a quaternion w x y z, ``opacity`` a logit; ``f_dc_*`` and ``f_rest_*`` are the harmonics' coefficients of
 red, green and blue: f_rest has all of red first, then green, then blue. A ``label`` (uchar) follows only where some
-Gaussian is not an object, so that readers of a fixed stride can read every other file.
+Gaussian is not an object, so that readers of a fixed stride can read every other file. Where ``scale_0`` stands
+alone it is of all three axes.
 """
 
 from collections.abc import Mapping
@@ -12,10 +13,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from splatctrl_cli.config.fixed import CENTER_LENGTH, CENTER_SHARE, SPARSEST, SPARSEST_SAMPLE
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.ply import PlyFile, check_properties, read_table, write_table
-from splatctrl_cli.records import Float32, GaussianSet, Label, UInt8
+from splatctrl_cli.records import Float32, Float64, GaussianSet, Label, UInt8
 from splatctrl_cli.splat_files.splat_format import (
     SplatFormat,
     check_finite,
@@ -32,7 +35,8 @@ NAMES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *REST, "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
-REQUIRED = tuple(name for name in NAMES if name not in {"nx", "ny", "nz", *REST})
+SCALES = ("scale_0", "scale_1", "scale_2")
+REQUIRED = tuple(name for name in NAMES if name not in {"nx", "ny", "nz", "scale_1", "scale_2", *REST})
 REST_PER_DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}  # number of f_rest_* -> degree of the harmonics
 HEADER_COMMENTS = {
     "frame": "world",
@@ -82,10 +86,11 @@ def gaussians_of(ply: PlyFile) -> GaussianSet:
     """The Gaussians that a table of a PLY file holds. Raises InputError as `read_gaussian_ply` does."""
     path = ply.path
     check_properties(path, ply.names, REQUIRED)
-    scales = [sigma_of_log(str(path), f"scale_{axis}", ply.column(f"scale_{axis}")) for axis in range(3)]
+    logs = log_sigmas(ply)
+    scales = np.column_stack([sigma_of_log(str(path), f"scale_{axis}", logs[:, axis]) for axis in range(3)])
     gaussians = GaussianSet(
-        centers=np.column_stack([ply.column(name) for name in "xyz"]).astype(np.float32),
-        scales=np.column_stack(scales),
+        centers=centers_of(ply, scales),
+        scales=scales,
         quats_wxyz=unit_quaternions(str(path), np.column_stack([ply.column(f"rot_{index}") for index in range(4)])),
         opacities=sigmoid(ply.column("opacity")),
         harmonics=without_zero_degrees(_harmonics(ply)),
@@ -93,6 +98,70 @@ def gaussians_of(ply: PlyFile) -> GaussianSet:
     )
     check_gaussians(str(path), gaussians)
     return gaussians
+
+
+class RoundedError(InputError):
+    """Centres that float32 would move."""
+
+
+def exact_centers(ply: PlyFile) -> Float64:
+    """(N, 3) float64 [m], as the file has them."""
+    return np.column_stack([ply.column(name) for name in "xyz"])
+
+
+def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
+    """(N, 3) float32 [m]. Raises InputError where float32 would move the splats, or moved them before, against their
+    `sigmas` (N,) or (N, 3) [m] and the length of their box.
+    """
+    exact = exact_centers(ply)
+    centers = exact.astype(np.float32)
+    if not len(ply):
+        return centers
+    size = max(float(np.median(sigmas)), CENTER_LENGTH * float(np.ptp(exact, axis=0).max()))
+    largest, moved = float(np.abs(exact).max()), float(np.abs(exact - centers).max())
+    step = float(np.spacing(np.float32(largest)))
+    places = f"{ply.path}: centres up to {largest:.0f} m"
+    if moved > CENTER_SHARE * size:
+        raise RoundedError(
+            f"{places}: float32, which splats are kept in, has steps of {step:g} m there and would move them by"
+            f" {moved:.3g} m",
+            remedy=f"'splatctrl export {ply.path} -o OUT.ply' takes an origin off and names it; give OUT.ply",
+        )
+    if step > size:
+        raise InputError(
+            f"{places}: were rounded to float32, whose steps of {step:g} m there are larger than the splats"
+            f" (sigma {float(np.median(sigmas)):.3g} m)",
+            remedy="write x, y and z again, as double or less an origin",
+        )
+    return centers
+
+
+def log_sigmas(ply: PlyFile) -> Float64:
+    """(N, 3) log(sigma [m]). Raises InputError for splats of two scales, and for scales that are no logarithms: all
+    above 0, which makes every splat SPARSEST times as large as their spacing.
+    """
+    found = [name for name in SCALES if name in ply]
+    if len(found) == 2:
+        raise InputError(
+            f"{ply.path}: expected scale_0 alone or scale_0 to scale_2, got {' and '.join(found)}: the flat splats of"
+            " 2D-GS have no third sigma",
+            remedy="write the log of a thickness [m] as scale_2",
+        )
+    logs = np.column_stack([ply.column(name if len(found) == 3 else "scale_0") for name in SCALES])
+    if len(ply) < 2 or logs.min() < 0:
+        return logs
+    centers = exact_centers(ply)
+    some = centers[:: -(-len(centers) // SPARSEST_SAMPLE)]
+    spacing = float(np.median(cKDTree(centers).query(some, k=2)[0][:, 1]))
+    if spacing > 0 and np.percentile(logs.mean(axis=1), 5) > np.log(SPARSEST * spacing):
+        raise InputError(
+            f"{ply.path}: scale_*: expected log(sigma [m]), got {logs.min():.3g} to {logs.max():.3g}: splats of"
+            f" {np.exp(min(float(np.median(logs)), 700.0)):.3g} m, {spacing:.3g} m apart",
+            remedy="the scales look like sigmas: write their logarithms"
+            if np.median(logs) < SPARSEST * spacing
+            else "write scales and centres in one unit",
+        )
+    return logs
 
 
 def labels_of(ply: PlyFile) -> UInt8:

@@ -94,10 +94,12 @@ def float32_bound(gaussians: GaussianSet) -> Differences:
     return Differences(center=0.0, sigma=6e-6, rotation=1e-4, color=1e-6 * largest_color, opacity=1e-6, harmonics=0.0)
 
 
-def differences(a: GaussianSet, b: GaussianSet) -> Differences:
-    """The largest differences between two sets of the same Gaussians in the same order."""
+def differences(a: GaussianSet, b: GaussianSet, centers: Float64 | None = None) -> Differences:
+    """The largest differences between two sets of the same Gaussians in the same order; centers: the more exact ones
+    of `a` (N, 3) [m].
+    """
     return Differences(
-        center=_largest(a.centers.astype(np.float64) - b.centers),
+        center=_largest((a.centers.astype(np.float64) if centers is None else centers) - b.centers),
         sigma=_largest(b.scales / a.scales.astype(np.float64) - 1.0),
         rotation=_largest(_angles(a.quats_wxyz, b.quats_wxyz)),
         color=SH_C0 * _largest(a.harmonics[:, 0].astype(np.float64) - b.harmonics[:, 0]),

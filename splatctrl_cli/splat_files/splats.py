@@ -17,8 +17,15 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.ply import PlyFile, read_table, write_table
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.libraries import entries_of
-from splatctrl_cli.records import Bool, Float32, GaussianSet, Label, SplatSet
-from splatctrl_cli.splat_files.gaussian_ply import gaussians_of, labels_of
+from splatctrl_cli.records import Bool, Float32, Float64, GaussianSet, Label, SplatSet
+from splatctrl_cli.splat_files.gaussian_ply import (
+    RoundedError,
+    centers_of,
+    exact_centers,
+    gaussians_of,
+    labels_of,
+    log_sigmas,
+)
 from splatctrl_cli.splat_files.splat_format import (
     SH_C0,
     Comments,
@@ -36,8 +43,9 @@ NAMES = (
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 DTYPE = np.dtype([*((name, "<f4") for name in NAMES), ("label", "u1"), ("density", "<f4")])
-REQUIRED = tuple(name for name in NAMES if name not in {"nx", "ny", "nz"} and not name.startswith("rot_"))
+REQUIRED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0")
 METRES = ("m", "metre", "metres", "meter", "meters")
+ORIGIN = "origin"  # [m] that was taken off every centre
 SHELL = {"shell": "beyond the robot's reach, rendered only: no surface that distances are kept to"}
 HEADER_COMMENTS = {
     "frame": "world",
@@ -187,9 +195,10 @@ def splats_of(ply: PlyFile) -> SplatSet:
             remedy="distances are defined on spheres: 'splatctrl export --isotropic' writes the nearest such set;"
             " score renders them as they are",
         )
+    radii = sigma_of_log(str(path), "scale_0", log_sigmas(ply)[:, 0])
     splats = SplatSet(
-        centers=np.column_stack([ply.column(name) for name in "xyz"]).astype(np.float32),
-        radii=sigma_of_log(str(path), "scale_0", ply.column("scale_0")),
+        centers=centers_of(ply, radii),
+        radii=radii,
         colors=np.column_stack([0.5 + SH_C0 * ply.column(f"f_dc_{axis}") for axis in range(3)]).astype(np.float32),
         opacities=sigmoid(ply.column("opacity")),
         labels=labels_of(ply),
@@ -201,7 +210,7 @@ def splats_of(ply: PlyFile) -> SplatSet:
 
 def num_stretched(ply: PlyFile) -> int:
     """How many rows of a table have scales that differ."""
-    scales = np.column_stack([ply.column(f"scale_{axis}") for axis in range(3)])
+    scales = log_sigmas(ply)
     spread = scales.max(axis=1, initial=-np.inf) - scales.min(axis=1, initial=np.inf)
     return int(np.count_nonzero(spread > MAX_SCALE_SPREAD))
 
@@ -236,18 +245,49 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
 
     Raises InputError for a file that is missing, not whole, of an unknown kind, or holds what is no splat.
     """
-    try:
-        kind = format_of(path)
-    except UsageError as error:
-        raise InputError(error.message) from None
+    kind = _known_format(path)
     if kind is not FORMATS[".ply"]:
         gaussians, comments = kind.read(path)
         return (as_splats(gaussians, str(path)) if is_isotropic(gaussians) else gaussians), comments
     ply = read_table(path, "vertex", REQUIRED)
+    return _splats_or_gaussians(ply), ply.pairs()
+
+
+def read_source(path: Path) -> tuple[SplatSet | GaussianSet, Comments, Float64]:
+    """As `read_splats`, and the centres (N, 3) float64 [m] in the file's precision.
+
+    Where float32 would move the centres, an origin is taken off, which the comment `ORIGIN` names. Raises InputError
+    as `read_splats`.
+    """
+    if _known_format(path) is not FORMATS[".ply"]:
+        splats, comments = read_splats(path)
+        return splats, comments, splats.centers.astype(np.float64)
+    ply = read_table(path, "vertex", REQUIRED)
+    comments, exact = ply.pairs(), exact_centers(ply)
+    try:
+        return _splats_or_gaussians(ply), comments, exact
+    except RoundedError:
+        if ORIGIN in comments:
+            raise
+        origin = np.round((exact.min(axis=0) + exact.max(axis=0)) / 2, -2)
+        fields = [(name, "<f8" if name in "xyz" else ply.rows.dtype[name]) for name in ply.names]
+        moved = replace(ply, rows=ply.rows.astype(np.dtype(fields)))
+        for name, column in zip("xyz", (exact - origin).T, strict=True):
+            moved.rows[name] = column
+        named = " ".join(f"{value:.0f}" for value in origin)
+        return _splats_or_gaussians(moved), {**comments, ORIGIN: named}, exact - origin
+
+
+def _known_format(path: Path) -> SplatFormat:
+    try:
+        return format_of(path)
+    except UsageError as error:
+        raise InputError(error.message) from None
+
+
+def _splats_or_gaussians(ply: PlyFile) -> SplatSet | GaussianSet:
     has_rest = any(name.startswith("f_rest_") and ply.column(name).any() for name in ply.names)
-    if num_stretched(ply) == 0 and not has_rest:
-        return splats_of(ply), ply.pairs()
-    return gaussians_of(ply), ply.pairs()
+    return splats_of(ply) if num_stretched(ply) == 0 and not has_rest else gaussians_of(ply)
 
 
 def read_spheres(path: Path) -> SplatSet:

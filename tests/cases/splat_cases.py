@@ -1,5 +1,243 @@
 """Splat files, point clouds and exports of other tools."""
 
-from tests.cases.case import Case
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
-CASES: tuple[Case, ...] = ()
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.files.ply import read_points, read_positions
+from tests.cases.case import Case, Run
+
+SIDE = 20  # splats along a side of the plane
+SPACING = 0.05  # [m]
+FORMATS = {"<": "binary_little_endian", ">": "binary_big_endian", "=": "ascii"}
+TYPES = {"f8": "double", "f4": "float", "u1": "uchar", "i4": "int"}
+EMPTY_FACES = ("element face 0\nproperty list uchar int vertex_indices\n", b"", b"")
+TRIANGLES = (
+    "element face 2\nproperty list uchar int vertex_indices\nproperty uchar flags\n",
+    b"3 0 1 2 7\n4 0 1 2 3 7\n",
+    b"",
+)
+UTM = (500000.0, 5400000.0, 312.0)
+
+
+def plane_rows(origin: Sequence[float] = (0, 0, 0), place: str = "f8", **others: float) -> NDArray[Any]:
+    """A plane of round splats of 20 mm, 50 mm apart; `others` are columns beside, None for no such column."""
+    x, y = np.meshgrid(SPACING * np.arange(SIDE) - 0.475, SPACING * np.arange(SIDE) - 0.475)
+    scales = dict.fromkeys(("scale_0", "scale_1", "scale_2"), float(np.log(0.02)))
+    colour = {**dict.fromkeys(("f_dc_0", "f_dc_1", "f_dc_2"), 0.3), "opacity": 4.0, **scales}
+    given = {**colour, "rot_0": 1.0, "rot_1": 0.0, "rot_2": 0.0, "rot_3": 0.0, **others}
+    columns = {name: value for name, value in given.items() if value is not None}
+    rows = np.zeros(SIDE * SIDE, [*((axis, place) for axis in "xyz"), *((name, "f4") for name in columns)])
+    for axis, values, offset in zip("xyz", (x, y, 0.01 * np.sin(7 * x)), origin, strict=True):
+        rows[axis] = values.ravel() + offset
+    for name, value in columns.items():
+        rows[name] = value
+    return rows
+
+
+def write_ply(
+    path: Path,
+    rows: NDArray[Any],
+    order: str = "<",
+    *,
+    before: tuple[str, bytes, bytes] = ("", b"", b""),
+    after: tuple[str, bytes, bytes] = ("", b"", b""),
+) -> None:
+    """A table as element vertex in a byte order, with header lines, text and bytes of elements before and after."""
+    fields: Mapping[str, Any] = rows.dtype.fields or {}
+    properties = "".join(f"property {TYPES[kind.str[1:]]} {name}\n" for name, (kind, *_) in fields.items())
+    vertex = f"element vertex {len(rows)}\n{properties}"
+    header = f"ply\nformat {FORMATS[order]} 1.0\n{before[0]}{vertex}{after[0]}end_header\n".encode()
+    if order == "=":
+        text = "".join(" ".join(repr(value.item()) for value in row) + "\n" for row in rows)
+        path.write_bytes(header + before[1] + text.encode() + after[1])
+    else:
+        swapped = rows.astype(rows.dtype.newbyteorder(order))
+        path.write_bytes(header + before[2] + swapped.tobytes() + after[2])
+
+
+def face_bytes(order: str) -> tuple[str, bytes, bytes]:
+    """Two faces of 3 and 4 corners, in text and in bytes of an order."""
+    bytes_ = b"".join(
+        bytes([len(face)]) + np.array(face, f"{order}i4").tobytes() + b"\x07" for face in ([0, 1, 2], [0, 1, 2, 3])
+    )
+    return TRIANGLES[0], TRIANGLES[1], bytes_
+
+
+def exported(run: Run, source: Path, out: Path) -> dict[str, Any]:
+    """What `export --json` says of a file that it could write."""
+    result = run(["export", source, "-o", out, "--json"])
+    assert result.code == 0, result.text
+    found: dict[str, Any] = json.loads(result.out)
+    return found
+
+
+def baked(run: Run, source: Path, out: Path, splats: int = SIDE * SIDE) -> None:
+    """Assert that a field is made of all splats."""
+    result = run(["sdf-bake", source, "-o", out, "--json"])
+    assert result.code == 0, result.text
+    assert f'"num_splats": {splats}' in result.out, result.out
+
+
+def _double(folder: Path) -> None:
+    write_ply(folder / "10-double-utm.ply", plane_rows(UTM))
+
+
+def _examine_double(folder: Path, out: Path, run: Run) -> None:
+    source = folder / "10-double-utm.ply"
+    refused = run(["sdf-bake", source, "-o", out / "field"])
+    assert refused.code == 4
+    assert "has steps of 0.5 m there and would move them by 0.2" in refused.text
+    assert "'splatctrl export" in refused.text
+    for suffix, bound, is_kept in ((".ply", 1e-6, True), (".glb", 1e-6, True), (".spz", 2e-4, False)):
+        file = out / f"moved{suffix}"
+        result = run(["export", source, "-o", file])
+        assert "centres are less the origin 500000 5400000 300 m" in result.text
+        assert ("not kept: origin" in result.text) is not is_kept
+        found = exported(run, source, out / f"again{suffix}")
+        assert 0 < found["differences"]["center"] <= bound
+        baked(run, file, out / f"field{suffix}")
+    assert "origin" in run(["info", out / "moved.ply"]).text
+    moved = read_positions(out / "moved.ply") + np.array([500000, 5400000, 300])
+    assert np.abs(moved - read_positions(source)).max() < 1e-6
+
+
+def _siblings_of_double(folder: Path) -> None:
+    write_ply(folder / "small.ply", plane_rows((0.123456789, 1.0, 2.0)))
+    write_ply(folder / "float.ply", plane_rows(UTM, "f4"))
+    write_ply(folder / "text.ply", plane_rows(UTM), "=")
+    text = (folder / "text.ply").read_text().replace("property double", "property float")
+    (folder / "text_float.ply").write_text(text)
+    write_ply(folder / "big.ply", plane_rows(UTM, scale_1=-3.0), ">")
+
+
+def _examine_siblings_of_double(folder: Path, out: Path, run: Run) -> None:
+    found = exported(run, folder / "small.ply", out / "small.ply")
+    assert found["origin"] is None
+    assert 1e-9 < found["differences"]["center"] < 1.3e-7
+    baked(run, folder / "small.ply", out / "field")
+    for command in ("export", "sdf-bake"):
+        refused = run([command, folder / "float.ply", "-o", out / f"{command}.ply"])
+        assert refused.code == 4
+        assert (
+            "rounded to float32, whose steps of 0.5 m there are larger than the splats (sigma 0.02 m)" in refused.text
+        )
+    for name in ("text.ply", "text_float.ply", "big.ply"):
+        assert exported(run, folder / name, out / name)["origin"] == "500000 5400000 300"
+
+
+def _linear(folder: Path) -> None:
+    write_ply(folder / "11-linear-scale.ply", plane_rows(scale_0=0.02, scale_1=0.02, scale_2=0.02))
+
+
+LINEAR = "expected log(sigma [m]), got 0.02 to 0.02: splats of 1.02 m, 0.05"
+
+
+def _examine_linear(folder: Path, out: Path, run: Run) -> None:
+    source = folder / "11-linear-scale.ply"
+    for command in ("export", "sdf-bake"):
+        refused = run([command, source, "-o", out / f"{command}.ply"])
+        assert refused.code == 4
+        assert LINEAR in refused.text
+        assert "the scales look like sigmas: write their logarithms" in refused.text
+
+
+def _siblings_of_linear(folder: Path) -> None:
+    flat: dict[str, Any] = {"scale_1": None, "scale_2": None}
+    bare: dict[str, Any] = {**flat, "rot_0": None, "rot_1": None, "rot_2": None, "rot_3": None}
+    write_ply(folder / "alone_linear.ply", plane_rows(scale_0=0.02, **flat))
+    write_ply(folder / "alone.ply", plane_rows(**bare))
+    write_ply(folder / "two.ply", plane_rows(scale_2=None))  # type: ignore[arg-type]
+    write_ply(folder / "zero.ply", plane_rows(scale_0=0.02, scale_1=0.01, scale_2=0.0))
+    write_ply(folder / "other_unit.ply", plane_rows(**dict.fromkeys(("scale_0", "scale_1", "scale_2"), 3.0)))
+    write_ply(folder / "millimetres.ply", _in_millimetres())
+    none: dict[str, Any] = dict.fromkeys(("scale_0", "scale_1", "scale_2"))
+    write_ply(folder / "sigma.ply", plane_rows(**none, **dict.fromkeys(("sigma_0", "sigma_1", "sigma_2"), 0.02)))
+
+
+def _in_millimetres() -> NDArray[Any]:
+    rows = plane_rows(**dict.fromkeys(("scale_0", "scale_1", "scale_2"), float(np.log(20.0))))
+    for axis in "xyz":
+        rows[axis] *= 1000
+    return rows
+
+
+def _examine_siblings_of_linear(folder: Path, out: Path, run: Run) -> None:
+    sentences = {
+        "alone_linear.ply": "splats of 1.02 m, 0.05",
+        "zero.ply": "got 0 to 0.02",
+        "other_unit.ply": "write scales and centres in one unit",
+        "two.ply": "the flat splats of 2D-GS have no third sigma",
+        "sigma.ply": "write them by these names: scale_* is log(sigma [m])",
+    }
+    for name, sentence in sentences.items():
+        for command in ("export", "sdf-bake"):
+            refused = run([command, folder / name, "-o", out / f"{command}.ply"])
+            assert refused.code == 4, name
+            assert sentence in refused.text, refused.text
+    for name in ("alone.ply", "millimetres.ply"):
+        assert exported(run, folder / name, out / name)["num_splats"] == SIDE * SIDE
+    baked(run, folder / "alone.ply", out / "field")
+
+
+def _points() -> NDArray[Any]:
+    kinds = [*((axis, "f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue", "alpha"))]
+    rows = np.zeros(SIDE * SIDE, kinds)
+    for axis in "xyz":
+        rows[axis] = plane_rows()[axis]
+    rows["red"] = 255
+    return rows
+
+
+def _empty_faces(folder: Path) -> None:
+    write_ply(folder / "11-face0.ply", plane_rows(place="f4"), after=EMPTY_FACES)
+    write_ply(folder / "11-face0-ascii.ply", plane_rows(place="f4"), "=", after=EMPTY_FACES)
+    write_ply(folder / "11-points-face0.ply", _points(), after=EMPTY_FACES)
+
+
+def _examine_empty_faces(folder: Path, out: Path, run: Run) -> None:
+    for name in ("11-face0.ply", "11-face0-ascii.ply"):
+        assert exported(run, folder / name, out / name)["num_splats"] == SIDE * SIDE
+        baked(run, folder / name, out / f"field {name}")
+    points = read_points(folder / "11-points-face0.ply")
+    assert len(points.points) == SIDE * SIDE
+    assert np.array_equal(points.points, read_positions(folder / "11-face0.ply").astype(np.float32))
+
+
+def _faces(folder: Path) -> None:
+    for order, name in (("<", "little"), (">", "big"), ("=", "text")):
+        rows, faces = plane_rows(place="f4"), face_bytes("<" if order == "=" else order)
+        write_ply(folder / f"before {name}.ply", rows, order, before=faces)
+        write_ply(folder / f"after {name}.ply", rows, order, after=faces)
+        write_ply(folder / f"points {name}.ply", _points(), order, before=faces, after=EMPTY_FACES)
+    whole = (folder / "after little.ply").read_bytes()
+    (folder / "cut.ply").write_bytes(whole[:-3])
+    (folder / "long.ply").write_bytes(whole + b"123")
+
+
+def _examine_faces(folder: Path, out: Path, run: Run) -> None:
+    wanted = plane_rows(place="f4")
+    for name in ("little", "big", "text"):
+        for place in ("before", "after"):
+            file = folder / f"{place} {name}.ply"
+            assert exported(run, file, out / file.name)["num_splats"] == SIDE * SIDE
+            assert np.array_equal(read_positions(out / file.name)[:, 2].astype(np.float32), wanted["z"])
+        assert np.array_equal(read_positions(folder / f"points {name}.ply")[:, 0].astype(np.float32), wanted["x"])
+    for name, sentence in (("cut.ply", "cut short"), ("long.ply", "longer than its header says")):
+        refused = run(["export", folder / name, "-o", out / name])
+        assert refused.code == 4
+        assert sentence in refused.text
+
+
+CASES: tuple[Case, ...] = (
+    Case(name="08-ply-double-utm", make=_double, examine=_examine_double, has_shared=True),
+    Case(name="ply-double-and-float-coordinates", make=_siblings_of_double, examine=_examine_siblings_of_double),
+    Case(name="33-ply-linear-scales", make=_linear, examine=_examine_linear, has_shared=True),
+    Case(name="ply-scales-of-other-kinds", make=_siblings_of_linear, examine=_examine_siblings_of_linear),
+    Case(name="19-ply-empty-face-element", make=_empty_faces, examine=_examine_empty_faces, has_shared=True),
+    Case(name="ply-faces-before-and-after", make=_faces, examine=_examine_faces),
+)

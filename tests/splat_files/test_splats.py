@@ -188,7 +188,7 @@ GOOD: list[object] = [0, 0, 0, 0, 0, 0, 0, -4, -4, -4]
 @pytest.mark.parametrize(
     ("names", "rows", "message"),
     [
-        (MINIMAL[:6], [[0] * 6], r"missing properties opacity scale_0 scale_1 scale_2 \(it has x y z f_dc_0"),
+        (MINIMAL[:6], [[0] * 6], r"missing properties opacity scale_0 \(it has x y z f_dc_0"),
         (MINIMAL, [GOOD, *[[*GOOD[:9], -6]] * 2], r"expected isotropic splats .* got 2 of 3 whose scales differ"),
         (MINIMAL, [GOOD, ["nan", *GOOD[1:]]], "splat 1: x: expected a finite number, got nan"),
         (MINIMAL, [GOOD, [*GOOD[:8], "nan", -4]], "splat 1: scale_1: expected a finite number, got nan"),
