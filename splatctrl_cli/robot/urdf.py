@@ -161,8 +161,8 @@ def _moves(joint: Joint, movable: Collection[str] | None) -> bool:
 def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
     """The URDF at `path`, or the `text` that is called so, once it is known to be one robot with a movable joint.
 
-    Raises InputError for a file that is missing or no URDF, several root links, a joint without the limits it needs,
-    or no movable joint (which is what an unexpanded xacro looks like).
+    Raises InputError for a file that is missing or no URDF, several root links, a joint without the limits it needs
+    or with an axis of zeros, or no movable joint (which is what an unexpanded xacro looks like).
     """
     text, root = _parse(path, _read(path) if text is None else text)
     links = tuple(_attribute(path, element, "name") for element in root.findall("link"))
@@ -255,6 +255,12 @@ def _joint(path: Path, joint: Any) -> Joint:
     kind = _attribute(path, joint, "type")
     if kind in LIMITED:
         _check_limits(where, kind, joint.find("limit"))
+    axis, child = joint.find("axis"), joint.find("child").get("link")
+    if kind in MOVABLE and axis is not None and not np.linalg.norm(_numbers(f"{where}: axis", axis.get("xyz"), 3)):
+        raise InputError(
+            f"{where}: axis: expected a direction, got {axis.get('xyz')!r}: link '{child}' would never move",
+            remedy='write <axis xyz="..."/> as in the robot\'s own URDF, or type="fixed" where it does not move',
+        )
     mimic = joint.find("mimic")
     follows = None
     if mimic is not None:
@@ -266,7 +272,7 @@ def _joint(path: Path, joint: Any) -> Joint:
         name=str(joint.get("name")),
         kind=kind,
         parent=joint.find("parent").get("link"),
-        child=joint.find("child").get("link"),
+        child=child,
         T_parent_child=_origin(where, joint.find("origin")),
         mimic=follows,
     )
