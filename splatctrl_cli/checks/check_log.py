@@ -16,7 +16,7 @@ from splatctrl_cli.checks.check_times import (
     peer_findings,
     time_findings,
 )
-from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, warning
+from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, note, warning
 from splatctrl_cli.checks.log_pass import LogWatch, checked_camera, image_motion, ready
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.errors import InputError
@@ -30,7 +30,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.calibrated import correction_of
 
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
-SAID = (" are never closer than ", " images as ", "distortion model ")  # lacks that other findings name
+SAID = (" are never closer than ", " images as ", "distortion model ", " says rectified")  # other findings name them
 
 
 def check_log(
@@ -44,6 +44,7 @@ def check_log(
     watch = LogWatch(log, options, num_images)
     found = survey(watch, by_log_time=options.stamps == "log")
     findings = damage_findings(log.path.name, found.damage.notes)
+    findings += [note("remark", log.path.name, text, value=num) for text, num in found.damage.remarks.items()]
     findings += file_findings(watch.spans)
     cameras = _chosen(log, found, options)
     rig = [(topics, ready(log, found, topics, options)) for topics in cameras]

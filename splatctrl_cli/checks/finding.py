@@ -45,6 +45,7 @@ _TABLE = """
 # code | severities | commands that an error blocks | meaning | what to do, where a finding does not say
 damaged | warning |  | a part of the file cannot be read; the rest is judged | copy the file again; if it stays,
     look at what wrote these messages
+remark | note |  | what is no damage: messages of a form that is not read, or how something was read
 loss | note |  | topics and frames that the source leaves out
 missing | error | all | what `ingest` needs is not there, or cannot be joined (depth, CameraInfo, tf)
 refused | error | all | the capture or folder cannot be read as described

@@ -9,8 +9,11 @@ one with a single bad page. Tables as rosbag2_storage_sqlite3 creates them: topi
 message_definitions.
 """
 
+import shutil
 import sqlite3
 import struct
+import tempfile
+import weakref
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -21,6 +24,7 @@ from splatctrl_cli.containers.foxglove import standing_in
 from splatctrl_cli.containers.mcap_log import ros_type_name
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.spilled_rows import scratch_folder
 from splatctrl_cli.files.unpacking import MAX_BLOCK, PIECE, BadBlockError, Budget, unpacked_start
 from splatctrl_cli.records import SECOND_NS
 
@@ -267,23 +271,55 @@ class Bag1Log:
 
 
 _WIDEST_HOLE = 1 << 40
+_WAL = b"\2\2"  # format versions of a database that keeps what is new in a journal, "-wal"
+_FILE_FORMAT = slice(18, 20)  # of its header (sqlite.org/fileformat2.html)
 
 
 class Db3Log:
-    """One .db3 file. Raises InputError where its tables are not those of a bag, or cannot be read at all."""
+    """One .db3 file, with what its journal ("-wal") holds where its recorder was stopped before it closed the bag.
+
+    SQLite writes while it reads a journal: file and journal are copied first. Raises InputError where its tables are
+    not those of a bag, or cannot be read at all.
+    """
 
     container = "ROS 2 bag (sqlite3)"
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.files = (path,)
+        self.path = self._database = path
+        self._journal, self._num_pages = path.with_name(f"{path.name}-wal"), 0
+        has_journal = self._journal.is_file() and self._journal.stat().st_size > 0
+        self.files = (path, self._journal) if has_journal else (path,)
         try:
+            if has_journal:
+                self._merge()
             with closing(self._opened()) as database:
                 self._topics = _topics(database)
         except (sqlite3.Error, ValueError) as error:
+            remedy = "try 'ros2 bag reindex', or copy it again"
+            with path.open("rb") as stream:
+                is_in_parts = stream.read(_FILE_FORMAT.stop)[_FILE_FORMAT] == _WAL
+            if is_in_parts and not has_journal:
+                error = ValueError(f"{error}, and {self._journal.name} is not beside it")
+                remedy = f"copy {self._journal.name} from where the bag was recorded: a stopped recorder leaves it"
+            raise InputError(f"{path}: not a readable {self.container}: {error}", remedy=remedy) from None
+
+    def _merge(self) -> None:
+        """Bring the journal into a copy of the file. Raises InputError where there is no room for one."""
+        folder = Path(tempfile.mkdtemp(prefix="splatctrl-", dir=scratch_folder()))
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        try:
+            self._database = Path(shutil.copyfile(self.path, folder / self.path.name))
+            shutil.copyfile(self._journal, folder / self._journal.name)
+        except OSError as error:
             raise InputError(
-                f"{path}: not a readable {self.container}: {error}", remedy="try 'ros2 bag reindex', or copy it again"
+                f"{self.path}: cannot be copied to {folder.parent} to read {self._journal.name}: {error.strerror}",
+                remedy="set TMPDIR to a folder with room for both files",
             ) from None
+        try:
+            with closing(sqlite3.connect(self._database)) as database:
+                self._num_pages = database.execute("PRAGMA wal_checkpoint").fetchone()[1]
+        except sqlite3.Error:
+            self._database = self.path  # what is whole of it is read without its journal
 
     def topics(self) -> tuple[Topic, ...]:
         """The topics table."""
@@ -291,9 +327,12 @@ class Db3Log:
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in the order they were written; rows on damaged pages are passed over and counted."""
-        journal = self.path.with_name(self.path.name + "-wal")
-        if journal.is_file() and journal.stat().st_size > 0:
-            damage.add(f"{journal.name}: holds messages that are not in the bag yet; it was not closed")
+        if self._num_pages > 0:
+            damage.remark(
+                f"{self.path.name}: was not closed; {self._num_pages} pages of {self._journal.name} were read"
+            )
+        elif len(self.files) > 1:
+            damage.add(f"{self._journal.name}: holds no page that can be read; the bag was not closed")
         with closing(self._opened()) as database:
             for topic_id, log_time_ns, data in self._rows(database, damage):
                 topic = self._topics.get(topic_id)
@@ -321,7 +360,7 @@ class Db3Log:
             return
 
     def _opened(self) -> sqlite3.Connection:
-        database = sqlite3.connect(f"file:{quote(str(self.path.absolute()))}?mode=ro&immutable=1", uri=True)
+        database = sqlite3.connect(f"file:{quote(str(self._database.absolute()))}?mode=ro&immutable=1", uri=True)
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BLOCK)
         database.execute("PRAGMA trusted_schema = OFF")
         database.execute("PRAGMA writable_schema = ON")  # else sqlite refuses a file that is shorter than it says

@@ -10,6 +10,7 @@ import weakref
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +130,7 @@ class SessionLog(JoinedLog):
 
 
 def open_raw_log(path: Path) -> RawLog:
-    """The log at `path`: .mcap, .bag, .db3 or a ROS 2 bag folder.
+    """The log at `path`: .mcap, .bag, .db3 or a ROS 2 bag folder; messages that are zstd frames are unpacked.
 
     Raises InputError where it is none of these, or cannot be read at all.
     """
@@ -141,7 +142,8 @@ def open_raw_log(path: Path) -> RawLog:
         magic = stream.read(16)
     kind = next((kind for kind in CONTAINERS if magic.startswith(kind.magic)), None)
     if kind is not None:
-        return kind.open(path)
+        log = kind.open(path)
+        return UnpackedMessagesLog(log) if _begins_compressed(log) else log
     if magic.startswith(_ZSTD):
         return _open_compressed(path)
     if path.suffix in SUFFIXES:
@@ -175,9 +177,7 @@ def _open_folder(path: Path) -> RawLog:
     parts = tuple(open_raw_log(file) for file in files)
     kind = "mcap" if ".mcap" in files[0].suffixes else "sqlite3"
     container = f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})"
-    log = JoinedLog(path, parts, container, note=note)
-    is_by_message = mode == "message" or (not told and _begins_compressed(parts))
-    return UnpackedMessagesLog(log) if is_by_message else log
+    return JoinedLog(path, parts, container, note=note)
 
 
 def told_formats(path: Path) -> set[str]:
@@ -191,10 +191,10 @@ def told_formats(path: Path) -> set[str]:
         return set()
 
 
-def _begins_compressed(parts: tuple[RawLog, ...]) -> bool:
-    """Whether the first message is a zstd frame: CDR begins with its own four bytes, of which the first is 0."""
-    first = next((message for part in parts for message in part.messages(Damage())), None)
-    return first is not None and first.data.startswith(_ZSTD)
+def _begins_compressed(log: RawLog) -> bool:
+    """Whether one of the first messages, of which some may be damaged, is a zstd frame: CDR begins with a 0."""
+    first = () if isinstance(log, Bag1Log) else islice(log.messages(Damage()), 5)
+    return any(message.topic.encoding == "cdr" and message.data.startswith(_ZSTD) for message in first)
 
 
 def _open_compressed(path: Path) -> RawLog:

@@ -1,5 +1,6 @@
 """Recorded messages as bytes, in the order of the file, whatever the container; damage is counted, not raised."""
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,10 +44,13 @@ class RawMessage:
 
 @dataclass(kw_only=True)
 class Damage:
-    """What one pass over a log could not read."""
+    """What one pass over a log could not read; remarks: how often something was met that is no damage, as messages of
+    a form that is not read.
+    """
 
     count: int = 0
     notes: list[str] = field(default_factory=list)
+    remarks: Counter[str] = field(default_factory=Counter)
     _num_unsaid: int = 0
 
     def add(self, note: str, num: int = 1) -> None:
@@ -57,6 +61,16 @@ class Damage:
         else:
             self._num_unsaid += num
             self.notes[MAX_NOTES:] = [f"and {self._num_unsaid} more"]
+
+    def remark(self, text: str) -> None:
+        """Count what is no damage; behind MAX_NOTES remarks, new ones share one."""
+        is_room = text in self.remarks or len(self.remarks) < MAX_NOTES
+        self.remarks[text if is_room else "more of this kind"] += 1
+
+    @property
+    def all_notes(self) -> list[str]:
+        """Damage, then each remark with how often it was met."""
+        return [*self.notes, *(text if num == 1 else f"{text} ({num} times)" for text, num in self.remarks.items())]
 
 
 class RawLog(Protocol):

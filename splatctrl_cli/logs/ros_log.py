@@ -56,7 +56,7 @@ class RosLogSource:
         _check_not_empty(log, found)
         self._rig = _rig(log, found, options)
         self._tf = found.tf
-        self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.notes, *found.tf.notes])
+        self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.all_notes, *found.tf.notes])
         self.cameras = tuple(camera.name for camera in self._rig)
         self._loss.notes.extend(still_note(camera.name) for camera in self._rig if camera.fixed_pose is not None)
         self.world_frame = self._rig[0].world_frame
@@ -75,7 +75,7 @@ class RosLogSource:
             loss,
             damaged=loss.damaged + most.damage.count,
             invalid_depth=most.num_invalid,
-            notes=[*loss.notes, *most.damage.notes],
+            notes=[*loss.notes, *most.damage.all_notes],
         )
 
     def records(self) -> Iterator[Record]:

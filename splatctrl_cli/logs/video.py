@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.containers.foreign import AZURE_KINECT, refuse_foreign
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.errors import InputError
@@ -192,6 +193,7 @@ _TIME = re.compile("time|stamp", re.IGNORECASE)
 
 def open_log(path: Path) -> RawLog:
     """A log, or a video file with its stamps beside it. Raises InputError."""
+    refuse_foreign(path)
     return VideoFileLog(path) if path.suffix.lower() in SUFFIXES else with_video(open_raw_log(path))
 
 
@@ -206,14 +208,15 @@ class VideoFileLog:
     container = "video"
 
     def __init__(self, path: Path) -> None:
-        self._av = of_extra(LIBRARY, EXTRA, "video files")
         self.path = path
         beside = next((file for form in _BESIDE if (file := path.with_name(form.format(path.stem))).is_file()), None)
         if beside is None:
             raise InputError(
                 f"{path}: no stamps beside it",
-                remedy=f"write {path.stem}.csv, a line for each image: its time in seconds",
+                remedy=f"write {path.stem}.csv, a line for each image: its time in seconds"
+                + (f"; if an Azure Kinect recorded it, {AZURE_KINECT}" if path.suffix.lower() == ".mkv" else ""),
             )
+        self._av = of_extra(LIBRARY, EXTRA, "video files")
         self.files = (path, beside)
         self._stamps = _read_stamps(beside)
         self._topic = Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)

@@ -11,6 +11,7 @@ from splatctrl_cli.captures.capture import CaptureSource, robot_description_of
 from splatctrl_cli.captures.capture_header import is_capture, read_capture_header
 from splatctrl_cli.captures.capture_writer import check_not_partial
 from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.containers.foreign import refuse_foreign
 from splatctrl_cli.containers.log_formats import CONTAINERS, SUFFIXES, SessionLog, is_bag_folder, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import ImageFolderSource, RigFolderSource, open_image_folder
@@ -123,7 +124,11 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
         return _describe_images(path, open_image_folder(path, options), "image folder")
     if (layout := layout_of(path)) is not None:
         return _describe_images(path, open_layout(path, options), layout.name)
-    return describe_file(path)
+    try:
+        return describe_file(path)
+    except InputError:
+        refuse_foreign(path)
+        raise
 
 
 def describe_log(log: RawLog, options: SourceOptions) -> Summary:
@@ -152,7 +157,7 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
         rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
         grids.append(Grid(name="cameras", header=("camera", "color", "depth", "camera_info"), rows=rows))
     lacks = missing(log, found, options) if found.num_messages else ["the log holds no messages"]
-    notes = [*sampling, *found.damage.notes, *found.tf.notes]
+    notes = [*sampling, *found.damage.all_notes, *found.tf.notes]
     return Summary(
         path=str(log.path),
         kind=log.container,
@@ -206,6 +211,7 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     names = {name for name in _KNOWN_FILES if (path / name).is_file()}
     is_dtu = all((path / name).is_dir() for name in ("Cameras", "Rectified"))
     if not ("run.json" in names or "splats.ply" in names or is_dtu):
+        refuse_foreign(path)
         inside = readable_in(path)
         if not inside and (found := bare_images(path)):
             raise InputError(f"{path}: {found}", remedy=BARE_REMEDY)

@@ -15,12 +15,19 @@ from splatctrl_cli.containers.bag_logs import Db3Log
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.raw_log import Damage, RawMessage
 from splatctrl_cli.errors import InputError
+from tests.cases.container_cases import kill_recorder
 from tests.logs.make_log import STORE, T
 
 
-def make_bag(folder: Path, num: int = 400, mode: CompressionMode = CompressionMode.NONE, version: int = 9) -> Path:
+def make_bag(
+    folder: Path,
+    num: int = 400,
+    mode: CompressionMode = CompressionMode.NONE,
+    version: int = 9,
+    plugin: StoragePlugin = StoragePlugin.SQLITE3,
+) -> Path:
     """Texts of 700 bytes on one topic, message i at time i + 1."""
-    writer = Writer(folder, version=version, storage_plugin=StoragePlugin.SQLITE3)
+    writer = Writer(folder, version=version, storage_plugin=plugin)
     if mode != CompressionMode.NONE:
         writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
@@ -109,12 +116,74 @@ def test_a_cut_file_gives_the_rows_before_the_cut(tmp_path: Path) -> None:
     assert damage.count >= 1
 
 
-def test_a_bag_that_was_not_closed_says_so(tmp_path: Path) -> None:
+def test_a_journal_of_nonsense_is_damage_and_the_bag_is_read_without(tmp_path: Path) -> None:
     file = make_bag(tmp_path / "bag", num=3) / "bag.db3"
     file.with_name("bag.db3-wal").write_bytes(b"rows")
     found, damage = read(file)
     assert len(found) == 3
-    assert damage.notes == ["bag.db3-wal: holds messages that are not in the bag yet; it was not closed"]
+    assert damage.notes == ["bag.db3-wal: holds no page that can be read; the bag was not closed"]
+
+
+def make_killed(folder: Path, num: int = 40, closed: int = 0) -> Path:
+    """A bag whose recorder was killed: all but the first `closed` messages are in its journal alone."""
+    killed = folder / "killed" / "bag.db3"
+    kill_recorder(make_bag(folder / "whole", num=num) / "whole.db3", killed, closed)
+    return killed
+
+
+@pytest.mark.parametrize("closed", [0, 13])
+def test_what_a_killed_recorder_left_in_its_journal_is_read_and_nothing_is_written(
+    tmp_path: Path, closed: int
+) -> None:
+    file = make_killed(tmp_path, closed=closed)
+    before = {path.name: path.read_bytes() for path in file.parent.iterdir()}
+    file.parent.chmod(0o500)
+    try:
+        found, damage = read(file)
+    finally:
+        file.parent.chmod(0o700)
+    assert [m.log_time_ns for m in found] == list(range(1, 41))
+    assert damage.count == 0
+    assert "was not closed" in damage.all_notes[0]
+    assert "pages of bag.db3-wal were read" in damage.all_notes[0]
+    assert {path.name: path.read_bytes() for path in file.parent.iterdir()} == before
+
+
+def test_a_journal_that_ends_inside_a_page_gives_what_was_committed_before(tmp_path: Path) -> None:
+    file = make_killed(tmp_path, closed=13)
+    journal = file.with_name("bag.db3-wal")
+    journal.write_bytes(journal.read_bytes()[: 32 + 2 * 4120 + 100])
+    found, damage = read(file)
+    assert [m.log_time_ns for m in found] == list(range(1, 14))
+    assert "bag.db3-wal" in damage.all_notes[0]
+
+
+def test_a_missing_journal_is_named_where_the_bag_is_empty_without_it(tmp_path: Path) -> None:
+    file = make_killed(tmp_path)
+    file.with_name("bag.db3-wal").unlink()
+    with pytest.raises(InputError, match=r"bag\.db3-wal is not beside it") as caught:
+        read(file)
+    assert caught.value.remedy.startswith("copy bag.db3-wal from where the bag was recorded")
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+def test_the_file_alone_of_a_bag_with_compressed_messages_gives_what_its_folder_gives(
+    tmp_path: Path, plugin: StoragePlugin
+) -> None:
+    plain, _ = read(make_bag(tmp_path / "plain", num=9))
+    bag = make_bag(tmp_path / "packed", num=9, mode=CompressionMode.MESSAGE, plugin=plugin)
+    file = next(path for path in bag.iterdir() if path.suffix in {".db3", ".mcap"})
+    alone, damage = read(file)
+    assert [m.data for m in alone] == [m.data for m in read(bag)[0]] == [m.data for m in plain]
+    assert damage.all_notes == []
+
+
+def test_the_compressed_file_alone_of_a_bag_gives_what_its_folder_gives(tmp_path: Path) -> None:
+    bag = make_bag(tmp_path / "packed", num=9, mode=CompressionMode.FILE)
+    alone, damage = read(next(bag.glob("*.zstd")))
+    assert [m.data for m in alone] == [m.data for m in read(bag)[0]]
+    assert len(alone) == 9
+    assert damage.all_notes == []
 
 
 def test_a_view_in_the_place_of_a_table_is_refused(tmp_path: Path) -> None:
