@@ -10,12 +10,17 @@ from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.config.fixed import TF_GAP_NS
 from splatctrl_cli.logs.decoder import CAMERA_INFO
-from splatctrl_cli.logs.registration import DISTORTION_MODELS, NUM_COEFFICIENTS, SAME_MODELS
-from splatctrl_cli.logs.rig import Camera, intrinsics_of, nearest_gap_ns
-from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
+from splatctrl_cli.logs.registration import DISTORTION_MODELS, is_distorted, lens_model
+from splatctrl_cli.logs.rig import Camera, ImageLens, image_lens, intrinsics_of, nearest_gap_ns
+from splatctrl_cli.logs.source_options import NUM_COEFFICIENTS, CameraTopics, SourceOptions
 from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey, pair_by_stamp
 from splatctrl_cli.records import Float64, Intrinsics
 
+_DONE = {
+    ImageLens.DISTORTED: "undistorts",
+    ImageLens.RECTIFIED: "takes P for the rectified",
+    ImageLens.CONTRADICTED: "refuses",
+}
 NUM_DISTORTION = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 
 
@@ -55,7 +60,6 @@ def lens_findings(where: str, lens: Intrinsics, source: str = "") -> list[Findin
 def calibration_findings(found: Survey, cameras: Sequence[CameraTopics], changed: dict[str, int]) -> list[Finding]:
     """CameraInfo topics of the log; `changed`: stamps at which one first differs from its first message."""
     findings: list[Finding] = []
-    used = {name for camera in cameras for name in (camera.info, camera.depth_info)}
     for entry in found.of_type(CAMERA_INFO):
         name, calibration = entry.topic.name, entry.calibration
         if calibration is None:
@@ -65,17 +69,21 @@ def calibration_findings(found: Survey, cameras: Sequence[CameraTopics], changed
         if name in changed:
             text = "the CameraInfo changes within the log; the first is used for all frames"
             findings.append(warning("camera-info-changes", name, text, stamp_ns=changed[name]))
-        if name in used:
-            findings += _distortion(name, calibration)
+    for topic, info in dict.fromkeys((c.color, c.info) for c in cameras if c.info) | dict.fromkeys(
+        (c.depth, c.depth_info) for c in cameras if c.depth_info
+    ):
+        its = found.topics[info].calibration
+        findings += [] if its is None else _distortion(info, its, topic, image_lens(found, topic, its))
     for camera in cameras:
         findings += _sizes(found, camera)
         findings += _rivals(found, camera)
     return findings
 
 
-def _distortion(name: str, calibration: Calibration) -> list[Finding]:
-    d, model = calibration.distortion, SAME_MODELS.get(calibration.distortion_model, calibration.distortion_model)
-    if not np.any(np.abs(d) > 1e-9):
+def _distortion(name: str, calibration: Calibration, topic: str, lens: ImageLens) -> list[Finding]:
+    """What is done about the distortion of a topic's images."""
+    d, model = calibration.distortion, lens_model(calibration.distortion_model)
+    if not is_distorted(model, d):
         return []
     if model not in DISTORTION_MODELS:
         remedy = f"rectify the images first; known: {', '.join(DISTORTION_MODELS)}"
@@ -83,10 +91,17 @@ def _distortion(name: str, calibration: Calibration) -> list[Finding]:
     if len(d) not in NUM_DISTORTION[model]:
         expected = " or ".join(map(str, NUM_DISTORTION[model]))
         text = f"{model} with {len(d)} coefficients, expected {expected}"
-        make = warning if len(d) in NUM_COEFFICIENTS else error
+        is_read = len(d) in NUM_COEFFICIENTS if model != "equidistant" else len(d) > 4 and not np.any(d[4:])
+        make = warning if is_read else error
         return [make("distortion", name, text, "calibrate again", value=len(d))]
-    figures = ", ".join(f"{v:.4g}" for v in d[:5])
-    return [note("distortion", name, f"{model} ({figures}): ingest undistorts the images")]
+    done = f"{model} ({', '.join(f'{v:.4g}' for v in d[:5])}): ingest {_DONE[lens]} {topic}"
+    if lens is ImageLens.DISTORTED and topic.endswith("rect_raw"):
+        remedy = "give --intrinsics NAME=FX,FY,CX,CY if the images are rectified"
+        return [warning("distortion", name, f"{done}, whose name says rectified", remedy)]
+    if lens is ImageLens.CONTRADICTED:
+        remedy = "give --intrinsics NAME=FX,FY,CX,CY if the images are rectified, with D1,D2,... behind it if not"
+        return [error("distortion", name, f"{done}, whose name says rectified", remedy)]
+    return [note("distortion", name, done)]
 
 
 def _sizes(found: Survey, camera: CameraTopics) -> list[Finding]:
@@ -216,7 +231,7 @@ def _lens(found: Survey, topics: CameraTopics, options: SourceOptions) -> list[F
     where, image = f"camera {topics.name}", found.topics[topics.color].first_image
     given = options.intrinsics.get(topics.name)
     if given is not None and image is not None:
-        fx, fy, cx, cy = given
+        fx, fy, cx, cy = given[:4]
         lens = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=image.width, height=image.height)
         return lens_findings(where, lens, "--intrinsics")
     found_by: list[Finding] = []

@@ -15,7 +15,7 @@ from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, shown
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.gates import gate
-from splatctrl_cli.logs.source_options import CameraTopics, PoseTopic, SourceOptions
+from splatctrl_cli.logs.source_options import NUM_COEFFICIENTS, CameraTopics, PoseTopic, SourceOptions
 
 T = TypeVar("T")
 
@@ -149,8 +149,9 @@ def _pose_topic(text: str) -> tuple[str, PoseTopic]:
 def _intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
     name, _, rest = text.partition("=")
     values = several(rest)
-    if not name or len(values) != 4 or not min(values[:2]) > 0:
-        raise UsageError(f"--intrinsics {text}: expected NAME=FX,FY,CX,CY in pixels")
+    if not name or len(values) - 4 not in (0, *NUM_COEFFICIENTS) or not min(values[:2]) > 0:
+        counts = ", ".join(map(str, NUM_COEFFICIENTS))
+        raise UsageError(f"--intrinsics {text}: expected NAME=FX,FY,CX,CY in pixels, then 0, {counts} coefficients")
     return name, values
 
 
@@ -220,8 +221,8 @@ SOURCE = (  # the options of a source, all but --cameras in a group of their own
             " of FRAME's",
         ),
         option(
-            "--intrinsics NAME=FX,FY,CX,CY ...",
-            "of a camera [px], without distortion, instead of the recorded ones",
+            "--intrinsics NAME=FX,FY,CX,CY[,K1,K2,P1,P2...] ...",
+            "of a camera [px], and its distortion where it has one, instead of the recorded ones",
         ),
         option(
             "--human-topic NAME=TOPIC ...", "mono8 masks of a camera's colour images, not 0 where they show a person"

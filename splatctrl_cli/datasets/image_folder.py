@@ -20,7 +20,7 @@ from splatctrl_cli.files.arrays import DAMAGE, npy_of
 from splatctrl_cli.files.image_file import decode_file, read_pfm
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.logs.messages import measured, metres, num_invalid
-from splatctrl_cli.logs.registration import DepthToColor, Undistortion
+from splatctrl_cli.logs.registration import DepthToColor, Undistortion, undistortion_of
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import NO_STATES
 from splatctrl_cli.logs.stored_frame import StoredFrame, check_depth, decoded, human_mask, is_kept, is_png
@@ -214,16 +214,18 @@ class ImageFolderSource:
         table = view.lens
         if table.name not in self._lenses:
             undistortion, depth_camera = _undistortion(table), self._description.depth_camera
+            intrinsics = table.intrinsics if undistortion is None else undistortion.intrinsics
             registration = None
             if depth_camera is not None:
+                bent = _undistortion(depth_camera)
                 registration = DepthToColor(
-                    depth_intrinsics=depth_camera.intrinsics,
-                    color_intrinsics=table.intrinsics,
+                    depth_intrinsics=depth_camera.intrinsics if bent is None else bent.intrinsics,
+                    color_intrinsics=intrinsics,
                     T_color_depth=self._description.T_color_depth,
-                    undistortion=_undistortion(depth_camera),
+                    undistortion=bent,
                 )
             self._lenses[table.name] = _Lens(
-                intrinsics=table.intrinsics, undistortion=undistortion, registration=registration
+                intrinsics=intrinsics, undistortion=undistortion, registration=registration
             )
         return self._lenses[table.name]
 
@@ -289,9 +291,7 @@ def _is_float(encoding: str, path: ImageFile) -> bool:
 
 
 def _undistortion(camera: CameraTable) -> Undistortion | None:
-    if not np.any(camera.distortion):
-        return None
-    return Undistortion(camera.intrinsics, camera.distortion_model, np.array(camera.distortion, dtype=np.float64))
+    return undistortion_of(camera.intrinsics, camera.distortion_model, np.array(camera.distortion, np.float64))
 
 
 def _check_names(path: Path, lenses: set[str], options: SourceOptions) -> None:

@@ -173,7 +173,7 @@ def described(
 def given_lens(options: SourceOptions, image: ImageFile) -> CameraTable | None:
     """The lens that --intrinsics gives for camera ``camera``, of the size of `image`; None where it gives none."""
     values = options.intrinsics.get(CAMERA)
-    return None if values is None else pinhole(values, image)
+    return None if values is None else pinhole(values[:4], image, values[4:])
 
 
 def pinhole(values: Sequence[float], image: ImageFile, distortion: Sequence[float] = ()) -> CameraTable:

@@ -13,8 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ListedView, PosesTable
 from splatctrl_cli.datasets.layout import Layout, Lenses, image_size
 from splatctrl_cli.datasets.poses import read_nerfstudio
@@ -25,6 +23,12 @@ from splatctrl_cli.records import Float64
 FILES = ("transforms.json", "transforms_train.json")  # the second is Blender's of NeRF, which has no depth
 _RADIAL = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")  # nerfstudio's CAMERA_MODEL_TO_TYPE
 _MODELS = {**dict.fromkeys(_RADIAL, "plumb_bob"), "OPENCV_FISHEYE": "equidistant"}
+_ALL = ("k1", "k2", "p1", "p2", "k3", "k4")
+_COEFFICIENTS = {
+    **dict.fromkeys(_RADIAL[:2], ()),
+    **dict.fromkeys(_RADIAL[2:], _ALL[:5]),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
 SUPPLY = "add depth_file_path to each frame (16-bit PNG in mm, or .npy in m), or describe the files in a .toml"
 _DEPTHS = ("depth_file_path", "depth_path")
 _SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
@@ -115,18 +119,23 @@ def _image(path: Path) -> Path:
 
 def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
     """The lens of a frame."""
-    model = "OPENCV_FISHEYE" if said.get("is_fisheye") else str(said.get("camera_model", "OPENCV"))
+    model = str(said.get("camera_model") or ("OPENCV_FISHEYE" if said.get("is_fisheye") else "OPENCV"))
     if model not in _MODELS:
         raise InputError(
             f"{path}: camera_model: expected one of {', '.join(_MODELS)}, got {model!r}",
             remedy="undistort the images",
         )
-    keys = ("k1", "k2", "k3", "k4") if model == "OPENCV_FISHEYE" else ("k1", "k2", "p1", "p2", "k3")
+    if "is_fisheye" in said and bool(said["is_fisheye"]) != (model == "OPENCV_FISHEYE"):
+        raise InputError(
+            f"{path}: camera_model is {model}, but is_fisheye is {said['is_fisheye']}", remedy="correct one of them"
+        )
     try:
-        distortion = [float(said.get(key, 0.0)) for key in keys]
-        if "k4" not in keys and float(said.get("k4", 0.0)):
+        distortion = [float(said.get(key, 0.0)) for key in _COEFFICIENTS[model]]
+        further = sorted(key for key in _ALL if key not in _COEFFICIENTS[model] and float(said.get(key, 0.0)))
+        if further:
             raise InputError(
-                f"{path}: camera_model {model}: expected no k4, got {said['k4']}", remedy="undistort the images"
+                f"{path}: camera_model {model}: expected no {further[0]}, got {said[further[0]]}",
+                remedy="correct the model, or undistort the images",
             )
         width, height = (int(said["w"]), int(said["h"])) if {"w", "h"} <= said.keys() else image_size(image)
         fx = float(said["fl_x"]) if "fl_x" in said else width / 2 / math.tan(float(said["camera_angle_x"]) / 2)
@@ -138,7 +147,7 @@ def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
             cx=float(said.get("cx", width / 2)),
             cy=float(said.get("cy", height / 2)),
             pixel_center=0.5,  # nerfstudio's convention
-            distortion=distortion if np.any(distortion) else [],
+            distortion=distortion,
             distortion_model=_MODELS[model],
         )
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:

@@ -28,6 +28,7 @@ from splatctrl_cli.logs.decoder import (
     stamp_ns,
 )
 from splatctrl_cli.logs.messages import ImageMessage
+from splatctrl_cli.logs.registration import is_distorted, lens_model
 from splatctrl_cli.logs.source_options import CameraTopics, PoseTopic, SourceOptions
 from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.logs.video import EXTRA, KEY_FRAME, LIBRARY, OFTENER, is_video
@@ -114,7 +115,7 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
 
 
 def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info: str) -> bool:
-    """Whether depth pixels already lie on colour pixels: same size, same frame (or a name that says so), same K."""
+    """Whether depth pixels already lie on colour pixels: of one size, frame (or a name says so), K and distortion."""
     color_image, depth_image = survey.topics[color].first_image, survey.topics[depth].first_image
     if color_image is None or depth_image is None:
         return False
@@ -127,11 +128,19 @@ def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info:
         return False
     calibration = survey.topics[info].calibration if info else None
     depth_calibration = survey.topics[depth_info].calibration if depth_info else None
-    return (
-        calibration is None
-        or depth_calibration is None
-        or bool(abs(calibration.K - depth_calibration.K).max() <= 0.01 * calibration.K[0, 0])
-    )
+    if calibration is None or depth_calibration is None:
+        return True
+    is_same_K = bool(abs(calibration.K - depth_calibration.K).max() <= 0.01 * calibration.K[0, 0])
+    return is_same_K and _same_distortion(calibration, depth_calibration)
+
+
+def _same_distortion(one: Calibration, two: Calibration) -> bool:
+    """Whether two lenses bend alike, coefficients that are left out being 0."""
+    bent = [is_distorted(c.distortion_model, c.distortion) for c in (one, two)]
+    if not all(bent):
+        return not any(bent)
+    a, b = (np.pad(c.distortion, (0, 14))[:14] for c in (one, two))
+    return lens_model(one.distortion_model) == lens_model(two.distortion_model) and bool(np.allclose(a, b, atol=1e-6))
 
 
 def frame_of(survey: Survey, color: str, depth: str) -> str:

@@ -2,14 +2,22 @@
 without lens distortion. The tree takes 16 bytes of memory a sample.
 """
 
+import re
 from array import array
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from splatctrl_cli.config.fixed import FARTHEST_RAY, REGISTERED_SHARE, TF_GAP_NS, TF_STILL_POSITION, TF_STILL_ROTATION
+from splatctrl_cli.config.fixed import (
+    FARTHEST_RAY,
+    REGISTERED_SHARE,
+    TF_GAP_NS,
+    TF_STILL_POSITION,
+    TF_STILL_ROTATION,
+    WIDEST_RAY,
+)
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile
 from splatctrl_cli.geometry import (
@@ -19,6 +27,7 @@ from splatctrl_cli.geometry import (
     transform_from,
     transform_points,
 )
+from splatctrl_cli.logs.source_options import NUM_COEFFICIENTS
 from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
 
 
@@ -204,14 +213,29 @@ class TfTree:
 
 
 DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
-NUM_COEFFICIENTS = (4, 5, 8, 12, 14)  # that OpenCV takes
-SAME_MODELS = {  # what others call them
-    "Brown Conrady": "plumb_bob",
-    "radtan": "plumb_bob",
-    "Kannala Brandt4": "equidistant",
-    "kannala_brandt": "equidistant",
-    "fisheye": "equidistant",
+_SAME_MODELS = {  # lower case, letters and digits alone: what others call them
+    **dict.fromkeys(("plumbbob", "brownconrady", "radtan", "opencv"), "plumb_bob"),
+    **dict.fromkeys(("rationalpolynomial", "rational"), "rational_polynomial"),
+    **dict.fromkeys(("equidistant", "equi", "fisheye", "opencvfisheye"), "equidistant"),
+    **dict.fromkeys(("kannalabrandt", "kannalabrandt4"), "equidistant"),
 }
+_PINHOLES = ("", "none", "pinhole", "perspective", "rectilinear", "inversebrownconrady", "modifiedbrownconrady")
+"""Further models that bend nothing where all coefficients are zero."""
+
+
+def lens_model(name: str) -> str:
+    """Which of `DISTORTION_MODELS` a driver's name stands for; the name itself where it is none of them."""
+    return _SAME_MODELS.get(_letters(name), name)
+
+
+def is_distorted(model: str, coefficients: Float64) -> bool:
+    """False where a lens is a pinhole. An equidistant lens never is, nor one of a model that is not known."""
+    is_radial = lens_model(model) in DISTORTION_MODELS[:2] or _letters(model) in _PINHOLES
+    return not is_radial or bool(np.any(np.abs(coefficients) > 1e-9))
+
+
+def _letters(name: str) -> str:
+    return re.sub("[^a-z0-9]", "", name.lower())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,8 +294,9 @@ class Undistortion:
         R: Float64 | None = None,
     ) -> None:
         R = np.eye(3) if R is None else R
-        if len(coefficients) not in NUM_COEFFICIENTS:
-            expected = ", ".join(map(str, NUM_COEFFICIENTS))
+        counts = (4,) if model == "equidistant" else NUM_COEFFICIENTS
+        if len(coefficients) not in counts and not (len(coefficients) > 4 and not np.any(coefficients[4:])):
+            expected = ", ".join(map(str, counts))
             raise InputError(
                 f"distortion model {model}: expected {expected} coefficients, got {len(coefficients)}",
                 remedy="calibrate again, or fill up with zeros",
@@ -324,13 +349,44 @@ def _radii(result: Intrinsics, R: Float64) -> Float64:
 
 def _largest_radius(model: str, coefficients: Float64) -> float:
     """Up to which distance from the axis a lens's polynomial still grows: beyond, it would show things twice."""
+    r, bent = _bent(model, coefficients)
+    folds = np.flatnonzero(np.diff(bent) <= 0)
+    return float(r[folds[0]]) if folds.size else np.inf
+
+
+def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
+    """Distances from the axis at a depth of one, and where the lens shows them, both in focal lengths."""
     r = np.linspace(0.0, FARTHEST_RAY, 20001)
     k = np.zeros(8)
     k[: min(len(coefficients), 8)] = coefficients[:8]
     if model == "equidistant":
         a = np.arctan(r)
-        bent = a * (1 + k[0] * a**2 + k[1] * a**4 + k[2] * a**6 + k[3] * a**8)
-    else:
-        bent = r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6) / (1 + k[5] * r**2 + k[6] * r**4 + k[7] * r**6)
-    folds = np.flatnonzero(np.diff(bent) <= 0)
-    return float(r[folds[0]]) if folds.size else np.inf
+        return r, a * (1 + k[0] * a**2 + k[1] * a**4 + k[2] * a**6 + k[3] * a**8)
+    bent = r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6) / (1 + k[5] * r**2 + k[6] * r**4 + k[7] * r**6)
+    return r, np.asarray(bent)
+
+
+def undistortion_of(lens: Intrinsics, model: str, coefficients: Float64) -> Undistortion | None:
+    """What removes a lens's distortion, None for a pinhole. Raises InputError for a lens that cannot be.
+
+    The result has the lens's focal lengths. Of an equidistant lens they are shortened, so that the result shows what
+    lies on the image's axes, but nothing beyond `WIDEST_RAY`: that would leave the middle few pixels.
+    """
+    if not is_distorted(model, coefficients):
+        return None
+    model = lens_model(model)
+    if model not in DISTORTION_MODELS:
+        raise InputError(
+            f"distortion model {model!r} is unknown",
+            remedy="rectify the images first, or give --intrinsics NAME=FX,FY,CX,CY if they are;"
+            f" known models: {', '.join(DISTORTION_MODELS)}",
+        )
+    if model != "equidistant" or len(coefficients) < 4:
+        return Undistortion(lens, model, coefficients)
+    r, bent = _bent(model, coefficients)
+    edges = np.array([lens.cx / lens.fx, lens.cy / lens.fy])
+    edges = np.append(edges, [(lens.width - 1) / lens.fx - edges[0], (lens.height - 1) / lens.fy - edges[1]])
+    grows = slice(1 + int(np.argmax(bent)))
+    seen = np.minimum(np.maximum(np.interp(edges, bent[grows], r[grows]), 1e-9), WIDEST_RAY)
+    share = min(1.0, float((edges / seen).min()))
+    return Undistortion(replace(lens, fx=share * lens.fx, fy=share * lens.fy), model, coefficients, lens=lens)

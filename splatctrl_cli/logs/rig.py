@@ -1,8 +1,10 @@
 """The cameras of a log made ready: intrinsics, world frame, lens and depth registration, or why they cannot be."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from splatctrl_cli.logs.cameras import (
     find_cameras,
     find_info,
     frame_of,
+    image_topics,
     is_registered,
     join_pose_topics,
     listed,
@@ -21,10 +24,20 @@ from splatctrl_cli.logs.cameras import (
     pose_topics,
 )
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
-from splatctrl_cli.logs.registration import DISTORTION_MODELS, SAME_MODELS, DepthToColor, TfTree, Undistortion
+from splatctrl_cli.logs.registration import (
+    DISTORTION_MODELS,
+    DepthToColor,
+    TfTree,
+    Undistortion,
+    is_distorted,
+    lens_model,
+    undistortion_of,
+)
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.survey import Calibration, Survey
 from splatctrl_cli.records import Bool, Float64, Intrinsics
+
+_RECTIFIED = frozenset({"rect", "rectified", "undistorted"})  # words in the names of topics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,9 +150,9 @@ def intrinsics_of(calibration: Calibration) -> Intrinsics:
 def _rectified(calibration: Calibration) -> Calibration:
     """The camera of the rectified image: P where it is set, and no distortion; valid where the lens is known."""
     K = calibration.projection if calibration.projection[0, 0] > 0 else calibration.K
-    pinhole = replace(calibration, K=K, distortion=np.zeros(0))
-    model = SAME_MODELS.get(calibration.distortion_model, calibration.distortion_model)
-    if not _is_distorted(calibration) or model not in DISTORTION_MODELS:
+    pinhole = replace(calibration, K=K, distortion_model="plumb_bob", distortion=np.zeros(0))
+    model = lens_model(calibration.distortion_model)
+    if not is_distorted(model, calibration.distortion) or model not in DISTORTION_MODELS:
         return pinhole
     lens, R = intrinsics_of(calibration), calibration.rotation if np.any(calibration.rotation) else None
     with suppress(InputError):  # of a lens that cannot be, nothing says what it saw
@@ -148,8 +161,32 @@ def _rectified(calibration: Calibration) -> Calibration:
     return pinhole
 
 
-def _is_distorted(calibration: Calibration) -> bool:
-    return bool(np.any(np.abs(calibration.distortion) > 1e-9))
+class ImageLens(StrEnum):
+    """What images are like by their CameraInfo and the name of their topic."""
+
+    PINHOLE = "pinhole"
+    DISTORTED = "distorted"
+    RECTIFIED = "rectified"
+    CONTRADICTED = "contradicted"
+
+
+def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> ImageLens:
+    """Which of the two decides where a name says rectified and a CameraInfo has a distortion.
+
+    A CameraInfo may describe the rectified images beside the raw ones (image_proc): by a P that is not K, or a topic
+    of raw images in the same folder. RealSense's ``image_rect_raw`` is as the lens sees it. Depth is computed in
+    rectified images. Nothing else tells.
+    """
+    says_rectified = not _RECTIFIED.isdisjoint(re.split("[/_]", image_topic.lower()))
+    if not is_distorted(calibration.distortion_model, calibration.distortion):
+        return ImageLens.RECTIFIED if says_rectified else ImageLens.PINHOLE
+    if not says_rectified or image_topic.endswith("rect_raw"):
+        return ImageLens.DISTORTED
+    folder, P = image_topic.rpartition("/")[0], calibration.projection
+    has_raw = any(t.topic.name.startswith(f"{folder}/image_raw") for t in survey.of_type(IMAGE, COMPRESSED_IMAGE))
+    is_depth = any(t.topic.name == image_topic for t in image_topics(survey, "depth"))
+    is_own = P[0, 0] > 0 and not np.allclose(P, calibration.K, rtol=1e-3)
+    return ImageLens.RECTIFIED if has_raw or is_depth or is_own else ImageLens.CONTRADICTED
 
 
 class _Builder:
@@ -167,8 +204,8 @@ class _Builder:
         topics = self._topics
         self._check_clock()
         calibration = self._calibration(topics.info, topics.color)
-        intrinsics = intrinsics_of(calibration)
         undistortion = self._undistortion(calibration, topics.info)
+        intrinsics = intrinsics_of(calibration) if undistortion is None else undistortion.intrinsics
         fixed = self._options.camera_poses.get(topics.name)
         return Camera(
             name=topics.name,
@@ -245,13 +282,25 @@ class _Builder:
                 remedy="name the right CameraInfo with --camera",
             )
         sized = replace(calibration, width=size[0], height=size[1])
-        return _rectified(sized) if any(part.startswith("image_rect") for part in image_topic.split("/")) else sized
+        lens = image_lens(self._survey, image_topic, sized)
+        if lens is ImageLens.CONTRADICTED:
+            raise self._contradicted(sized, info, image_topic)
+        return _rectified(sized) if lens is ImageLens.RECTIFIED else sized
+
+    def _contradicted(self, calibration: Calibration, info: str, image_topic: str) -> InputError:
+        k = intrinsics_of(calibration)
+        pinhole = f"--intrinsics {self._topics.name}={k.fx:.9g},{k.fy:.9g},{k.cx:.9g},{k.cy:.9g}"
+        bent = ",".join(f"{value:.9g}" for value in calibration.distortion)
+        return InputError(
+            f"{self._where}: topic {image_topic} says rectified, but {info} has a distortion and no P of its own",
+            remedy=f"give {pinhole} if the images are rectified, {pinhole},{bent} if they are as the lens sees them",
+        )
 
     def _given(self, intrinsics: tuple[float, ...], image_topic: str) -> Calibration:
-        """What --intrinsics says, for images without distortion of the size that they are."""
+        """What --intrinsics says, for images of the size that they are."""
         image = self._survey.topics[image_topic].first_image
         assert image is not None
-        fx, fy, cx, cy = intrinsics
+        fx, fy, cx, cy, *distortion = intrinsics
         return Calibration(
             width=image.width,
             height=image.height,
@@ -259,7 +308,7 @@ class _Builder:
             projection=np.zeros((3, 3)),
             rotation=np.zeros((3, 3)),
             distortion_model="plumb_bob",
-            distortion=np.zeros(0),
+            distortion=np.array(distortion),
             frame_id=image.frame_id,
         )
 
@@ -301,16 +350,8 @@ class _Builder:
         return f", or NAME=TOPIC[@FRAME] of a pose topic ({listed(topics)})" if topics else ""
 
     def _undistortion(self, calibration: Calibration, info: str) -> Undistortion | None:
-        if not _is_distorted(calibration):
-            return None
-        model = SAME_MODELS.get(calibration.distortion_model, calibration.distortion_model)
-        if model not in DISTORTION_MODELS:
-            raise InputError(
-                f"{self._where}: {info}: distortion model {calibration.distortion_model!r} is unknown",
-                remedy=f"rectify the images first; known models: {', '.join(DISTORTION_MODELS)}",
-            )
         try:
-            return Undistortion(intrinsics_of(calibration), model, calibration.distortion)
+            return undistortion_of(intrinsics_of(calibration), calibration.distortion_model, calibration.distortion)
         except InputError as error:
             raise InputError(f"{self._where}: {info}: {error.message}", remedy=error.remedy) from None
 
@@ -327,6 +368,12 @@ class _Builder:
         calibration = self._calibration(topics.depth_info, topics.depth)
         frame = depth_image.frame_id
         T_color_depth = self._survey.realsense.T_between(topics.color, topics.depth)
+        if is_registered(self._survey, topics.color, topics.depth, topics.info, ""):  # but for the lens
+            T_color_depth = np.eye(4)
+            self._survey.tf.note(
+                f"camera {topics.name}: {topics.info} and {topics.depth_info} differ in distortion: colour and depth"
+                " are undistorted each by its own"
+            )
         if T_color_depth is None and frame == color_frame:
             raise InputError(
                 f"{what}: their CameraInfo differ but both say frame {frame!r}",
@@ -341,11 +388,12 @@ class _Builder:
                 f" frames tf knows: {listed(tf.frames)}",
                 remedy=f"record /tf_static, or {remedy}",
             )
+        undistortion = self._undistortion(calibration, topics.depth_info)
         return DepthToColor(
-            depth_intrinsics=intrinsics_of(calibration),
+            depth_intrinsics=intrinsics_of(calibration) if undistortion is None else undistortion.intrinsics,
             color_intrinsics=color,
             T_color_depth=T_color_depth,
-            undistortion=self._undistortion(calibration, topics.depth_info),
+            undistortion=undistortion,
         )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from splatctrl_cli.errors import InputError
 
 CALIBRATION = "--calibration "  # begins the name of a calibration among the files that were read
+NUM_COEFFICIENTS = (4, 5, 8, 12, 14)  # of a distortion, that OpenCV takes
 PERTURB = "--perturb "  # likewise, what was done to them
 
 
@@ -36,11 +37,11 @@ class SourceOptions:
     world_frame: frame of poses (default: the root of the tf tree). cameras: only these (default: all).
     camera_topics: topics by camera name, instead of those found. camera_poses: T_world_camera of fixed cameras as
     x, y, z, qx, qy, qz, qw, instead of those recorded. camera_pose_topics: topics of poses by camera name, where tf
-    has none. human_topics: image topics by camera name, not 0 where a
-    pixel shows a person. intrinsics: fx, fy, cx, cy [px] by camera name, instead of those recorded. depth_scale:
-    [m per count] of depth images. root: folder of an image folder's files. holdout: frames (index or name) of an
-    image folder that become camera `holdout`. stamps: ``header``, or ``log`` for the times of logging. calibration:
-    what `calibrate` wrote of the recording. perturb: what is done to its frames, by name (`sources.perturbed`).
+    has none. human_topics: image topics by camera name, not 0 where a pixel shows a person. intrinsics: fx, fy, cx,
+    cy [px] and the coefficients of a distortion by camera name, instead of those recorded. depth_scale: [m per count]
+    of depth images. root: folder of an image folder's files. holdout: frames (index or name) of an image folder that
+    become camera `holdout`. stamps: ``header``, or ``log`` for the times of logging. calibration: what `calibrate`
+    wrote of the recording. perturb: what is done to its frames, by name (`sources.perturbed`).
     """
 
     world_frame: str | None = None

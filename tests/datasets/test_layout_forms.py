@@ -288,7 +288,7 @@ def test_depth_of_nerfstudio_may_be_smaller_or_float(tmp_path: Path) -> None:
     ("changed", "model"),
     [
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.02, "k3": 0.03, "k4": 0.04}, "equidistant"),
-        ({"is_fisheye": True, "k1": 0.01, "k2": 0.02, "k3": 0.03, "k4": 0.04}, "equidistant"),
+        ({"camera_model": None, "is_fisheye": True, "k1": 0.01, "k2": 0.02, "k3": 0.03, "k4": 0.04}, "equidistant"),
         ({"camera_model": "SIMPLE_RADIAL", "k1": 0.01}, "plumb_bob"),
     ],
 )
