@@ -1,5 +1,6 @@
 """Foxglove's schemas as the ROS messages that they stand for, from JSON, their ROS twins, or protobuf, which is read
-by the FileDescriptorSet that a log carries, without generated code.
+by the FileDescriptorSet that a log carries, without generated code. And the RealSense SDK's texts: its .db3 holds
+intrinsics, extrinsics and depth units as std_msgs/String (librealsense, src/media/ros2/ros2_writer.cpp).
 
 Fields are those of docs.foxglove.dev ("Schemas"): in JSON times are {sec, nsec} and bytes base64, in protobuf times
 are google.protobuf.Timestamp.
@@ -7,6 +8,7 @@ are google.protobuf.Timestamp.
 
 import base64
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -21,6 +23,7 @@ from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
 from splatctrl_cli.containers.raw_log import Topic
+from splatctrl_cli.geometry import quat_from_rotation
 
 
 class MessageTypes:
@@ -71,6 +74,13 @@ DEFINITIONS = {  # for bags without any; foxglove/schemas, ros_foxglove_msgs/ros
     "foxglove_msgs/msg/FrameTransform": _TRANSFORM,
     "foxglove_msgs/msg/FrameTransforms": "foxglove_msgs/FrameTransform[] transforms\n",
 }
+TEXT = "std_msgs/msg/String"
+_SENSOR = r"/device_\d+/sensor_\d+"
+_TEXTS = {  # by the topic, what a text of the SDK stands for; metadata say the depth unit of one image
+    rf"{_SENSOR}/\w+_\d+/camera_info": "sensor_msgs/msg/CameraInfo",
+    rf"{_SENSOR}/\w+_\d+/tf/ref_\d+": "geometry_msgs/msg/Transform",
+    rf"{_SENSOR}/(option/Depth_Units/value|\w+_\d+/image/metadata)": "std_msgs/msg/Float32",
+}
 _PREFIXES = ("foxglove.", "foxglove_msgs/msg/", "foxglove_msgs/")
 
 
@@ -81,8 +91,10 @@ def stands_for(schema: str) -> str:
 
 
 def standing_in(topic: Topic) -> Topic:
-    """A topic of a ROS bag, with the type that its messages stand for where that is Foxglove's (foxglove_msgs)."""
-    ros_type = stands_for(topic.type_name)
+    """A topic of ROS messages, with the type that they stand for where they are foxglove_msgs or the SDK's texts."""
+    texts = _TEXTS if topic.type_name == TEXT else {}
+    said = next((kind for pattern, kind in texts.items() if re.fullmatch(pattern, topic.name)), "")
+    ros_type = said or stands_for(topic.type_name)
     return replace(topic, type_name=ros_type, schema=topic.type_name) if ros_type else topic
 
 
@@ -191,6 +203,23 @@ def _joint_states(message: Any) -> Any:
     )
 
 
+def _sdk_text(message: Any) -> Any:
+    """Raises KeyError or ValueError where a text of the SDK lacks a field."""
+    said = dict(part.split("=", 1) for part in message.data.split(";") if "=" in part)
+    values = {key: np.array(text.split(","), np.float64) for key, text in said.items() if key in _TEXT_FIELDS}
+    if "fx" in said:
+        fx, fy, cx, cy = (float(values[key][0]) for key in ("fx", "fy", "ppx", "ppy"))
+        size = SimpleNamespace(width=float(said["width"]), height=float(said["height"]))
+        lens = {"distortion_model": said["model"], "K": [fx, 0, cx, 0, fy, cy, 0, 0, 1], "D": values["coeffs"]}
+        return _calibration(SimpleNamespace(**vars(size), **lens))
+    if "rotation" in said:
+        x, y, z, w = quat_from_rotation(values["rotation"].reshape(3, 3).T)  # written by columns
+        t = dict(zip("xyz", values["translation"], strict=True))
+        return SimpleNamespace(translation=SimpleNamespace(**t), rotation=SimpleNamespace(x=x, y=y, z=z, w=w))
+    return SimpleNamespace(data=float(said.get("Depth Units", 0) if said else message.data))
+
+
+_TEXT_FIELDS = ("fx", "fy", "ppx", "ppy", "coeffs", "rotation", "translation")
 _READERS: dict[str, Callable[[Any], Any]] = {
     "CompressedImage": _compressed_image,
     "CompressedVideo": _compressed_image,
@@ -198,5 +227,6 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "CameraCalibration": _calibration,
     "FrameTransform": lambda message: SimpleNamespace(transforms=[_transform(message)]),
     "JointStates": _joint_states,
+    "String": _sdk_text,
     "FrameTransforms": lambda message: SimpleNamespace(transforms=[_transform(item) for item in message.transforms]),
 }

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatctrl_cli.containers.foxglove import stands_for
+from splatctrl_cli.containers.foxglove import standing_in, stands_for
 from splatctrl_cli.containers.mcap_file import McapFile
 from splatctrl_cli.containers.mcap_records import (
     CHANNEL,
@@ -258,7 +258,7 @@ def _topic(channel: Channel, schema: Schema | None) -> Topic:
         return Topic(name=channel.topic, type_name="", encoding=channel.message_encoding)
     is_ros, is_protobuf = schema.encoding in {"ros2msg", "ros2idl", "ros1msg"}, schema.encoding == "protobuf"
     type_name, ros_type = ros_type_name(schema.name) if is_ros else schema.name, stands_for(schema.name)
-    return Topic(
+    topic = Topic(
         name=channel.topic,
         type_name=ros_type or type_name,
         encoding=channel.message_encoding,
@@ -266,6 +266,7 @@ def _topic(channel: Channel, schema: Schema | None) -> Topic:
         definition_format={"ros2idl": "idl", "protobuf": "protobuf"}.get(schema.encoding, "msg"),
         schema=type_name if ros_type else "",
     )
+    return standing_in(topic) if is_ros else topic
 
 
 def ros_type_name(name: str) -> str:

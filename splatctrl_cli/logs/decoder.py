@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-from splatctrl_cli.containers.foxglove import DEFINITIONS, as_ros, read_foxglove
+from splatctrl_cli.containers.foxglove import DEFINITIONS, TEXT, as_ros, read_foxglove
 from splatctrl_cli.containers.raw_log import RawMessage, Topic
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform, transform_from
@@ -107,6 +107,8 @@ def header_stamp_ns(message: RawMessage) -> int:
     The stamp follows four bytes (CDR's encapsulation, or ROS 1's `seq`) as two 32-bit words. Foxglove's messages are
     decoded. Raises UndecodableMessageError for a message too short.
     """
+    if message.topic.schema == TEXT:
+        return message.log_time_ns
     if is_foxglove(message.topic):
         return stamp_ns(MessageDecoder().decode(message).header)
     start = 0 if message.topic.schema and message.topic.encoding == "ros1" else 4  # foxglove_msgs have no `seq`
@@ -211,7 +213,7 @@ def _check_definition(text: str) -> None:
 
 TRANSFORM, OPTION = "geometry_msgs/msg/Transform", "std_msgs/msg/Float32"
 _STREAM = re.compile(r"/(device_\d+)/(sensor_\d+)/([A-Za-z0-9]+_\d+)/")
-_EXTRINSICS = re.compile(r"(/device_\d+/sensor_\d+/[A-Za-z0-9]+_\d+)/tf/(\d+)")
+_EXTRINSICS = re.compile(r"(/device_\d+/sensor_\d+/[A-Za-z0-9]+_\d+)/tf/(?:ref_)?(\d+)")
 _FRAME_1, _AT = b"\x01\x00\x00\x001", 12  # a header's frame behind its number and stamp: its length, then its text
 _DEPTH_UNITS = re.compile(r"(/device_\d+/sensor_\d+)/option/Depth[ _]Units/value")
 
@@ -238,14 +240,18 @@ class RealSense:
             self.extrinsics.setdefault(extrinsics[1], {})[extrinsics[2]] = transform_from(position, quat_xyzw)
         elif units:
             self.depth_units[units[1]] = _unit(message.data, topic)
+        elif topic.endswith("/image/metadata") and message.data:
+            self._say(topic, message.data)
 
     def add_image(self, message: RawMessage) -> None:
         """Take the depth unit of an image that says one. Raises ValueError for nonsense."""
-        topic = message.topic.name
         if has_unit(message) and (value := struct.unpack("<f", message.data[-4:])[0]):
-            units, unit = self.image_units.setdefault(_stream(topic), []), _unit(value, topic)
-            if unit not in units:
-                units.append(unit)
+            self._say(message.topic.name, value)
+
+    def _say(self, topic: str, value: float) -> None:
+        units, unit = self.image_units.setdefault(_stream(topic), []), _unit(value, topic)
+        if unit not in units:
+            units.append(unit)
 
     def T_between(self, to_topic: str, from_topic: str) -> Float64 | None:
         """T_to_from (4, 4) of the streams of two image topics; None where no group holds both."""
