@@ -1,6 +1,7 @@
 """The exact distance to a triangle mesh, in float64."""
 
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from splatctrl_cli.kernels.triangles import TriangleTree
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Bool, Float64, Index
 
+STL_HEADER, STL_FACE = 84, 50  # bytes; the header ends with the number of faces
 NEXT, OPPOSITE = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
@@ -20,11 +22,13 @@ class TriangleMesh:
     """vertices (V, 3) float64 [m]; faces (F, 3) int64, counter-clockwise seen from outside.
 
     is_closed: every edge has two faces that run through it in opposite directions, so that there is an inside.
+    note: what of its file was ignored, in words.
     """
 
     vertices: Float64
     faces: Index
     is_closed: bool
+    note: str = ""
 
     @property
     def corners(self) -> Float64:
@@ -42,14 +46,17 @@ def load_mesh(path: Path) -> TriangleMesh:
     """The mesh in a file that trimesh reads (OBJ, STL, PLY, OFF, GLB, COLLADA), all its parts as one.
 
     Vertices at the same place become one, whatever their texture and normal: a seam of a texture is not a hole.
-    COLLADA is scaled by the file's unit; its up axis is ignored, as RViz does.
+    COLLADA is scaled by the file's unit; its up axis is ignored, as RViz does. What follows the faces of a binary STL
+    is ignored, with a note.
     Raises InputError where the file cannot be read, or holds no triangle or a coordinate that is not finite.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected a mesh, got no such file")
+    kind = path.suffix.lower()
+    source, note = _opened(path) if kind in {".stl", ".obj", ".off"} else (path, "")
     try:
-        loaded = trimesh.load(path, force="mesh", process=False)
-        scale = _collada_unit(path) if path.suffix.lower() == ".dae" else 1.0
+        loaded = trimesh.load(source, file_type=kind[1:], force="mesh", process=False)
+        scale = _collada_unit(path) if kind == ".dae" else 1.0
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         raise InputError(
             f"{path}: expected a mesh, got {type(error).__name__}: {error}",
@@ -65,7 +72,32 @@ def load_mesh(path: Path) -> TriangleMesh:
         vertices=scale * np.array(loaded.vertices, dtype=np.float64),
         faces=np.array(loaded.faces, dtype=np.int64),
         is_closed=bool(loaded.is_watertight and loaded.is_winding_consistent),
+        note=note,
     )
+
+
+def _opened(path: Path) -> tuple[BytesIO | Path, str]:
+    """A binary STL less what follows its faces, whatever its header begins with, and how much that is; a text, other
+    than in UTF-8 without the letters that are not.
+    """
+    content = path.read_bytes()
+    num = int.from_bytes(content[STL_HEADER - 4 : STL_HEADER], "little")
+    end = STL_HEADER + STL_FACE * num  # of a text: gigabytes
+    if path.suffix.lower() == ".stl" and len(content) >= STL_HEADER:
+        if end <= len(content):
+            rest = len(content) - end
+            words = f"{path.name}: {rest} bytes after its {num} faces are ignored" if rest else ""
+            return BytesIO(content[:end]), words
+        if b"facet" not in content.lower():
+            raise InputError(
+                f"{path}: expected {end} bytes for {num} faces, got {len(content)}",
+                remedy="copy or write the file again",
+            )
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        return BytesIO(content.decode("utf-8", "replace").encode()), ""
+    return path, ""
 
 
 def _collada_unit(path: Path) -> float:

@@ -1,15 +1,16 @@
 """What `robot` does, from requests to results: fit spheres, measure them, list self-collision pairs, show a robot."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
+from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons, parse_gate
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
 from splatctrl_cli.files.output import finite, output_path
@@ -32,6 +33,7 @@ from splatctrl_cli.robot.sphere_files import (
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
+DEFAULT_MARGIN = ControlConfig().margin  # [m] that a controller keeps: what is farther outside may touch all the same
 SCALES = {
     "max_deficit": ERROR,
     "uncovered_share": BAD_SHARE,
@@ -167,7 +169,8 @@ def fit_robot(request: RobotRequest, progress: Progress = SILENT) -> CoverageRes
     spheres = read_spheres(request.out)
     if request.picture is not None:
         _draw(request.picture, urdf, solids, spheres)
-    verdict = _verdict(report, "robot spheres", request.require)
+    allowed = max(DEFAULT_MARGIN, request.fit.max_deficit)
+    verdict = _verdict(report, urdf, solids, "robot spheres", request.require, allowed)
     return CoverageResult(report=report, verdict=verdict, spheres=request.out)
 
 
@@ -183,7 +186,7 @@ def check_robot(request: RobotRequest) -> CoverageResult:
         _draw(request.picture, urdf, solids, spheres)
     return CoverageResult(
         report=report,
-        verdict=_verdict(report, "robot check", request.require),
+        verdict=_verdict(report, urdf, solids, "robot check", request.require, DEFAULT_MARGIN),
         spheres=path,
         file=file,
         is_renamed=are_links_renamed(file.spheres, urdf),
@@ -232,8 +235,19 @@ def bare_links(report: CoverageReport) -> str:
     return f"no sphere stands for {bare}: nothing is said of these links" if bare else ""
 
 
-def _verdict(report: CoverageReport, command: str, require: Sequence[str]) -> Verdict:
-    """The verdict on a set of spheres: what they leave uncovered, links without any, and each ``--require``."""
+def _verdict(
+    report: CoverageReport,
+    urdf: UrdfFile,
+    solids: Mapping[str, tuple[Solid, ...]],
+    command: str,
+    require: Sequence[str],
+    allowed: float,
+) -> Verdict:
+    """The verdict on a set of spheres: what they leave uncovered, links without any, and each ``--require``.
+
+    A surface farther than `allowed` [m] outside fails, and a link that moves without a sphere; a gate on max_deficit
+    takes the place of that.
+    """
     num, bare = len(report.links), bare_links(report)
     counts = dict.fromkeys(METRICS, num) | dict.fromkeys(("max_protrusion", "num_stray_spheres"), report.num_spheres)
     covered = Reason(
@@ -241,16 +255,35 @@ def _verdict(report: CoverageReport, command: str, require: Sequence[str]) -> Ve
         outcome=Outcome.PASSED,
         sentence=coverage_summary(report),
         value=report.max_deficit,
+        threshold=allowed,
         unit="m",
         count=num,
     )
+    faults = _uncovered(report, urdf, allowed)
+    if faults and not any(parse_gate(requirement)[0] == "max_deficit" for requirement in require):
+        covered = replace(
+            covered,
+            outcome=Outcome.FAILED,
+            sentence=f"{', '.join(faults[:3])}{', ...' * (len(faults) > 3)}: {len(faults)} of {num} links, allowed"
+            f" {1e3 * allowed:g} mm",
+            remedy="fit a set with 'splatctrl robot spheres', or give --require 'max_deficit<=...' [m]",
+        )
+    ignored = dict.fromkeys(part.surface.note for parts in solids.values() for part in parts if part.surface.note)
     gates = gate_reasons(require, {name: of(report) for name, of in METRICS.items()}, counts)
     return verdict_of(
         command,
-        [covered, *([noted("coverage", bare)] if bare else []), *gates],
+        [covered, *([noted("coverage", bare)] if bare else []), *(noted("mesh", text) for text in ignored), *gates],
         scope=f"{report.num_spheres} spheres on {num} links",
         counts=counts,
     )
+
+
+def _uncovered(report: CoverageReport, urdf: UrdfFile, allowed: float) -> list[str]:
+    """The links whose surface is farther than `allowed` [m] outside, the worst first, and how far."""
+    bodies, root = urdf.rigid_bodies(), urdf.root
+    bare = [f"{link} moves and has no sphere" for link in report.bare_links if bodies[link][0] != root]
+    far = [(link.deficit.proven, link.link) for link in report.links if link.deficit is not None]
+    return bare + [f"{link} is up to {1e3 * far:.1f} mm outside" for far, link in sorted(far)[::-1] if far > allowed]
 
 
 def _lost_meshes(urdf: UrdfFile, packages: Sequence[Path]) -> tuple[str, ...]:

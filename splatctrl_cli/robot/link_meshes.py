@@ -18,7 +18,7 @@ from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
 
 MESH_LENGTHS = (0.001, 10.0)  # [m] of a link's mesh: beyond them its unit is another
 LINK_LENGTHS = (0.01, 3.0)  # [m] that a link has in its own unit
-UNITS = {"millimetres": 1e-3, "metres": 1.0}
+UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,14 +148,14 @@ def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
 
 
 def _unit_words(shape: MeshShape, length: float) -> str:
-    """The unit in which a mesh of `length` [m], as scaled, would be as long as links are; else what to correct."""
+    """The units in which a mesh of `length` [m], as scaled, would be as long as links are; else what to correct."""
     raw, signs = length / float(np.abs(shape.scale).max()), np.sign(shape.scale)
-    words = (
-        f'looks like {name}: scale="{" ".join(f"{unit * sign:g}" for sign in signs)}"'
+    words = [
+        f'{name}: scale="{" ".join(f"{unit * sign:g}" for sign in signs)}"'
         for name, unit in UNITS.items()
-        if LINK_LENGTHS[0] <= raw * unit <= LINK_LENGTHS[1]
-    )
-    return next(words, "correct its scale")
+        if LINK_LENGTHS[0] <= raw * unit < LINK_LENGTHS[1]
+    ]
+    return f"looks like {', or '.join(words)}" if words else "correct its scale"
 
 
 def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
@@ -181,7 +181,8 @@ def _taken_apart(mesh: TriangleMesh) -> list[TriangleMesh]:
     for part in [*parts, *([is_open] if is_open.any() else [])]:
         used, inverse = np.unique(mesh.faces[part], return_inverse=True)
         local = inverse.reshape(-1, 3).astype(np.int64)
-        pieces.append(TriangleMesh(vertices=mesh.vertices[used], faces=local, is_closed=_is_closed(local)))
+        is_closed = _is_closed(local)
+        pieces.append(replace(mesh, vertices=mesh.vertices[used], faces=local, is_closed=is_closed))
     return pieces
 
 

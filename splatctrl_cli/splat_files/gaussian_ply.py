@@ -152,7 +152,7 @@ def log_sigmas(ply: PlyFile) -> Float64:
         return logs
     centers = exact_centers(ply)
     some = centers[:: -(-len(centers) // SPARSEST_SAMPLE)]
-    spacing = float(np.median(cKDTree(centers).query(some, k=2)[0][:, 1]))
+    spacing = float(np.median(np.asarray(cKDTree(centers).query(some, k=2)[0])[:, 1]))
     if spacing > 0 and np.percentile(logs.mean(axis=1), 5) > np.log(SPARSEST * spacing):
         raise InputError(
             f"{ply.path}: scale_*: expected log(sigma [m]), got {logs.min():.3g} to {logs.max():.3g}: splats of"
