@@ -17,6 +17,7 @@ from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import publish
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.jobs.batches.batch import (
     BatchRequest,
     BatchResult,
@@ -196,7 +197,7 @@ def _lines(result: BatchResult, *, is_long: bool) -> Iterator[str]:
 def _cell(run: Run | None) -> str:
     if run is None:
         return "-"
-    word = run.label or run.state
+    word = (run.label or run.state) + damage_mark(run.sentence, run.exit_code)
     return word if run.state == DONE else f"{word.upper()} !" if run.state == FAILED else run.state.upper()
 
 

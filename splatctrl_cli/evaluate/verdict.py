@@ -21,6 +21,7 @@ class Outcome(StrEnum):
 
 EXIT_CODES = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.NOT_EVALUABLE: 5}
 DAMAGED = 3
+DAMAGE = "part of the recording is damaged and left out"
 SHORT = 80  # characters of a value that `brief` prints
 _WORST_FIRST = (Outcome.FAILED, Outcome.NOT_EVALUABLE, Outcome.PASSED)  # a definite failure outranks missing evidence
 
@@ -141,6 +142,7 @@ class Verdict:
     def sentence(self) -> str:
         """The verdict as one sentence."""
         scope = f" ({self.scope})" if self.scope else ""
+        scope = f", {DAMAGE}{scope}" if self.is_damaged else scope
         if not self.decisive:
             how = f", {self.how}" if self.how else ""
             return f"{self.command}: {self.label.upper()}{how}{scope}" + "".join(f"; {note}" for note in self.notes)
@@ -157,6 +159,7 @@ class Verdict:
             "sentence": self.sentence,
             "scope": self.scope,
             "exit_code": self.exit_code,
+            "is_damaged": self.is_damaged,
             "reasons": [_plain(reason) for reason in self.reasons],
             "notes": list(self.notes),
             "counts": dict(self.counts),
@@ -199,6 +202,11 @@ def verdict_of(
         is_damaged=is_damaged,
         counts=counts or {},
     )
+
+
+def damage_mark(sentence: str | None, exit_code: int | None) -> str:
+    """Say of a run in a table that its recording is damaged: a word after its label, or nothing."""
+    return ", damaged" if exit_code == DAMAGED or DAMAGE in (sentence or "") else ""
 
 
 def brief(result: Any) -> str:

@@ -145,5 +145,9 @@ def _verdict(report: CheckReport, fail_on: str) -> Verdict:
     ]
     counts = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in report.counts.items())
     return verdict_of(
-        "check", [read, *found], scope=f"{Path(report.path).name}: {counts}", counts={"messages": report.num_messages}
+        "check",
+        [read, *found],
+        scope=f"{Path(report.path).name}: {counts}",
+        is_damaged=any(finding.code == "damaged" for finding in report.findings),
+        counts={"messages": report.num_messages},
     )

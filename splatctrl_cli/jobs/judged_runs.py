@@ -19,6 +19,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate import field_accuracy, score_report
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.metrics import Better, Scale, Shown
+from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PARTIAL, output_path
 from splatctrl_cli.jobs import robot
 from splatctrl_cli.jobs.bakes import bake
@@ -184,7 +185,7 @@ def _judged_run(
         job=job,
         command=command,
         outcome=verdict["outcome"],
-        label=verdict["label"],
+        label=verdict["label"] + damage_mark(verdict.get("sentence"), verdict.get("exit_code")),
         is_green=verdict["outcome"] == "passed",
         metrics=_declared(command, metrics if isinstance(metrics, dict) else {}),
         settings=dict(_settings(document)),

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.errors import InputError, SplatCtrlError
+from splatctrl_cli.evaluate.verdict import DAMAGE
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.jobs.batches.graph import columns_of
 from splatctrl_cli.jobs.progress import SILENT, Progress
@@ -198,7 +199,8 @@ def _sentence(jobs: Sequence[_Job], unexpected: Sequence[_Job]) -> str:
     """How many jobs are as expected, and the first that is not."""
     count = len(jobs) - len(unexpected)
     if not unexpected:
-        return f"all {count} jobs as expected"
+        damaged = dict.fromkeys(job.node.recording for job in jobs if job.node.damage)
+        return f"all {count} jobs as expected" + (f"; {DAMAGE}: {', '.join(damaged)}" if damaged else "")
     node = unexpected[0].node
     said = node.sentence or node.cause or node.state
     return f"{len(unexpected)} of {len(jobs)} jobs not as expected; first {node.id}: {said}"
@@ -275,7 +277,7 @@ def _cell(node: Node | None, linked: set[str]) -> Cell:
         return Cell(text="-")
     state = node.outcome if node.state == AS_EXPECTED and node.outcome else node.state
     is_expected = node.state == AS_EXPECTED and node.outcome != PASSED
-    words = f"{node.label or node.state}{', as expected' if is_expected else ''}"
+    words = f"{node.label or node.state}{node.damage}{', as expected' if is_expected else ''}"
     return Cell(text=words, state="" if is_expected else state, link=node.id if node.id in linked else "")
 
 
@@ -287,7 +289,7 @@ def _list(title: str, jobs: Sequence[_Job], linked: set[str]) -> Table:
         least = None if job.least == math.inf else round(1e3 * job.least, 1)
         words = node.sentence or node.cause
         cost = (node.seconds or None, node.peak_mb or None)
-        cells = (name, node.label or node.state, node.expect, least, words, *cost)
+        cells = (name, f"{node.label or node.state}{node.damage}", node.expect, least, words, *cost)
         rows.append(Row(cells=cells, state=node.state))
     return Table(title=title, header=("job", "verdict", "expected", "least mm", "sentence", "s", "MB"), rows=rows)
 

@@ -12,6 +12,7 @@ from typing import Any, TextIO
 from xml.etree import ElementTree
 
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.verdict import DAMAGE, DAMAGED
 from splatctrl_cli.files.output import output_path
 
 
@@ -75,14 +76,21 @@ def cases_of(verdict: Mapping[str, Any], group: str, *, expected: str = "passed"
     for reason in verdict["reasons"]:
         by_criterion.setdefault(reason["criterion"], []).append(reason)
     cases = [_case(name, group, reasons) for name, reasons in by_criterion.items()]
+    damaged = [damage_case(group)] if verdict.get("is_damaged") else []
     if expected == "passed":
-        return cases
+        return [*cases, *damaged]
     outcome = verdict["outcome"]
     words = f"expected '{expected}', got '{outcome}'"
     kind = Kind.PASSED if outcome == expected else Kind.FAILED
     if kind is Kind.PASSED:
         cases = [replace(case, kind=kind, text=f"{case.kind}, as expected\n{case.text}") for case in cases]
-    return [Case(name="outcome", group=group, kind=kind, sentence=words, text=words), *cases]
+    return [Case(name="outcome", group=group, kind=kind, sentence=words, text=words), *cases, *damaged]
+
+
+def damage_case(group: str) -> Case:
+    """The case of a damaged recording: it says why the exit code is not 0 where everything else passed."""
+    text = f"{DAMAGE} (exit code {DAMAGED}); splatctrl check says which"
+    return Case(name="recording", group=group, kind=Kind.ERROR, sentence=text, text=text)
 
 
 def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[str] = ()) -> Case:
@@ -100,9 +108,8 @@ def skipped_case(group: str, why: str) -> Case:
 
 
 def notes_of(verdict: Mapping[str, Any]) -> list[str]:
-    """The sentence of a verdict, its notes, and that part of the input was lost."""
-    lost = ["part of the input was damaged and is left out (exit code 3)"] if verdict["exit_code"] == 3 else []
-    return [verdict["sentence"], *verdict["notes"], *lost]
+    """The sentence of a verdict, and its notes."""
+    return [verdict["sentence"], *verdict["notes"]]
 
 
 def worst_first(suites: Iterable[Suite]) -> list[tuple[Suite, Case]]:

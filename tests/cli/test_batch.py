@@ -9,6 +9,7 @@ from junitparser import JUnitXml
 
 from splatctrl_cli.cli.main import main
 from tests.conftest import ROOT
+from tests.logs.make_log import LogRecipe, make_log
 
 LOG = ROOT / "sample_data/tabletop/log.mcap"
 SUITE = f"""
@@ -107,6 +108,33 @@ def test_ci_is_told_a_suite_for_each_recording(tmp_path: Path, capsys: pytest.Ca
     assert found["good"]["good/ingest"].time > 0.0
     joined, _ = xunitparserx.parse(str(junit))
     assert joined.properties["batch"] == "two logs"
+
+
+@pytest.mark.parametrize(("expect", "code", "num_errors"), [("passed", 3, 2), ("exit 3", 0, 0)])
+def test_a_log_that_was_cut_is_named_in_the_table_the_sentence_the_page_and_junit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], expect: str, code: int, num_errors: int
+) -> None:
+    """Every job ends as expected, so nothing else would say why the exit code is 3."""
+    whole, suite, junit = make_log(tmp_path / "whole.mcap", LogRecipe(num_frames=20)), "suite.toml", "found.xml"
+    (tmp_path / "cut.mcap").write_bytes(whole.read_bytes()[: whole.stat().st_size // 3])
+    jobs = "".join(f"[jobs.{job}]\nexpect = '{expect}'\n" for job in ("check", "ingest"))
+    (tmp_path / suite).write_text(f"[[recordings]]\npaths = ['cut.mcap']\n{jobs}")
+    assert main(["batch", str(tmp_path / suite), "--junit", str(tmp_path / junit), "-q"]) == code
+    printed, _ = capsys.readouterr()
+    assert ("AS EXPECTED, part of the recording is damaged and left out (2 nodes" in printed) is (code == 3)
+    assert ("; damaged: cut" in printed) is (code == 3)
+    assert [line.split() for line in printed.splitlines() if line.startswith("cut")] == [
+        ["cut", "passed,", "damaged", "done,", "damaged"]
+    ]
+    cases = [case for each in JUnitXml.fromfile(str(tmp_path / junit)) for case in each]
+    errors = [case.result[0].message for case in cases if not case.is_passed]
+    assert errors == ["part of the recording is damaged and left out (exit code 3); splatctrl check says which"] * (
+        num_errors
+    )
+    assert main(["report", str(tmp_path / "suite.out"), "-o", str(tmp_path / "page.html")]) == 0
+    page = (tmp_path / "page.html").read_text()
+    assert "all 2 jobs as expected; part of the recording is damaged and left out: cut" in page
+    assert "passed, damaged" in page and "done, damaged" in page
 
 
 def test_what_a_page_reads_is_the_suite_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -56,6 +56,19 @@ def test_an_error_fails_unless_never(
     assert all("depth-scale" in result["commands"][name][-1] for name in CHECKS["depth-scale"].blocked)
 
 
+@pytest.mark.parametrize(("fail_on", "code"), [("error", 3), ("warning", 1), ("never", 0)])
+def test_a_log_that_was_cut_is_damaged_in_the_first_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fail_on: str, code: int
+) -> None:
+    log = make_log(tmp_path / "log.mcap", GOOD)
+    log.write_bytes(log.read_bytes()[: log.stat().st_size // 3])
+    found, printed, _ = run(capsys, "check", log, "--fail-on", fail_on)
+    assert found == code
+    first = printed.splitlines()[0]
+    assert ", part of the recording is damaged and left out (log.mcap: " in first
+    assert first.startswith("check: FAILED" if code == 1 else "check: PASSED")
+
+
 def test_cameras_whose_poses_disagree_are_an_error_with_millimetres(
     real_data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -179,6 +179,7 @@ def test_logs_that_do_not_fit_are_refused(desk: Desk, capsys: pytest.CaptureFixt
     assert "expected a stamp not before" in capsys.readouterr().err
     desk.source = FakeSource(states=logged(), loss=LossReport(damaged=2))
     assert desk.replay("--scene", scene, "-q") == 3
+    assert "SAFE, proven, part of the recording is damaged and left out (logged" in capsys.readouterr().out
 
 
 def test_fingers_that_the_log_does_not_move_are_locked_with_a_note(

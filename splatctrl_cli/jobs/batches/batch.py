@@ -11,7 +11,7 @@ from typing import Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
+from splatctrl_cli.evaluate.verdict import DAMAGED, Outcome, Reason, Verdict, damage_mark, verdict_of
 from splatctrl_cli.files.output import MARKERS, write_durably, write_json
 from splatctrl_cli.jobs.batches.graph import COMMANDS, CommandLine, Node, nodes_of, of_shard
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run, keys_of
@@ -33,7 +33,7 @@ from splatctrl_cli.jobs.batches.suite import read_suite
 from splatctrl_cli.jobs.batches.task import last_lines
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.libraries import distributed
-from splatctrl_cli.report.suites import Case, Kind, Suite, cases_of, error_case, skipped_case
+from splatctrl_cli.report.suites import Case, Kind, Suite, cases_of, damage_case, error_case, skipped_case
 
 CONNECT_S = 10.0  # to a scheduler
 FORMAT, VERSION = "splatctrl-batch", 1
@@ -128,13 +128,20 @@ def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node
 def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
     """A reason for each node: passed where it ended as expected."""
     num = len({run.recording for run in runs})
+    damaged = dict.fromkeys(run.recording for run in runs if _is_damaged(run))
     return verdict_of(
         "batch",
         [_reason(run) for run in runs],
         scope=f"{_counted(len(runs), 'node')} of {_counted(num, 'recording')}",
         passed="as expected",
-        is_damaged=any(run.exit_code == 3 and run.state == DONE for run in runs),
+        notes=[f"damaged: {', '.join(damaged)}"] if damaged else [],
+        is_damaged=bool(damaged),
     )
+
+
+def _is_damaged(run: Run) -> bool:
+    """Whether damage is to be said of a run: it ended as expected, and damage was not what was expected."""
+    return run.state == DONE and run.expect != f"exit {DAMAGED}" and bool(damage_mark(run.sentence, run.exit_code))
 
 
 def _counted(number: int, what: str) -> str:
@@ -181,9 +188,10 @@ def _cases_of(run: Run, out: Path) -> list[Case]:
     if run.state == FAILED:
         wrong = Case(name="expected", group=run.node, kind=Kind.FAILED, sentence=told(run), text=str(_reason(run)))
         return [wrong, *(cases_of(verdict, run.node) if verdict and run.outcome != Outcome.PASSED else [])]
-    if not verdict:
-        return [Case(name=run.command, group=run.node, kind=Kind.PASSED, text="" if run.outcome else told(run))]
-    return cases_of(verdict, run.node, expected=run.outcome)
+    if verdict:
+        return cases_of({**verdict, "is_damaged": _is_damaged(run)}, run.node, expected=run.outcome)
+    passed = Case(name=run.command, group=run.node, kind=Kind.PASSED, text="" if run.outcome else told(run))
+    return [passed, *([damage_case(run.node)] if _is_damaged(run) else [])]
 
 
 def write_batch(

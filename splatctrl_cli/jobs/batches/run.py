@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
+from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.jobs.batches.graph import Node
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run, keys_of
 from splatctrl_cli.jobs.batches.task import End, Task, last_lines, read_end, run_task, stamp_of, stop_runners
@@ -201,6 +202,7 @@ def _judged_again(run: Run, node: Node) -> Run:
 def told(run: Run) -> str:
     """A run in a few words."""
     what = run.cause or (run.label.upper() if run.outcome else run.label)
+    what += damage_mark(run.sentence, run.exit_code)
     if run.state == SKIPPED:
         return f"skipped: {run.cause}"
     odd = "" if run.state == DONE else f", expected {run.expect}" if run.state == FAILED else ", an error"

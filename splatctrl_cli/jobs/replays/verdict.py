@@ -50,6 +50,7 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
         passed=SAFE,
         how=_how(judged),
         notes=tuple(_notes(judged)),
+        is_damaged=bool(judged.inputs.source.loss.damaged),
         counts=counts,
     )
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PARTIAL, Parts, sha256
 from splatctrl_cli.records import Float64, Stamps
 
@@ -198,12 +199,18 @@ class Node:
     outcome: str | None = None
     label: str | None = None
     sentence: str | None = None
+    exit_code: int | None = None
     seconds: float | None = None
     peak_mb: float | None = None
     out: str = ""
     log: str = ""
     version: str | None = None
     cause: str | None = None
+
+    @property
+    def damage(self) -> str:
+        """The word of a damaged recording, or nothing."""
+        return damage_mark(self.sentence, self.exit_code)
 
     @property
     def column(self) -> str:
