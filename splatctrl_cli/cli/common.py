@@ -54,8 +54,8 @@ class Console:
         code: int | None = None,
         has_findings: bool = False,
     ) -> int:
-        """A verdict, its reasons and notes, then `result` or `lines`; the sentence goes to stderr too where the exit
-        code is not 0. Returns that: `code`, else the verdict's. has_findings: the lines say each reason themselves.
+        """A verdict, its reasons and notes, then `result` or `lines`; with --json the sentence goes to stderr where
+        the exit code is not 0. Returns that: `code`, else the verdict's. has_findings: the lines say each reason.
         """
         code = verdict.exit_code if code is None else code
         if self.is_json:
@@ -68,7 +68,7 @@ class Console:
                 print(f"  note: {reason}")
             print()
             self.result({}, lines)
-        if code:
+        if code and self.is_json:
             gates = [str(reason) for reason in verdict.decisive[1:] if reason.criterion.startswith("--require")]
             print("\n".join(f"splatctrl: {line}" for line in (verdict.sentence, *gates)), file=sys.stderr, flush=True)
         if self.reports is not None:

@@ -22,7 +22,7 @@ from splatctrl_cli.voxels import VoxelState
 
 ROUNDING = 1e-6  # [m] and of the lengths in it: what float32 may lose of an exact distance, as in a baked bound
 TITLES = (
-    *("x", "y", "z", "inside", "distance", "gradient_x", "gradient_y", "gradient_z", "bound", "probability"),
+    *("x", "y", "z", "in_box", "distance", "gradient_x", "gradient_y", "gradient_z", "bound", "probability"),
     *("label", "splat", "observed", "surface_x", "surface_y", "surface_z", "surface_rest"),
 )
 _LABELS = np.array([*(label.name.lower() for label in sorted(Label)), ""])  # the last for -1
@@ -35,13 +35,13 @@ _DECIMALS = 7  # of a length [m]: finer than float32
 class Answers:
     """Of Q points, world: None for what is not known of any point, NaN or -1 for what is not known of one.
 
-    inside (Q,): in the box that was asked; distance (Q,) [m] and its gradient (Q, 3); bound (Q,) [m]: the exact
+    in_box (Q,): in the box that was asked; distance (Q,) [m] and its gradient (Q, 3); bound (Q,) [m]: the exact
     distance to the splats is not less; probability (Q,) of collision; label (Q,) `Label` and splat (Q,), the index in
     the scene's file, of the nearest sphere; observed (Q,) `VoxelState`; surface (Q, 3) [m], where sphere marching
     ended, and rest (Q,) [m], what the field reads there.
     """
 
-    inside: Bool | None = None
+    in_box: Bool | None = None
     distance: Float64
     gradient: Float64
     bound: Float64 | None = None
@@ -98,7 +98,7 @@ class SceneAnswers:
         walked = march(self._field, self._exact, points, steps=MARCH_STEPS)
         size = self._reach + np.abs(points - self._spheres.points.anchor).max(axis=1)
         return Answers(
-            inside=None if self._workspace is None else self._workspace.contains(points),
+            in_box=None if self._workspace is None else self._workspace.contains(points),
             distance=distance,
             gradient=gradient,
             bound=self._exact.query(points)[0] - ROUNDING * (1.0 + size),
@@ -116,7 +116,7 @@ class SceneAnswers:
         probability = self._probability.at(points, of_grid.distance)
         return replace(
             mine,
-            inside=of_grid.inside,
+            in_box=of_grid.in_box,
             distance=of_grid.distance,
             gradient=of_grid.gradient,
             bound=of_grid.bound,
@@ -148,7 +148,7 @@ class GridAnswers:
         distance, gradient = self._field.query(points)
         probability = None if self._probability is None else self._probability.query(points)[0]
         return Answers(
-            inside=inside,
+            in_box=inside,
             distance=np.where(inside, distance, np.nan),
             gradient=np.where(inside[:, None], gradient, np.nan),
             bound=np.where(inside, self._field.certified(points), np.nan) if self._has_bound else None,
@@ -169,7 +169,7 @@ def rows_of(points: Float64, answers: Answers) -> str:
     splat = None if a.splat is None else np.where(a.splat < 0, "", a.splat.astype(str))
     columns: list[tuple[str, NDArray[np.generic] | None]] = [
         *(("%.9g", points[:, axis]) for axis in range(3)),
-        ("%d", a.inside),
+        ("%d", a.in_box),
         (length, a.distance),
         *(("%.6f", a.gradient[:, axis]) for axis in range(3)),
         (length, bound),

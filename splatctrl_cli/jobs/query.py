@@ -226,8 +226,8 @@ class _Figures:
         self._num["points"] += len(answers.distance)
         self._num["answered"] += len(distance)
         self._num["in_collision"] += int(np.count_nonzero(distance <= 0))
-        if answers.inside is not None:
-            self._num["outside"] += int(np.count_nonzero(~answers.inside))
+        if answers.in_box is not None:
+            self._num["outside"] += int(np.count_nonzero(~answers.in_box))
         if answers.observed is None:
             self._knows_seen = False
         else:

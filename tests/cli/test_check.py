@@ -40,9 +40,11 @@ def test_an_error_fails_unless_never(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], fail_on: str, code: int
 ) -> None:
     log = make_log(tmp_path / "log.mcap", replace(GOOD, depth_counts=1))
-    found, printed, _ = run(capsys, "check", log, "--fail-on", fail_on, "--json")
+    found, printed, said = run(capsys, "check", log, "--fail-on", fail_on, "--json")
     assert found == code
     result = json.loads(printed)
+    assert (said == result["verdict"]["sentence"].join(("splatctrl: ", "\n"))) is bool(code), "stdout has the object"
+    assert run(capsys, "check", log, "--fail-on", fail_on)[2] == "", "stdout has the sentence"
     assert (result["exit_code"], result["verdict"]["outcome"]) == (code, "failed")
     assert result["verdict"]["reasons"][0]["criterion"] == "depth-scale"
     assert result["counts"]["error"] == 1

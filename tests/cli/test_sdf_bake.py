@@ -73,7 +73,7 @@ def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
         "sdf-bake", splats, "-o", tmp_path / "field", "--voxel", 0.1, *COARSE, "--require", "num_splats>1000000"
     )
     assert result.returncode == 1
-    assert "num_splats is 600, required > 1e+06" in result.stderr
+    assert "num_splats is 600, required > 1e+06" in result.stdout
     assert (tmp_path / "field" / "field.npz").exists()
 
 

@@ -102,7 +102,7 @@ def test_a_grid_answers_within_its_box_and_leaves_the_rest_empty(scene: Path) ->
     grid = GridField(read_npz(field / "field.npz"))
     assert column(rows, "distance")[:4, 0] == pytest.approx(grid.query(POINTS[:4])[0], abs=1e-6)
     assert column(rows, "bound")[:4, 0] == pytest.approx(grid.certified(POINTS[:4]), abs=1e-6)
-    assert [row["inside"] for row in rows] == ["1"] * 4 + ["0"]
+    assert [row["in_box"] for row in rows] == ["1"] * 4 + ["0"]
     assert [rows[4][name] for name in TITLES[4:]] == [""] * 13
     assert rows[0]["observed"] == "free" and {row["splat"] + row["surface_x"] for row in rows} == {""}
     assert result.metrics["num_outside"] == 1 and "1 of 5 points lie outside the box" in result.notes[0]
@@ -114,7 +114,7 @@ def test_a_field_with_its_scene_has_the_distance_of_the_grid_and_the_rest_of_the
     _, of_grid = asked(field)
     _, of_scene = asked(scene)
     result, both = asked(field / "field.npz", scene=scene)
-    for name in ("inside", "distance", "gradient_x", "bound"):
+    for name in ("in_box", "distance", "gradient_x", "bound"):
         assert [row[name] for row in both] == [row[name] for row in of_grid]
     for name in ("label", "splat", "observed", "surface_x", "surface_rest"):
         assert [row[name] for row in both] == [row[name] for row in of_scene]
@@ -140,7 +140,7 @@ def test_blocks_change_no_answer(scene: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_a_bare_splat_file_knows_nothing_of_space(tmp_path: Path) -> None:
     write_ply(tmp_path / "splats.ply", splats_of(*BALLS), {})
     result, rows = asked(tmp_path / "splats.ply")
-    assert {row["observed"] + row["inside"] for row in rows} == {""}
+    assert {row["observed"] + row["in_box"] for row in rows} == {""}
     assert result.metrics["num_never_seen"] is None and result.notes == ()
 
 
