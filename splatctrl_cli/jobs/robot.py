@@ -272,8 +272,9 @@ def _verdict(
     gates = gate_reasons(require, {name: of(report) for name, of in METRICS.items()}, counts)
     return verdict_of(
         command,
-        [covered, *([noted("coverage", bare)] if bare else []), *(noted("mesh", text) for text in ignored), *gates],
+        [covered, *([noted("coverage", bare)] if bare else []), *gates],
         scope=f"{report.num_spheres} spheres on {num} links",
+        notes=ignored,
         counts=counts,
     )
 

@@ -122,7 +122,7 @@ URDF_SUFFIXES = (".urdf", ".xml")
 
 @dataclass(frozen=True, kw_only=True)
 class SphereFile:
-    """A sphere file: its layout ("YAML", "cuRobo YAML", "URDF"), its spheres, and how many more are switched off."""
+    """A sphere file: its layout (such as "cuRobo YAML"), its spheres, and how many more are switched off."""
 
     path: Path
     layout: str
@@ -136,15 +136,20 @@ def read_spheres(path: Path) -> SphereSet:
 
 
 def read_sphere_file(path: Path) -> SphereFile:
-    """The spheres of a YAML file (`collision_spheres` at the top or under robot_cfg.kinematics) or a URDF.
+    """The spheres of a YAML file or a URDF: `collision_spheres` at the top or under robot_cfg.kinematics, by link or
+    in Lula's list of links, or the groups of an XRDF.
 
     Raises InputError for a missing file, another layout, a number that is not finite, or no sphere at all.
     """
     if path.suffix.lower() in URDF_SUFFIXES:
         return SphereFile(path=path, layout="URDF", spheres=spheres_of(read_urdf(path)), num_off=0)
     tree = _yaml(path)
-    section = _section(tree)
+    is_xrdf = isinstance(tree, dict) and tree.get("format") == "xrdf"
+    section = _xrdf(path, tree) if is_xrdf else _section(tree)
     table = section.get("collision_spheres")
+    is_lula = isinstance(table, list) and all(isinstance(entry, dict) for entry in table)
+    if is_lula:
+        table = _joined(path, table)
     source = path
     if isinstance(table, str):
         source = path.parent / table
@@ -166,7 +171,7 @@ def read_sphere_file(path: Path) -> SphereFile:
     numbers = np.array([row for _, row in on], dtype=np.float64)
     return SphereFile(
         path=path,
-        layout="YAML" if section is tree else "cuRobo YAML",
+        layout="XRDF" if is_xrdf else "Lula YAML" if is_lula else "YAML" if section is tree else "cuRobo YAML",
         spheres=SphereSet(
             links=tuple(link for link, _ in on), centers=numbers[:, :3].copy(), radii=numbers[:, 3].copy()
         ),
@@ -201,6 +206,33 @@ def _section(tree: Any) -> dict[Any, Any]:
         if isinstance(tree, dict) and key in tree:
             tree = tree[key]
     return tree if isinstance(tree, dict) else {}
+
+
+def _joined(path: Path, entries: list[dict[Any, Any]]) -> dict[Any, Any]:
+    """A list of {link: spheres} as one table."""
+    table: dict[Any, Any] = {}
+    for entry in entries:
+        for link, spheres in entry.items():
+            table[link] = [*table.get(link, []), *_listed(path, link, spheres)]
+    return table
+
+
+def _xrdf(path: Path, tree: dict[Any, Any]) -> dict[Any, Any]:
+    """The group of spheres that an XRDF takes for collisions with the world, and what it adds to their radii."""
+    asked = tree.get("collision") or tree.get("world_collision")
+    collision, groups = (value if isinstance(value, dict) else {} for value in (asked, tree.get("geometry")))
+    name = collision.get("geometry", next(iter(groups), None) if len(groups) == 1 else None)
+    group = groups.get(str(name))
+    if not isinstance(group, dict) or "spheres" not in group:
+        known = ", ".join(map(str, groups)) or "none"
+        raise InputError(
+            f"{path}: XRDF: expected spheres in the group '{name}', got groups {known}",
+            remedy="name a group with spheres in collision: {geometry: NAME}",
+        )
+    return {
+        "collision_spheres": group["spheres"],
+        "collision_sphere_buffer": collision.get("buffer_distance") or 0.0,
+    }
 
 
 def _buffers(path: Path, buffer: Any, table: dict[Any, Any]) -> dict[str, float]:
