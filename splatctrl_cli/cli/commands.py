@@ -15,8 +15,8 @@ from splatctrl_cli.cli.options import (
     GATES,
     JUNIT,
     LOCK,
+    OF_FOLDERS,
     PACKAGES,
-    SOURCE,
     THREADS,
     output,
     seed,
@@ -149,7 +149,7 @@ _ROBOT_LEARN = (
         "--reach M", "how far outside of a link's visual surface its parts are looked for", real(0.01, 0.5, "m"), 0.06
     ),
     group("robot", BASE, LOCK),
-    *SOURCE,
+    *OF_FOLDERS,
 )
 _ROBOT_INFO = (*_robot("none, or those of the URDF"), LOCK)
 

@@ -5,6 +5,7 @@ import errno
 import io
 import json
 import os
+import shlex
 import stat
 import sys
 import time
@@ -20,6 +21,8 @@ from splatctrl_cli.errors import SplatCtrlError, UsageError
 from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
 from splatctrl_cli.report.suites import check_replaceable
 
+INTERRUPTED = 130  # exit code
+RESUME = "--resume"  # the option of what can be gone on with
 MAX_PIXELS = 1 << 27  # of an image file: twice the largest cameras; a small file can announce a thousand million
 
 _BY_THE_SHELL = ("/dev/stdin", "/dev/fd/", "/proc/self/fd/")  # as in --config <(...)
@@ -31,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; 6 where stdout was closed and there was something to print."""
     lost = _stand_in_for_closed_streams()
     code = _run(argv)
-    if lost.is_written and code not in {70, 130}:
+    if lost.is_written and code not in {70, INTERRUPTED}:
         print(
             "splatctrl: stdout: closed, so the result was not printed; files are as they should be", file=sys.stderr
         )
@@ -56,15 +59,18 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     except (Exception, KeyboardInterrupt) as error:
         is_json = "--json" in words and not hasattr(args, "is_printed")
-        line, code = _fail(error, is_json=is_json, is_verbose=args is not None and args.verbose > 0)
+        line, code = _fail(error, words, is_json=is_json, is_verbose=args is not None and args.verbose > 0)
         if judges(words):
             tell_of_failure(words, args, line, code, start)
         return code
 
 
-def _fail(error: BaseException, *, is_json: bool, is_verbose: bool) -> tuple[str, int]:
+def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbose: bool) -> tuple[str, int]:
     """Say an error in a line on stderr, with --json as an object on stdout; that line, and the exit code."""
     message, remedy, code = _told(error)
+    if code == INTERRUPTED and remedy.endswith(RESUME):
+        goes_on = shlex.join([words[0], RESUME, *(word for word in words[1:] if word != RESUME)])
+        remedy = f"continue it with: splatctrl {goes_on}"
     if is_verbose:
         traceback.print_exception(error)
     line = " ".join((f"{message}; {remedy}" if remedy else message).split())
@@ -84,7 +90,7 @@ def _told(error: BaseException) -> tuple[str, str, int]:
             return error.message, error.remedy, error.exit_code
         case KeyboardInterrupt():
             message, _, remedy = (str(error) or "interrupted").partition("; ")
-            return message, remedy, 130
+            return message, remedy, INTERRUPTED
         case OSError() if is_write_failure(error):
             return f"{error.filename or 'output'}: writing failed: {error.strerror or error}", "make room", 6
         case OSError():

@@ -190,11 +190,7 @@ COMMON = (  # which every command has
     ),
 )
 JUNIT = (  # which every command that judges has
-    of_run(
-        option(
-            "--junit FILE", "write the verdict as JUnit XML, a case for each criterion and gate (docs/ci.md)", Path
-        )
-    ),
+    option("--junit FILE", "write the verdict for CI as JUnit XML, a case for each criterion", Path),
 )
 THREADS = of_run(
     option("--threads THREADS", "threads, at most 16 or one per core (default: one per core)", whole(0, 1024))
@@ -210,6 +206,9 @@ DEVICE = of_run(
     )
 )
 GATES = option("--require METRIC>=VALUE ...", "fail (exit 1) unless it holds", gate)
+HOLDOUT = option(
+    "--holdout 0,6", "keep frames of an image folder for judging, as camera holdout", partial(_listed, "--holdout")
+)
 SOURCE = (  # the options of a source, all but --cameras in a group of their own
     option("--cameras A,B", "only these cameras", partial(_listed, "--cameras")),
     group(
@@ -238,11 +237,9 @@ SOURCE = (  # the options of a source, all but --cameras in a group of their own
         option("--stamps", "a log's times: those of the headers, or of logging", ("header", "log"), "header"),
         option("--joint-topic TOPIC", "JointState topic (default: /joint_states)"),
         option("--root DIR", "folder of the images that a .toml describes", Path),
-        option(
-            "--holdout 0,6", "frames of an image folder that become camera 'holdout'", partial(_listed, "--holdout")
-        ),
     ),
 )
+OF_FOLDERS = (SOURCE[0], HOLDOUT, SOURCE[1])  # likewise, of commands that read image folders
 SCAN = (  # the options of a DTU scan
     option("--scan NAME", "which scan of --dtu (default: the only one)"),
     option(

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from splatctrl_cli.cli.options import BASE, LOCK, PACKAGES, SEVERAL_LOGS, SOURCE, numbers, output, seed
+from splatctrl_cli.cli.options import BASE, LOCK, OF_FOLDERS, PACKAGES, SEVERAL_LOGS, numbers, output, seed
 from splatctrl_cli.cli.parser import group, option, real, whole
 
 QUICK = 30  # images of a topic
@@ -73,9 +73,9 @@ INGEST = (
     option("SOURCE", f"{FILES}, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+"),
     *output("capture folder", default="NAME.capture in this folder, NAME that of SOURCE"),
     option("--resume", "continue an interrupted run, if there is one, to the same bytes"),
-    *SOURCE,
+    *OF_FOLDERS,
 )
-INFO = (option("PATH", "file or folder", Path), *SOURCE)
+INFO = (option("PATH", "file or folder", Path), *OF_FOLDERS)
 CHECK = (
     option("SOURCE", f"{FILES}, capture, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+"),
     option("--fail-on", "exit with 1 where a finding is as bad as this", ("error", "warning", "never"), "error"),
@@ -93,7 +93,7 @@ CHECK = (
         BASE,
         LOCK,
     ),
-    *SOURCE,
+    *OF_FOLDERS,
 )
 CALIBRATE = (
     option("SOURCE", f"the recording to calibrate: {FILES}, capture, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+"),
@@ -112,7 +112,7 @@ CALIBRATE = (
         PACKAGES,
         LOCK,
     ),
-    *SOURCE,
+    *OF_FOLDERS,
 )
 CAPTURE_PACK = (option("CAPTURE", "capture folder", Path), *output("MCAP file", default="CAPTURE.mcap"))
 CAPTURE_UNPACK = (option("PACKED", "MCAP file", Path), *output("capture folder", default="PACKED.capture"))

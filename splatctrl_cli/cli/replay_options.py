@@ -10,6 +10,7 @@ from splatctrl_cli.cli.options import (
     DEVICE,
     DISAGREEMENT,
     GATES,
+    HOLDOUT,
     LOCK,
     PACKAGES,
     POSE,
@@ -53,10 +54,16 @@ REPLAY = (  # what people use, and in groups the rest
     option("--urdf FILE", "the robot's URDF (default: the log's own robot_description)", Path),
     option("--spheres FILE.yaml", "its spheres (default: the URDF's own)", Path),
     option("--mode", "what to replay", MODES, "audit"),
-    option(
-        "--start-time S", "start at this time of the log [s], or first-map: where the scene is first known", _start
-    ),
+    option("--start-time S", "start at this time of the log [s], or first-map: at the first map", _start),
     option("--truth FILE", "truth.json of a simulated log", Path),
+    option(
+        "--evidence CAMERA|K",
+        "bound the map's error by depth kept out of it: of this camera, or (--lockstep) of every K-th frame set",
+    ),
+    either(
+        option("--controller MODULE:CLASS", "judge a controller of your own: this Python class"),
+        option("--controller-command 'PROGRAM ARGS'", "or this program, by JSON on its stdin and stdout"),
+    ),
     *output("folder to write", default="replay"),
     *CONFIG,
     DEVICE,
@@ -95,15 +102,6 @@ REPLAY = (  # what people use, and in groups the rest
     ),
     group(  # a controller of the user's own in place of ours (docs/controllers.md)
         "controller",
-        either(
-            option(
-                "--controller MODULE:CLASS",
-                "ask this Python class, found from the current folder on, instead of ours",
-            ),
-            option(
-                "--controller-command 'PROGRAM ARGS'", "ask this program, by lines of JSON on its stdin and stdout"
-            ),
-        ),
         option(
             "--controller-step-limit S",
             "a controller that takes longer for a step has failed",
@@ -114,6 +112,7 @@ REPLAY = (  # what people use, and in groups the rest
     ),
     group(
         "evidence",
+        HOLDOUT,
         option("--max-unknown SHARE", "never-seen share allowed", real(0, 1), 0.05),
         option("--max-map-age S", "a scene older than this is no evidence", real(1e-3, MAX_SECONDS, "s"), 1.0),
         option(
@@ -121,11 +120,6 @@ REPLAY = (  # what people use, and in groups the rest
             "a map is known this long after its frames' stamp (--scene, --lockstep)",
             real(0, MAX_SECONDS, "s"),
             0.0,
-        ),
-        option(
-            "--evidence CAMERA|K",
-            "bound the map's error by depth kept out of the map: of a camera that did not train it, or (--lockstep)"
-            " of every K-th frame set",
         ),
         option("--require-evidence", "not evaluable (exit 5) without a bound on the map's error"),
         option(

@@ -73,7 +73,12 @@ SWEEP = (
     option("--dask ADDRESS", "make the runs on a Dask cluster that shares this folder"),
 )
 STUDY = (
-    option("STUDY", "which experiment of the paper", ("table2", "scenes", "shared-workspace", "dtu", "ablation")),
+    option(
+        "STUDY",
+        "table2: planning in reconstructed scenes; scenes: pick and place in twelve scenes; shared-workspace: a"
+        " person's arm comes near; dtu: splats beside 3D Gaussian splatting; ablation: table2 without a part of ours",
+        ("table2", "scenes", "shared-workspace", "dtu", "ablation"),
+    ),
     option("-o/--out DIR", "folder of the study, where it goes on (default: STUDY)", Path),
     option("--trials N", "problems of each kind (default: as many as the paper's)", whole(1, 100_000)),
     option("--methods A,B", "some of the study's (docs/study.md; default: all that are installed)", _names),

@@ -12,9 +12,9 @@ from splatctrl_cli.cli.options import (
     DEVICE,
     DISAGREEMENT,
     GATES,
+    OF_FOLDERS,
     SCAN,
     SELF_MODEL,
-    SOURCE,
     THREADS,
     output,
     settings,
@@ -38,7 +38,7 @@ RECONSTRUCT = (
     option("--max-splats N", "budget of splats (default: 5000)", setting(SceneConfig, "max_splats")),
     *CONFIG,
     GATES,
-    *SOURCE,
+    *OF_FOLDERS,
     group("scan of --dtu", *SCAN),
     group(
         "fit",
@@ -175,7 +175,7 @@ SCORE = (
     ),
     *CONFIG,
     GATES,
-    *SOURCE,
+    *OF_FOLDERS,
     group(
         "scan of --dtu",
         *SCAN,

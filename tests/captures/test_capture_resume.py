@@ -46,7 +46,8 @@ def test_an_interrupted_ingest_goes_on_to_the_same_bytes(
     assert main(["ingest", str(log), "-o", str(tmp_path / "whole"), "-q"]) == 0
     out = tmp_path / "x.capture"
     partial = interrupted(log, out, monkeypatch, after)
-    assert "is kept; continue it with the same command and --resume" in capsys.readouterr().err
+    words = f"is kept; continue it with: splatctrl ingest --resume {log} -o {out} -q\n"
+    assert words in capsys.readouterr().err
     images = sorted(partial.rglob("*.jpg"))
     assert len(images) == after
     written = images[0].stat().st_mtime_ns

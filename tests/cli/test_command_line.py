@@ -123,6 +123,23 @@ print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
         assert "130 interrupted" in done.stdout
 
 
+@pytest.mark.parametrize(
+    ("command", "word"),
+    [
+        *(("replay", option) for option in ("--evidence", "--controller", "--junit")),
+        *((command, "--junit") for command in ("check", "reconstruct", "score", "batch", "compare", "study", "demo")),
+        *((command, "--holdout") for command in ("ingest", "reconstruct", "score", "check")),
+        *(("study", name) for name in ("table2", "scenes", "shared-workspace", "dtu", "ablation")),
+    ],
+)
+def test_what_people_look_for_is_in_the_short_help(
+    command: str, word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        build_parser(command).parse_args([command, "--help"])
+    assert re.search(rf"(^|\s){word}\b", capsys.readouterr().out)
+
+
 def leaves(commands: dict[str, Command]) -> Iterator[tuple[list[str], Command]]:
     for name, command in commands.items():
         below = {} if command.actions is None else command.actions
@@ -257,7 +274,8 @@ sys.exit(main(sys.argv[1:]))
         time.sleep(0.05)
     running.send_signal(signal.SIGINT)
     stderr = running.communicate(timeout=30)[1]
-    assert (running.returncode, stderr.splitlines()[-1]) == (130, "splatctrl: interrupted")
+    last = "splatctrl: interrupted before its first checkpoint; run the same command again"
+    assert (running.returncode, stderr.splitlines()[-1]) == (130, last)
     assert "Traceback" not in stderr
     assert [path.name for path in tmp_path.iterdir()] == [partial.name]
 

@@ -46,7 +46,7 @@ def test_the_table_shows_each_view_and_the_mean(scored: Path, capsys: pytest.Cap
 
 def test_a_gate_that_fails_leaves_the_scores_and_exits_1(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(scored, "-o", scored / "score", "--require", "psnr_seen>=20", "--require", "psnr_all>=90") == 5
-    assert "psnr_all is" in capsys.readouterr().err
+    assert "psnr_all is" in capsys.readouterr().out
     assert (scored / "score" / "score.json").is_file()
 
 

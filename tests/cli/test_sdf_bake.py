@@ -216,7 +216,7 @@ def test_resume_goes_on_with_what_is_left(tmp_path: Path, splats: Path, monkeypa
         patch.setattr("splatctrl_cli.field.header.label_counts", interrupt)
         stopped = here.splatctrl(*given)
     assert stopped.returncode == 130
-    assert "continue it with the same command and --resume" in stopped.stderr
+    assert f"field.partial is kept; continue it with: splatctrl sdf-bake --resume {splats} " in stopped.stderr
     monkeypatch.setattr(Baker, "bake", None)  # nothing is left to bake
     resumed = here.splatctrl(*given, "--resume")
     assert resumed.returncode == 0

@@ -64,7 +64,7 @@ def told_how_to_go_on(checkpoint: Path, kept: Path | None = None) -> Iterator[No
         yield
     except KeyboardInterrupt:
         if not checkpoint.is_file():
-            raise
+            raise KeyboardInterrupt("interrupted before its first checkpoint; run the same command again") from None
         kept = kept or checkpoint.parent.parent
         raise KeyboardInterrupt(
             f"interrupted: {kept} is kept; continue it with the same command and --resume"
