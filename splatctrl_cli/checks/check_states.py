@@ -10,13 +10,13 @@ import numpy as np
 from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.config.fixed import STATES_STILL
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.spilled_rows import blocks_of, ranges
 from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_messages import STATE_TYPES, JointStream
-from splatctrl_cli.logs.state_topics import joint_records
+from splatctrl_cli.logs.state_topics import joint_records, refuse_contradiction, state_topics
 from splatctrl_cli.logs.survey import Survey
 from splatctrl_cli.records import Float64, Index, JointState, LossReport, spread
 from splatctrl_cli.robot.model import RobotModel
@@ -147,8 +147,17 @@ def check_angles(model: RobotModel, states: Sequence[JointState], name: str) -> 
     raise InputError(
         f"{name}: joint {names[joint]}: expected radians within [{lower[joint]:.3f}, {upper[joint]:.3f}], "
         f"got {at_worst[joint]:.4g}, which would fit as degrees",
-        remedy='convert them, or give the states as CSV or NPZ with unit = "deg" (docs/replay.md, Logs)',
+        remedy=_unit_remedy(names),
     )
+
+
+def _unit_remedy(names: Sequence[str]) -> str:
+    if all(name.endswith(".pos") for name in names):
+        return (
+            "LeRobot's numbers are -100 to 100 of a calibrated range, or degrees where it was told so (use_degrees):"
+            " convert them to radians with the arm's calibration file"
+        )
+    return 'record radians (REP 103), or give the states as CSV or NPZ with unit = "deg" (docs/replay.md, Logs)'
 
 
 def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgreement | None:
@@ -270,8 +279,10 @@ def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) 
     loss = LossReport()
     wanted = None if model is None else model.joint_names
     try:
+        if topics := state_topics(found, options, LossReport()):
+            refuse_contradiction(topics, wanted)
         names, states = joint_records(found, options, loss, wanted)
-    except InputError as wrong:
+    except (InputError, NotEvaluableError) as wrong:
         findings.append(error("joints", "joint states", wrong.message, wrong.remedy))
         return RobotStates(model=model, lack=str(wrong), findings=findings)
     findings += [note("joints", "joint states", text) for text in loss.notes]
@@ -289,13 +300,11 @@ def robot_states(model: RobotModel | None, names: Sequence[str], states: StateCo
     if model is None:
         return RobotStates(model=None, states=states)
     model = model.moved_by(names)
-    absent = [name for name in model.joint_names if name not in names]
-    if absent:
-        text = f"the robot's joints {', '.join(absent)} are in no joint state"
-        remedy = "give this robot's URDF, or hold them still with --lock"
-        found = [error("joints", "joint states", text, remedy)]
-        return RobotStates(model=model, lack=f"{text}; {remedy}", findings=found)
-    states = states.of_joints(np.asarray(model.joint_order(names), dtype=np.int64))
+    try:
+        states = states.of_log(*model.joint_columns(names))
+    except InputError as wrong:
+        found = [error("joints", "joint states", wrong.message, wrong.remedy)]
+        return RobotStates(model=model, lack=str(wrong), findings=found)
     of_fingers = [note("joints", "joint states", model.held_words)] if model.held else []
     return RobotStates(
         model=model, states=states, findings=[*of_fingers, *robot_findings(model, states, "joint states")]
@@ -327,7 +336,7 @@ def stream_findings(where: str, stream: JointStream) -> list[Finding]:
     if np.isfinite(widest).any() and float(widest[np.isfinite(widest)].max()) > DEGREES:
         worst = int(np.argmax(np.where(np.isfinite(widest), widest, 0)))
         text = f"{stream.names[worst]} reaches {widest[worst]:.4g}: degrees, not radians?"
-        remedy = 'record radians (REP 103), or convert the states to CSV or NPZ with unit = "deg"'
+        remedy = _unit_remedy(stream.names)
         found.append(error("joints-degrees", where, text, remedy, value=widest[worst]))
     found += _velocities(where, stream, bool((highest - lowest > STATES_STILL).any()))
     return found

@@ -180,7 +180,7 @@ def _arm(model: RobotModel, source: FrameSource) -> Arm:
             f"{model.urdf.path}: expected collision geometry, got spheres alone, which enclose the surface",
             remedy="give the URDF with its meshes (--packages DIR where they are in packages)",
         )
-    return Arm(model, source.states.of_joints(model.joint_order(source.joint_names)))
+    return Arm(model, source.states.of_log(*model.joint_columns(source.joint_names)))
 
 
 def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tuple[list[RgbdFrame], list[Sighting]]:

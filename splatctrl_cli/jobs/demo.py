@@ -280,7 +280,7 @@ def _draw(data: Path, out: Path, threads: int) -> None:
     comparison_picture(out / "renders.png", rows)
     model = RobotModel.from_urdf(data / "robot.urdf", data / "robot_spheres.yaml").moved_by(source.joint_names)
     assert joints is not None
-    centers = model.sphere_centers(joints.position[model.joint_order(source.joint_names)])
+    centers = model.sphere_centers(model.positions_of(source.joint_names, joints.position))
     height = float(np.median(centers[model.moving_spheres][-4:, 2]))
     field_slice_picture(
         out / "field_slice.png",

@@ -74,7 +74,7 @@ def _read(model: RobotModel, source: FrameSource, progress: Progress) -> tuple[l
     """Frames of the moments between which the arm moved farthest, by stamp, and the poses (V, L, 4, 4) of the links
     of its surface.
     """
-    posture = source.states.of_joints(model.joint_order(source.joint_names)).postures(STATES_CLOSE_NS)
+    posture = source.states.of_log(*model.joint_columns(source.joint_names)).postures(STATES_CLOSE_NS)
     surface, stamps = model.surface, stamps_by_camera(source)
     stamps = {camera: its for camera, its in stamps.items() if camera in training_cameras(source)}
 

@@ -9,7 +9,7 @@ from typing import Any, Self, overload
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, of_columns, ranges, selected
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, blocks_of, of_columns, ranges, selected
 from splatctrl_cli.records import Float64, Index, JointState, Stamps
 
 OF_JOINTS = ("position", "velocity", "commanded_velocity")
@@ -96,6 +96,23 @@ class StateColumns(Sequence[JointState]):
     def of_joints(self, order: Index) -> Self:
         """The joints of an order (J,)."""
         return replace(self, **self._each(partial(of_columns, order=order), OF_JOINTS))
+
+    def of_log(self, order: Index, factor: Float64, offset: Float64) -> Self:
+        """Joints (J,) each of which moves as a column: ``position[order] * factor + offset``."""
+        plain = self.of_joints(order)
+        if (factor == 1.0).all() and (offset == 0.0).all():
+            return plain
+
+        file, shift = {name: RowFile((len(order),)) for name in OF_JOINTS}, {"position": offset}
+
+        def moved(table: Table, name: str) -> Table:
+            for block in blocks_of(table):
+                file[name].append(block * factor + shift.get(name, 0.0))
+            return Rows(file[name])
+
+        tables = {name: getattr(plain, name) for name in OF_JOINTS}
+        changed: dict[str, Any] = {name: moved(table, name) for name, table in tables.items() if table is not None}
+        return replace(plain, **changed)
 
     def _each(self, change: Callable[[Table], Table], names: Iterable[str]) -> dict[str, Any]:
         """What becomes of those columns that there are."""

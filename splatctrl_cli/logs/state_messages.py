@@ -3,6 +3,7 @@ message names.
 """
 
 from array import array
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -33,7 +34,7 @@ class RawJoints:
     """One joint state as recorded, in the order of its names.
 
     position (J,); velocity, commanded_velocity (J,) or empty; log_time_ns: when it was logged; T_base_ee (4, 4): the
-    end effector that the robot's own controller reports.
+    end effector that the robot's own controller reports; note: what of the message is not used, and why.
     """
 
     stamp_ns: int
@@ -43,6 +44,7 @@ class RawJoints:
     log_time_ns: int = 0
     commanded_velocity: Float64 = field(default_factory=_none)
     T_base_ee: Float64 | None = None
+    note: str = ""
 
 
 def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoints]:
@@ -78,13 +80,7 @@ def pose_of_quat(position: Float64, quat_xyzw: Float64) -> Float64 | None:
 def _joint_state(message: Any, log_time_ns: int) -> RawJoints:
     names = tuple(str(name) for name in message.name)
     position, velocity = _array(message.position), _array(message.velocity)
-    if len(position) != len(names) or len(velocity) not in {0, len(names)}:
-        raise UndecodableMessageError(
-            f"a JointState with {len(names)} names, {len(position)} positions and {len(velocity)} velocities"
-        )
-    return RawJoints(
-        stamp_ns=stamp_ns(message.header), names=names, position=position, velocity=velocity, log_time_ns=log_time_ns
-    )
+    return _checked("a JointState", message, names, position, velocity, _none(), log_time_ns, None)
 
 
 def _franka(message: Any, log_time_ns: int) -> RawJoints:
@@ -134,6 +130,7 @@ def _checked(
 ) -> RawJoints:
     if len(position) != len(names):
         raise UndecodableMessageError(f"{what} with {len(names)} names and {len(position)} positions")
+    is_odd = len(velocity) not in (0, len(names))
     return RawJoints(
         stamp_ns=stamp_ns(message.header),
         names=names,
@@ -142,6 +139,7 @@ def _checked(
         log_time_ns=log_time_ns,
         commanded_velocity=commanded if len(commanded) == len(names) else _none(),
         T_base_ee=T_base_ee,
+        note=f"{len(names)} names with {len(velocity)} velocities, which are not used" if is_odd else "",
     )
 
 
@@ -234,10 +232,11 @@ class JointStream:
 
 
 class JointLog:
-    """The states of a topic in file order; first_names: of the first, None before it."""
+    """The states of a topic in file order; first_names: of the first, None before it; notes: of states, counted."""
 
     def __init__(self) -> None:
         self.first_names: tuple[str, ...] | None = None
+        self.notes: Counter[str] = Counter()
         self._num = 0
         self._streams: dict[frozenset[str], JointStream] = {}
 
@@ -261,6 +260,7 @@ class JointLog:
     def extend(self, states: Iterable[RawJoints]) -> None:
         """The next states. Raises OverflowError for a time beyond 64 bits."""
         for state in states:
+            self.notes.update(filter(None, [state.note]))
             if state.names:
                 key = frozenset(state.names)
                 stream = self._streams[key] if key in self._streams else JointStream(state.names)

@@ -14,17 +14,25 @@ from splatctrl_cli.config.fixed import (
     CLOCK_OTHER,
     CLOCK_STEP,
     STATES_BRIDGED,
+    STATES_COMPARED,
+    STATES_RIVAL,
     STATES_STILL,
+    TURNS_ACCELERATION,
+    TURNS_FEWEST,
+    TURNS_LEAST,
+    TURNS_SHARE,
 )
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, absent, ranges
 from splatctrl_cli.logs.decoder import JOINT_STATE
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import NO_STATES, StateColumns
-from splatctrl_cli.logs.state_messages import NAMELESS, STANDARD_TYPES, STATE_TYPES, TRAJECTORY, JointStream
-from splatctrl_cli.logs.state_track import RawTrack, cleaned
+from splatctrl_cli.logs.state_messages import STANDARD_TYPES, STATE_TYPES, TRAJECTORY, JointStream
+from splatctrl_cli.logs.state_track import RawTrack, cleaned, unwrapped
 from splatctrl_cli.logs.survey import Survey, TopicSurvey
 from splatctrl_cli.records import Bool, Float64, Index, LossReport, Stamps
+
+_COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")  # in topics of what is wished
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +59,13 @@ def joint_records(
     topics = state_topics(survey, options, loss)
     if not topics:
         return (), NO_STATES
+    try:
+        refuse_contradiction(topics, wanted)
+    except SplatCtrlError as wrong:
+        if wanted is not None:
+            raise
+        loss.notes.append(wrong.message)
+    loss.notes += [f"{t.topic.name}: {note} ({num} states)" for t in topics for note, num in t.joints.notes.items()]
     raw = track_of_topic(main_topic(topics, loss), loss) if wanted is None else track_of_joints(topics, wanted, loss)
     states = cleaned(raw, loss)
     return (raw.names, states) if len(states) else ((), NO_STATES)
@@ -78,11 +93,14 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
 
 
 def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
-    """/joint_states, else the JointState topic with most messages, else the fullest of another type."""
+    """/joint_states, else the JointState topic with most messages, else the fullest of another type; one that names
+    commands last.
+    """
 
-    def rank(topic: TopicSurvey) -> tuple[bool, bool, int, str]:
+    def rank(topic: TopicSurvey) -> tuple[bool, bool, bool, int, str]:
         name = topic.topic.name
-        return (name == "/joint_states", topic.topic.type_name == JOINT_STATE, topic.count, name)
+        is_of_type = topic.topic.type_name == JOINT_STATE
+        return (name == "/joint_states", not _is_command(name), is_of_type, topic.count, name)
 
     chosen = max(topics, key=rank)
     others = sorted(t.topic.name for t in topics if t is not chosen)
@@ -108,12 +126,7 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
     `STATES_BRIDGED` over which a joint moved, are left out with a note.
     """
     streams = _renamed(_streams(topics), wanted, loss)
-
-    def rank(stream: _Stream) -> tuple[int, bool, bool, int, str]:
-        covered = len(set(stream.names) & set(wanted))
-        return (covered, stream.has_poses, stream.where == "/joint_states", len(stream.states), stream.where)
-
-    base = max(streams, key=rank)
+    base = _base(streams, wanted)
     track = _raw(base, base.names, loss)
     missing = [name for name in wanted if name not in base.names]
     used = [base.where]
@@ -140,21 +153,117 @@ def _streams(topics: Sequence[TopicSurvey]) -> list[_Stream]:
     ]
 
 
+def _base(streams: Sequence[_Stream], wanted: Sequence[str]) -> _Stream:
+    """The stream with most of the joints `wanted`, of equals one with end-effector poses, then /joint_states."""
+
+    def rank(stream: _Stream) -> tuple[int, bool, bool, bool, int, str]:
+        covered, where = len(set(stream.names) & set(wanted)), stream.where
+        return (
+            covered,
+            stream.has_poses,
+            where == "/joint_states",
+            not _is_command(where),
+            len(stream.states),
+            where,
+        )
+
+    return max(streams, key=rank)
+
+
+def _is_command(topic: str) -> bool:
+    return any(word in topic.lower() for word in _COMMANDS)
+
+
+def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | None) -> None:
+    """Raise where the states of joints `wanted` (None: of all) are those of two robots.
+
+    InputError for another topic, not one of commands, that has the same joints elsewhere by over `STATES_RIVAL`;
+    NotEvaluableError for two publishers that take turns on one topic.
+    """
+    streams = _streams(topics)
+    if wanted is None:
+        base = max(streams, key=lambda s: (s.where == main_topic(topics, LossReport()).topic.name, len(s.names)))
+    else:
+        streams = _renamed(streams, wanted, LossReport())
+        base = _base(streams, wanted)
+    names = base.names if wanted is None else tuple(name for name in base.names if name in wanted)
+    for other in streams:
+        shared = [name for name in names if name in other.names]
+        if other.where == base.where or not shared or _is_command(other.where):
+            continue
+        apart = _apart(base, other, shared)
+        if apart > STATES_RIVAL:
+            both = f"{base.where} and {other.where}"
+            raise InputError(
+                f"joint states: {both} both have {', '.join(shared[:3])} and differ by {apart:.3g} (median)",
+                remedy=f"give --joint-topic {base.where} or --joint-topic {other.where}",
+            )
+    num = _num_turns(base, names)
+    if num >= max(TURNS_FEWEST, TURNS_SHARE * len(base.states)):
+        raise NotEvaluableError(
+            f"{base.where}: two publishers take turns: {num} of {len(base.states)} states jump away and back at once",
+            remedy="let one node publish the topic (ros2 topic info -v names them), and record again",
+        )
+
+
+def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
+    """How far apart [rad or m] two streams have their shared joints at the same times (median); 0 if never both."""
+    stamps, its = base.states.stamp_ns, other.states.stamp_ns
+    at, at_other = np.argsort(stamps, kind="stable"), np.argsort(its, kind="stable")
+    its = its[at_other]
+    some = np.unique(np.linspace(0, len(its) - 1, min(len(its), STATES_COMPARED // 10)).astype(np.int64))
+    near = np.clip(np.searchsorted(stamps[at], its[some]), 0, len(at) - 1)
+    is_near = np.abs(stamps[at][near] - its[some]) <= STATES_BRIDGED * 1e9
+    if not is_near.any():
+        return 0.0
+    one = base.states.columns()["position"][at[near[is_near]]][:, [base.names.index(name) for name in shared]]
+    two = other.states.columns()["position"][at_other[some[is_near]]][:, [other.names.index(name) for name in shared]]
+    turned = np.abs(one - two)
+    return float(np.median(np.minimum(turned, np.abs(turned - 2 * np.pi)).max(axis=1)))
+
+
+def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
+    """States that jump away from both neighbours, which are near each other, faster than any joint can turn back."""
+    position = stream.states.columns().get("position")
+    columns = [stream.names.index(name) for name in names]
+    if position is None or not columns:
+        return 0
+    num, order = 0, np.argsort(stream.states.stamp_ns, kind="stable")
+    seconds = stream.states.stamp_ns[order] * 1e-9
+    for first, last in ranges(max(len(order) - 2, 0)):
+        q, gaps = position[order[first : last + 2]][:, columns], np.diff(seconds[first : last + 2])
+        steps = np.abs(np.diff(q, axis=0))
+        jump = np.minimum(steps[1:], steps[:-1])
+        fastest = np.maximum(TURNS_ACCELERATION * gaps[1:] * gaps[:-1], TURNS_LEAST)[:, None]
+        is_turn = (np.abs(q[2:] - q[:-2]) < 0.25 * jump) & (jump > fastest)
+        num += int((is_turn & (np.abs(jump - 2 * np.pi) > 0.1 * np.pi)).any(axis=1).sum())
+    return num
+
+
 def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
-    """Streams of joint1 ... joint7 under the names of `wanted` that end so, where no stream has those."""
-    names = with_prefix(wanted)
-    if not names or any(set(stream.names) & set(names.values()) for stream in streams):
+    """Streams whose unknown joints are under the names of `wanted` that are missing, if only a prefix differs."""
+    found = dict.fromkeys(name for stream in streams for name in stream.names)
+    unknown, missing = [n for n in found if n not in wanted], [name for name in wanted if name not in found]
+    names = with_prefix(unknown, missing)
+    if not names:
         return streams
-    loss.notes.append(f"joints without a prefix are taken by their number: joint1 is {names['joint1']}, and so on")
+    name, meant = next(iter(names.items()))
+    loss.notes.append(f"joint names differ by a prefix: {name} is {meant}, and so on")
     return [replace(s, names=tuple(names.get(name, name) for name in s.names)) for s in streams]
 
 
-def with_prefix(wanted: Sequence[str]) -> dict[str, str]:
-    """joint1 ... joint7 -> the names of `wanted` that end so after one prefix; empty unless one prefix fits."""
-    first = NAMELESS[0]
-    prefixes = [name.removesuffix(first) for name in wanted if name.endswith(first)]
-    fitting = [prefix for prefix in prefixes if all(prefix + short in wanted for short in NAMELESS)]
-    return {short: fitting[0] + short for short in NAMELESS} if len(fitting) == 1 else {}
+def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
+    """Names of a log -> those of a robot that a prefix on one side keeps apart; empty unless one prefix fits best."""
+    by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
+    for name in dict.fromkeys(found):
+        for meant in wanted:
+            longer, shorter = (name, meant) if len(name) > len(meant) else (meant, name)
+            prefix = longer.removesuffix(shorter)
+            if len(prefix) < len(longer) and prefix.endswith(("_", "/", ".", ":", "-")):
+                by_prefix.setdefault((prefix, longer == name), {})[name] = meant
+    fitting = sorted(by_prefix.values(), key=len)[-2:]
+    is_sure = bool(fitting) and len(fitting[-1]) > 1 and (len(fitting) == 1 or len(fitting[0]) < len(fitting[1]))
+    return fitting[-1] if is_sure else {}
 
 
 def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
@@ -178,8 +287,9 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     if len(at) == 1:
         at, order = np.repeat(at, 2), np.repeat(order, 2)
     before = after - 1
+    position = unwrapped(other.select(order), loss).position
     gap = (at[after] - at[before]) * 1e-9
-    is_still = _is_still(other.position, order[before], order[after])
+    is_still = _is_still(position, before, after)
     keep = (stamps >= at[0]) & (stamps <= at[-1]) & ((gap <= STATES_BRIDGED) | is_still)
     share = np.clip((stamps - at[before]) / np.maximum(at[after] - at[before], 1), 0.0, 1.0)[:, None]
 
@@ -194,7 +304,7 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
         lost = f"{int((~keep).sum())} of {len(stamps)} states left out"
         loss.notes.append(f"{track.where}: {lost}: {names} of {other.where} are unknown then")
 
-    def joined(one: Table, two: Table) -> Table:
+    def joined(one: Table, two: Table, order: Index) -> Table:
         file = RowFile((len(track.names) + len(other.names),))
         for first, last in ranges(len(stamps)):
             part = slice(first, last)
@@ -206,9 +316,9 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     filled = replace(
         track,
         names=(*track.names, *other.names),
-        position=joined(track.position, other.position),
-        velocity=joined(track.velocity, other.velocity),
-        commanded_velocity=None if one is None or two is None else joined(one, two),
+        position=joined(track.position, position, np.arange(len(at))),
+        velocity=joined(track.velocity, other.velocity, order),
+        commanded_velocity=None if one is None or two is None else joined(one, two, order),
     )
     return filled.select(np.flatnonzero(keep))
 

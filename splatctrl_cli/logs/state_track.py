@@ -171,7 +171,7 @@ def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
     States with a position that is not finite are damage and left out; of states with one stamp the first is kept;
     velocities that are absent, NaN, or zero throughout for a joint that moves, are differences of the positions.
     """
-    ordered = _in_order(_finite(raw, loss), loss)
+    ordered = unwrapped(_in_order(_finite(raw, loss), loss), loss)
     gaps = gaps_of(ordered.stamp_ns)
     if len(gaps):
         longest = float(np.max(np.diff(ordered.stamp_ns)[gaps])) * 1e-9
@@ -183,6 +183,30 @@ def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
     if 0 < num_without < num:
         loss.notes.append(f"{raw.where}: {num_without} of {num} states have no valid end-effector pose")
     return replace(ordered, velocity=velocity)
+
+
+def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
+    """States in order whose positions run on where a joint was counted from the other end (pi to -pi, 2 pi to 0)."""
+    position, file = raw.position, RowFile(raw.position.shape[1:])
+    turns: Float64 = np.zeros(position.shape[1])
+    is_close = np.diff(raw.stamp_ns) * 1e-9 <= fixed.STATES_BRIDGED
+    num = np.zeros(len(turns), dtype=np.int64)
+    last: Float64 | None = None
+    for first, end in ranges(len(position)):
+        block = position[first:end]
+        steps = np.diff(block if last is None else np.vstack([last, block]), axis=0)
+        is_wrap = (np.abs(steps) > fixed.STATES_WRAP) & (np.abs(steps) < 4 * np.pi - fixed.STATES_WRAP)
+        is_wrap &= is_close[end - 1 - len(steps) : end - 1, None]
+        num += is_wrap.sum(axis=0)
+        added = -2 * np.pi * np.cumsum(np.where(is_wrap, np.sign(steps), 0.0), axis=0) + turns
+        added = added if last is not None else np.vstack([turns, added])
+        file.append(block + added)
+        turns, last = added[-1], block[-1]
+    if not num.any():
+        return raw
+    names = ", ".join(name for name, count in zip(raw.names, num, strict=True) if count)
+    loss.notes.append(f"{raw.where}: {names}: {int(num.sum())} steps of a whole turn between states are taken out")
+    return replace(raw, position=Rows(file))
 
 
 def _num_posed(raw: RawTrack) -> int:

@@ -353,19 +353,31 @@ class RobotModel:
         keep = ~is_near & (gap > touching)
         return np.stack([a[keep], b[keep]], axis=1).astype(np.int64)
 
-    def joint_order(self, log_joint_names: Sequence[str]) -> Index:
-        """Index array (J,) that puts a log's joints in the model's order: ``position[order]``.
+    def joint_columns(self, log_joint_names: Sequence[str]) -> tuple[Index, Float64, Float64]:
+        """Index, factor and offset (J,) of each joint in a log's positions: ``position[order] * factor + offset``.
 
-        Raises InputError naming the joints that the log lacks, and what it has.
+        A joint that the log lacks follows the one that it mimics. Raises InputError naming the joints that the log
+        lacks, and what it has.
         """
-        missing = [name for name in self.joint_names if name not in log_joint_names]
+        log = {name: (column, 1.0, 0.0) for column, name in enumerate(log_joint_names)}
+        for joint in self.urdf.joints:
+            if joint.mimic is not None and joint.name not in log and joint.mimic[0] in log:
+                log[joint.name] = (log[joint.mimic[0]][0], *joint.mimic[1:])
+        missing = [name for name in self.joint_names if name not in log]
         if missing:
+            hold = f"; hold still what it does not move: --lock {missing[0]}=VALUE"
             raise InputError(
                 f"{self.urdf.path}: joints not in the log: {', '.join(missing)}",
-                remedy=f"the log has: {', '.join(log_joint_names) or 'no joints'}; "
-                f"hold still what it does not move: --lock {missing[0]}=VALUE",
+                remedy=f"the log has: {', '.join(log_joint_names) or 'no joints'}"
+                + (hold if len(missing) < self.num_joints else "; give the URDF of the robot whose joints these are"),
             )
-        return np.array([list(log_joint_names).index(name) for name in self.joint_names], dtype=np.int64)
+        order, factor, offset = zip(*(log[name] for name in self.joint_names), strict=True)
+        return np.array(order, dtype=np.int64), np.array(factor), np.array(offset)
+
+    def positions_of(self, log_joint_names: Sequence[str], position: Float64) -> Float64:
+        """Positions (..., J) of a log's joints, in the model's order."""
+        order, factor, offset = self.joint_columns(log_joint_names)
+        return np.asarray(position[..., order] * factor + offset)
 
     def _checked(self, q: Float64) -> Float64:
         if np.shape(q) != (self.num_joints,):

@@ -119,9 +119,10 @@ def _libfranka(path: Path, joints: Sequence[str]) -> StateSource:
             f"{path}: expected libfranka's columns (time, q[0], ...), got {', '.join(table.names[:4])}, ...",
             remedy="describe the columns in a .toml and give that (docs/replay.md, Logs)",
         )
-    raw, names = libfranka_track(table), with_prefix(joints)
+    raw = libfranka_track(table)
+    names = with_prefix(raw.names, joints)
     loss = LossReport(notes=["times are those of the robot, in ms since it was switched on"])
-    if names:
+    if len(names) == len(raw.names):
         raw = replace(raw, names=tuple(names[name] for name in raw.names))
     return _of_table(path, (path,), raw, loss)
 

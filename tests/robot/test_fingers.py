@@ -86,4 +86,4 @@ def test_a_joint_of_the_arm_that_the_log_lacks_is_not_locked(tmp_path: Path) -> 
     spheres = SphereSet(links=("l",), centers=np.zeros((1, 3)), radii=np.full(1, 0.01))
     model = RobotModel.from_urdf(robot(tmp_path, *ARM, *FRANKA), spheres).moved_by(["shoulder"])
     with pytest.raises(InputError, match="joints not in the log: wrist; the log has: shoulder"):
-        model.joint_order(["shoulder"])
+        model.joint_columns(["shoulder"])

@@ -84,12 +84,12 @@ def test_self_pairs_are_apart_on_bodies_that_are_not_neighbours(arm: RobotModel)
 
 def test_joint_order_sorts_a_log_into_the_model(arm: RobotModel) -> None:
     log = ["gripper", *reversed(arm.joint_names)]
-    np.testing.assert_array_equal(np.array(log)[arm.joint_order(log)], arm.joint_names)
+    np.testing.assert_array_equal(np.array(log)[arm.joint_columns(log)[0]], arm.joint_names)
 
 
 def test_joint_order_names_the_joints_a_log_lacks(arm: RobotModel) -> None:
     with pytest.raises(InputError, match=r"joints not in the log: joint7; the log has: .*--lock joint7=VALUE"):
-        arm.joint_order(arm.joint_names[:6])
+        arm.joint_columns(arm.joint_names[:6])
 
 
 def test_continuous_and_prismatic_joints_take_one_number_each(tmp_path: Path) -> None:

@@ -262,14 +262,14 @@ def franka_2(num: int) -> tuple[Any, list[Message]]:
 
 def test_a_franka_robot_state_of_ros_2_is_preferred_because_it_has_poses(tmp_path: Path) -> None:
     store, messages = franka_2(20)
-    both = messages + states_of(ramp(20, 7) + 1, ARM)
+    both = messages + states_of(ramp(20, 7) + 0.01, ARM)
     source = opened(write_mcap(tmp_path / "x.mcap", both, store), ARM)
     found = states(source)
     assert found[2].position == pytest.approx(ramp(20, 7)[2])
     assert found[2].commanded_velocity == pytest.approx(np.arange(2.0, 9.0))
     assert found[2].T_base_ee == pytest.approx(some_pose())
     chosen = opened(tmp_path / "x.mcap", ARM, joint_topic="/joint_states")
-    assert states(chosen)[2].position == pytest.approx(ramp(20, 7)[2] + 1)
+    assert states(chosen)[2].position == pytest.approx(ramp(20, 7)[2] + 0.01)
 
 
 def test_a_type_that_the_log_does_not_define_is_said_and_is_no_damage(tmp_path: Path) -> None:

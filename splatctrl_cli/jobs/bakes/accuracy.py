@@ -137,7 +137,7 @@ def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request:
     for frame, at in newest.values():
         spheres = None
         if robot is not None and at is not None:
-            centers = robot.sphere_centers(at.position[robot.joint_order(recording.joint_names)])
+            centers = robot.sphere_centers(robot.positions_of(recording.joint_names, at.position))
             spheres = centers, robot.sphere_set.radii
         counted.append(counted_pixels(frame, source.workspace, spheres))
     frames = [frame for frame, _ in newest.values()]

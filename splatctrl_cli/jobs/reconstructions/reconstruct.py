@@ -187,7 +187,7 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
         model = RobotModel.from_urdf(urdf, request.spheres)
         if request.source.joint_names:
             model = model.moved_by(request.source.joint_names)
-            model.joint_order(request.source.joint_names)
+            model.joint_columns(request.source.joint_names)
         model = with_self_model(model, request.self_model)
         if request.urdf is None:
             _check_fits(urdf, request.source)

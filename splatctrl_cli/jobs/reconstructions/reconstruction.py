@@ -11,7 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from splatctrl_cli.config import Config, SceneConfig
-from splatctrl_cli.config.fixed import MOST_GROWTH
+from splatctrl_cli.config.fixed import MOST_GROWTH, PLAUSIBLE_DEPTH
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.files.ply import read_points
@@ -127,7 +127,7 @@ class Reconstruction:
         self._early: TimeStep | None = None  # the first that said nothing of the workspace
         self.depth: RecordedDepth | None = None  # by which the map's lengths were chosen
         allowed, still, guess = request.allow_disagreement, not self.source.has_clock, guessed_unit(self.source)
-        self.agreement = CameraAgreement(self.source.name, is_allowed=allowed, is_still=still, guess=guess)
+        self.agreement = CameraAgreement(self.source, is_allowed=allowed, is_still=still, guess=guess)
         self._saved_at, self._save_time = -float("inf"), 0.0
         request.corrections.check(request.source)
         if checkpoint is not None:
@@ -177,6 +177,8 @@ class Reconstruction:
         the workspace is.
         """
         index, self.num_read = self.num_read, self.num_read + 1
+        if self.robot is not None:  # no camera of a robot measures farther: such depth is a driver's word for none
+            step = step.within(max(PLAUSIBLE_DEPTH[1], self.config.occupancy.max_range))
         if self.fitter is None and not step.has_depth and self._needs_depth():
             console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
             self._early = self._early or step
@@ -354,7 +356,7 @@ class Reconstruction:
         """Those of the source, from its beginning."""
         records, has_clock = self.source.records(), self.source.has_clock
         steps = time_steps(records, self.cameras, has_clock=has_clock, observe=self._see, repeats=self.repeats)
-        return steps if self.cloud is None else (step.without_depth() for step in steps)
+        return steps if self.cloud is None else (step.within(0.0) for step in steps)
 
     def _see(self, record: Record) -> None:
         if isinstance(record, RgbdFrame):
@@ -396,10 +398,10 @@ class Reconstruction:
     def _posture(self, step: TimeStep) -> RobotPosture | None:
         if self.robot is None or step.position is None:
             return None
-        order = self.robot.joint_order(self.source.joint_names)
-        at_frames = {stamp_ns: q[order] for stamp_ns, q in step.positions.items()}
+        robot, names = self.robot, self.source.joint_names
+        at_frames = {stamp_ns: robot.positions_of(names, q) for stamp_ns, q in step.positions.items()}
         carried = self.declared.carried_at(self._seconds(step.stamp_ns)) if self.declared.carried else ()
-        return posture_of(self.robot, step.position[order], at_frames, carried)
+        return posture_of(robot, robot.positions_of(names, step.position), at_frames, carried)
 
     def _seconds(self, stamp_ns: int) -> float:
         """Since the first joint state, which time steps with a posture come after."""

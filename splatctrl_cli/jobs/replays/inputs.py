@@ -278,7 +278,7 @@ def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedS
 
     Raises InputError where they cannot be the robot's.
     """
-    states = source.states.of_joints(model.joint_order(source.joint_names))
+    states = source.states.of_log(*model.joint_columns(source.joint_names))
     check_states(states, model.joint_names)
     check_angles(model, states, source.name)
     return LoggedStates(source=source, states=states, poses=pose_agreement(model, states))
