@@ -13,6 +13,7 @@ from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.sources.source import describe
 
 WIDTH = 118  # columns of text
+FEW = 3  # rows that no command reads, which are all printed
 
 
 def run(args: argparse.Namespace) -> int:
@@ -81,21 +82,24 @@ def _needs(report: CheckReport) -> Iterator[str]:
 
 
 def run_info(args: argparse.Namespace) -> int:
-    return show_described(Console(args), describe(args.path, source_options(args)))
+    return show_described(Console(args), describe(args.path, source_options(args)), is_long=args.verbose > 0)
 
 
-def show_described(console: Console, summary: Summary) -> int:
+def show_described(console: Console, summary: Summary, *, is_long: bool = False) -> int:
     """Facts and tables, and what a reconstruction lacks."""
     code = DAMAGED if summary.damaged else 0
-    return console.result(summary.as_dict(), _described(summary), code=code)
+    return console.result(summary.as_dict(), _described(summary, is_long=is_long), code=code)
 
 
-def _described(summary: Summary) -> Iterator[str]:
+def _described(summary: Summary, *, is_long: bool) -> Iterator[str]:
     yield f"{summary.path}: {summary.kind}"
     yield from _facts(summary.facts, "  ")
     for grid in summary.grids:
         yield ""
-        yield from table(grid.header, grid.rows) if grid.rows else [f"no {grid.name}"]
+        num = len(grid.unused) if len(grid.unused) > FEW and not is_long else 0
+        rows = [row for row in grid.rows if not num or row[0] not in grid.unused]
+        yield from table(grid.header, rows) if rows else () if num else [f"no {grid.name}"]
+        yield from [f"and {num} {grid.name} that no command reads; -v prints them"] if num else ()
     if summary.missing:
         yield ""
         yield from (f"missing for a reconstruction: {item}" for item in summary.missing)

@@ -3,18 +3,19 @@ the time and memory of paths.
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """A table: rows of as many cells as the header has."""
+    """A table: rows of as many cells as the header has; unused: first cells of those that no command reads."""
 
     name: str
     header: tuple[str, ...]
     rows: Sequence[Sequence[object]]
+    unused: Collection[object] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

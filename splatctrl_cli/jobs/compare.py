@@ -105,7 +105,8 @@ class JobChange:
 class CompareResult:
     """What changed. figures: of each run, those that got worse first; jobs: over recordings, where there are enough,
     which then decide instead; differences: settings, versions and inputs by name, before and after; only_after: runs
-    that were not there before. metrics: how many of each.
+    that were not there before; only_before: runs that are not there now and are not compared. metrics: how
+    many of each.
     """
 
     __repr__ = brief
@@ -116,6 +117,7 @@ class CompareResult:
     jobs: tuple[JobChange, ...]
     differences: Mapping[str, tuple[str, str]]
     only_after: tuple[str, ...]
+    only_before: tuple[str, ...] = ()
     metrics: Mapping[str, int]
     baseline: Path | None = None
 
@@ -138,6 +140,7 @@ class CompareResult:
             ],
             "differences": {name: list(values) for name, values in self.differences.items()},
             "only_after": list(self.only_after),
+            "only_before": list(self.only_before),
             "baseline": None if self.baseline is None else str(self.baseline),
         }
 
@@ -162,18 +165,21 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
 
 
 def _check_alike(before: Judged, after: Judged) -> None:
-    """Raise InputError for what was not run alike: a run and a batch, other commands, recordings that are missing."""
+    """Raise InputError for what was not run alike: a run and a batch, other commands, no recording in common."""
     if before.kind != after.kind:
         raise InputError(f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}")
     if before.kind == "run" and before.runs.keys() != after.runs.keys():
         expected, got = (", ".join(judged.runs) for judged in (before, after))
         raise InputError(f"{after.path}: expected a run of {expected}, as {before.path} is, got one of {got}")
-    missing = sorted(before.runs.keys() - after.runs.keys())
-    if missing:
-        remedy = "run them again, or write the baseline anew" if before.is_baseline else "run them again"
-        raise InputError(f"{after.path}: has no {_named(missing)}, which {before.path} has", remedy=remedy)
-    for name, old in before.runs.items():
-        new = after.runs[name]
+    common = [name for name in before.runs if name in after.runs]
+    if not common:
+        expected, got = (_named([*judged.runs]) or "none" for judged in (before, after))
+        raise InputError(
+            f"{after.path}: expected some of the runs of {before.path} ({expected}), got {got}",
+            remedy="compare runs of the same recordings",
+        )
+    for name in common:
+        old, new = before.runs[name], after.runs[name]
         if old.command != new.command:
             raise InputError(f"{after.path}: {name}: expected a run of {old.command}, got one of {new.command}")
         lost = sorted(old.metrics.keys() - new.metrics.keys())
@@ -185,7 +191,8 @@ def _check_alike(before: Judged, after: Judged) -> None:
 
 
 def _compared(before: Judged, after: Judged) -> CompareResult:
-    pairs = [(old, after.runs[name]) for name, old in before.runs.items()]
+    pairs = [(old, after.runs[name]) for name, old in before.runs.items() if name in after.runs]
+    only_before = tuple(sorted(before.runs.keys() - after.runs.keys()))
     verdicts = [change for old, new in pairs if (change := _verdict_change(old, new)) is not None]
     found = [change for old, new in pairs for change in _figure_changes(old, new)]
     jobs = sorted(_job_changes(found), key=lambda one: -one.worst.share)
@@ -207,13 +214,15 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
     weighed += [(-one.worst.share, one.metric, _of_job(one)) for one in jobs if one.change is Change.WORSE]
     ordered = sorted(weighed, key=lambda one: one[:2])
     reasons = [*_of_verdicts(verdicts, after), *(reason for *_, reason in ordered), *_of_single(jobs)]
-    reasons += [noted("runs", f"only in {after.path}: {_named(only_after)}")] if only_after else []
+    lone = ((before, only_before), (after, only_after))
+    reasons += [noted("runs", f"only in {side.path}: {_named(names)}") for side, names in lone if names]
     return CompareResult(
         verdict=verdict_of(
             "compare",
             [_overall(metrics), *reasons],
             scope=f"{before.path} -> {after.path}",
             passed="no regression",
+            notes=[f"not compared, only in {before.path}: {_named(only_before)}"] if only_before else [],
             counts=metrics,
         ),
         verdicts=tuple(verdicts),
@@ -221,6 +230,7 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
         jobs=tuple(jobs),
         differences=_differences(pairs),
         only_after=only_after,
+        only_before=only_before,
         metrics=metrics,
     )
 

@@ -19,9 +19,11 @@ from splatctrl_cli.datasets.layouts import BARE_REMEDY, bare_images, has_views, 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.summary import Grid, Summary, files_below, names_in
 from splatctrl_cli.grid_files.grid_format import FORMAT, covers, header_facts
+from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
 from splatctrl_cli.logs.rig import camera_topics, missing
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
+from splatctrl_cli.logs.state_messages import STATE_TYPES
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.logs.survey import NAME as ROBOT
 from splatctrl_cli.logs.survey import RobotDescription, TopicSurvey, robot_descriptions, survey_to_describe
@@ -151,7 +153,8 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
     if robots:
         facts[ROBOT] = robots
     rows = [_topic_row(found.topics[name]) for name in sorted(found.topics)]
-    grids = [Grid(name="topics", header=_TOPIC_COLUMNS, rows=rows)]
+    unused = [name for name, topic in found.topics.items() if _first(topic) == "-" and not _is_read(topic)]
+    grids = [Grid(name="topics", header=_TOPIC_COLUMNS, rows=rows, unused=unused)]
     cameras = camera_topics(log, found, options)
     if cameras:
         rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
@@ -182,6 +185,13 @@ def _topic_row(entry: TopicSurvey) -> list[object]:
         f"{(entry.count - 1) / span:.2f}" if entry.count > 1 and span > 0 else "-",
         _first(entry),
     ]
+
+
+def _is_read(entry: TopicSurvey) -> bool:
+    """Whether a command can read a topic, with the right options."""
+    name, kind = entry.topic.name, entry.topic.type_name or ""
+    types = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS)
+    return kind in types or kind.startswith("geometry_msgs/") or name.endswith(f"/{ROBOT}")
 
 
 def _first(entry: TopicSurvey) -> str:
@@ -219,7 +229,7 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
             f"{path}: a folder of no known kind",
             remedy=f"give one that is in it: {inside}"
             if inside
-            else "expected a capture, ROS 2 bag, dataset folder (docs/formats.md), MVSNet scan, output of splatctrl;"
+            else "expected a capture, ROS 2 bag, dataset folder (splatctrl help formats), MVSNet scan or output;"
             " for other images give their .toml",
         )
     field = _field_facts(path / "field.json") if "field.json" in names else {}

@@ -1,6 +1,7 @@
 """Open loop, golden commands, explanations, gates, and what a closed loop may be asked for."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -242,3 +243,21 @@ def test_the_standstill_waits_where_the_controller_goes_on(
     assert "Beside people, from the same moment:" in capsys.readouterr().out
     names = metric_names("closed-loop", ("exact", "barrier"), has_truth=False, baselines=["standstill"])
     assert set(metrics) == set(names)
+
+
+def test_a_closed_loop_that_outlasts_the_log_says_so_and_how_to_end_it_sooner(
+    desk: Desk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    far = ",".join(f"{value:g}" for value in logged()[0].position + 1.4)
+    drive = (*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05)), "-q", "--mode", "closed-loop", f"--goal-joints={far}")
+    assert desk.replay(*drive, is_judged=True) == 5
+    verdict = desk.verdict()
+    assert re.search(r"^driven motion from 0\.00 s of the log to \d\.\d\d s past its end, ", verdict["scope"])
+    (reason,) = [each for each in verdict["reasons"] if each["criterion"] == "map age"]
+    assert re.match(
+        r"the motion goes on \d\.\d\d s past the end of the log, and the map is up to", reason["sentence"]
+    )
+    assert reason["remedy"].startswith("end it with the log (--set control.max_time=1), start earlier (--start-time)")
+    assert "check the cameras" not in capsys.readouterr().out
+    desk.replay(*drive, "--set", "control.max_time=1", out="ended", is_judged=True)
+    assert "past the end" not in json.dumps(desk.verdict("ended"))

@@ -19,6 +19,7 @@ from splatctrl_cli.jobs import judged_runs
 from splatctrl_cli.jobs.compare import Change, CompareRequest, CompareResult, compare
 from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.jobs.replays.standstill_baseline import BASELINES
+from splatctrl_cli.jobs.report import WriteReportRequest, write_report
 from tests.jobs.runs import Runs
 
 OLDER = Path(__file__).parents[1] / "data" / "older.zip"
@@ -164,7 +165,7 @@ def batch_of(
         node |= {"state": "failed", "expect": "passed", "outcome": "failed", "label": "limits broken"}
         nodes.append(node | {"out": f"{name}/audit", "result": f"{name}/audit.json", "cause": ""})
         edit(nodes[-1])
-    document = {"format": "splatctrl-batch", "version": 1, "suite": "s", "nodes": nodes}
+    document = {"format": "splatctrl-batch", "version": 1, "suite": "s", "jobs": ["audit"], "nodes": nodes}
     (folder / "batch.json").write_text(json.dumps(document))
     return folder
 
@@ -279,6 +280,30 @@ def test_a_baseline_of_a_batch_holds_every_run(audit: Path, tmp_path: Path) -> N
     assert compared(new, against=file).verdict.decisive[0].criterion == "num_in_collision of b/audit"
 
 
+@pytest.mark.parametrize("is_stored", [False, True])
+def test_a_shard_of_a_batch_is_compared_and_the_others_are_named(
+    audit: Path, tmp_path: Path, is_stored: bool
+) -> None:
+    """A recording that was taken out of the suite is one, too."""
+    old = batch_of(tmp_path / "old", audit, {name: {} for name in "abc"})
+    new = batch_of(tmp_path / "new", audit, {"b": {"num_in_collision": 3}, "d": {}})
+    same = batch_of(tmp_path / "same", audit, {"b": {}})
+    compared(old, update_baseline=tmp_path / "base.toml")
+    before = tmp_path / "base.toml" if is_stored else old
+
+    def since(folder: Path) -> CompareResult:
+        return compared(folder, against=before) if is_stored else compared(before, folder)
+
+    assert since(same).verdict.sentence.endswith(f"; not compared, only in {before}: a/audit, c/audit")
+    result = since(new)
+    assert (result.only_before, result.only_after) == (("a/audit", "c/audit"), ("d/audit",))
+    assert result.verdict.decisive[0].criterion == "num_in_collision of b/audit"
+    assert f"only in {before}: a/audit, c/audit" in [note.sentence for note in result.verdict.said]
+    page = tmp_path / "page.html"
+    write_report(WriteReportRequest(path=same, out=page, against=before))
+    assert "a/audit, c/audit" in page.read_text()
+
+
 def refused(words: str, *runs: Path, kind: type[SplatCtrlError] = InputError, **more: Path) -> None:
     with pytest.raises(kind, match=words):
         compared(*runs, **more)
@@ -291,8 +316,8 @@ def test_what_cannot_be_compared_is_refused_by_name(audit: Path, tmp_path: Path)
     shutil.copytree(audit, tmp_path / "a.partial")
     refused(r"a\.partial: is still being written", audit, tmp_path / "a.partial")
     refused("a: is still being written", audit, tmp_path / "a")
-    one, two = batch_of(tmp_path / "1", audit, {"a": {}}), batch_of(tmp_path / "2", audit, {"a": {}, "b": {}})
-    refused("1: has no b/audit, which .*2 has; run them again", two, one)
+    one, two = batch_of(tmp_path / "1", audit, {"a": {}}), batch_of(tmp_path / "2", audit, {"b": {}})
+    refused(r"1: expected some of the runs of .*2 \(b/audit\), got a/audit", two, one)
     refused("expected a run like .*audit, got a batch", audit, one)
     other = batch_of(tmp_path / "3", audit, {"a": {}}, lambda node: node.update(command="score"))
     refused("a/audit: expected a run of replay, got one of score", one, other)

@@ -38,6 +38,11 @@ class Judged:
         """That were judged."""
         return len(self.replay.audit.stamp_ns)
 
+    @property
+    def past_end_s(self) -> float:
+        """How long a driven motion goes on after the log's last state [s]."""
+        return max(int(self.replay.audit.stamp_ns[-1]) - int(self.inputs.states.stamp_ns[-1]), 0) * 1e-9
+
 
 def events_of(replay: Replay, kind: EventKind, source: str = "") -> Sequence[Event]:
     return [event for event in replay.events if event.kind is kind and event.source == source]

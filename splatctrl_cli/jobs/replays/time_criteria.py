@@ -41,19 +41,33 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
         )
     near = nearby(judged, judged.replay.near["age"])
     if near is not None and near[0] > judged.request.max_map_age:
+        words, remedy = _after_end(judged, near[0], near[1])
         yield lacking(
-            sentence=f"the newest depth near the arm is {near[0]:.2f} s old, allowed "
+            sentence=f"{words}the newest depth near the arm is {near[0]:.2f} s old, allowed "
             f"{judged.request.max_map_age:g} s",
             value=near[0],
             threshold=judged.request.max_map_age,
             unit="s",
             time_s=near[1],
-            remedy="frames that have no depth or repeat it do not count: check the cameras ('splatctrl check')",
+            remedy=remedy
+            or "frames that have no depth or repeat it do not count: check the cameras ('splatctrl check')",
             count=near[2],
         )
     elif near is not None:
         words = f"depth from about the arm at most {near[0]:.2f} s before"
         yield held(words, near[0], judged.request.max_map_age, "s", near[2])
+
+
+def _after_end(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
+    """First words and the remedy where evidence of an age [s] at a time is too old because the log had ended; else
+    empty.
+    """
+    lasts = float(judged.replay.audit.stamp_ns[-1] - judged.replay.audit.stamp_ns[0]) * 1e-9 - judged.past_end_s
+    at_end = age - (time_s - lasts)
+    if not judged.past_end_s or at_end > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
+        return "", ""
+    remedy = f"end it with the log (--set control.max_time={max(lasts, 0.01):.3g}), start earlier (--start-time), or"
+    return f"the motion goes on {judged.past_end_s:.2f} s past the end of the log, and ", f"{remedy} record longer"
 
 
 def _unwatched(judged: Judged) -> Iterator[Reason]:
@@ -94,14 +108,15 @@ def map_age(judged: Judged) -> Iterator[Reason]:
         yield held(f"at most {most:.2f} s", most, allowed, "s", len(known))
         return
     worst = max(events_of(judged.replay, EventKind.STALE_MAP), key=lambda event: event.worst)
+    words, remedy = _after_end(judged, most, worst.worst_s)
     yield lacking(
-        sentence=f"the map is up to {most:.2f} s old, allowed {allowed:g} s, from {worst.start_s:.2f} to "
+        sentence=f"{words}the map is up to {most:.2f} s old, allowed {allowed:g} s, from {worst.start_s:.2f} to "
         f"{worst.end_s:.2f} s",
         value=most,
         threshold=allowed,
         unit="s",
         time_s=worst.worst_s,
-        remedy="the cameras must cover the motion in time; --max-map-age says how old a map may be",
+        remedy=remedy or "the cameras must cover the motion in time; --max-map-age says how old a map may be",
         count=len(known),
     )
 

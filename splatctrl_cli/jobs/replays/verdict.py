@@ -42,11 +42,14 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
     stamps = replay.audit.stamp_ns
     first, last = replay.start_time_s, replay.start_time_s + float(stamps[-1] - stamps[0]) * 1e-9
     motion = "driven" if replay.closed_loop else "logged"
+    span, past = f"{motion} motion from {first:.2f} to {last:.2f} s of the log", judged.past_end_s
+    if past > 0:
+        span = f"{motion} motion from {first:.2f} s of the log to {past:.2f} s past its end"
     who = "" if replay.outside is None else f", controller {shown(replay.outside.name)}"
     return verdict_of(
         "replay",
         reasons,
-        scope=f"{motion} motion from {first:.2f} to {last:.2f} s of the log, {len(stamps)} states{who}",
+        scope=f"{span}, {len(stamps)} states{who}",
         passed=SAFE,
         how=_how(judged),
         notes=tuple(_notes(judged)),
