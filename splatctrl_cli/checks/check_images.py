@@ -50,6 +50,7 @@ class ImageWatch:
         self.where, self.scale = where, scale
         self.count = self.num_decoded = self.num_bad = self.num_without_depth = self.num_invalid = 0
         self.num_repeats, self._last_depth = 0, np.zeros((0, 0), np.float32)
+        self.constants: Counter[float] = Counter()  # images by their largest depth, where it is suspicious
         self.first_bad_ns: int | None = None
         self.first_bad = ""
         self.encodings: Counter[str] = Counter()
@@ -102,6 +103,7 @@ class ImageWatch:
         if self.shares.is_next():
             self.shares.add(valid.size / small.size)
         self.num_without_depth += valid.size == 0
+        self.constants.update(_constant(valid))
         if self.medians.is_next():
             self.medians.add(float(np.median(valid)) if valid.size else 0.0)
         if self.kept.is_next():
@@ -116,6 +118,7 @@ class ImageWatch:
         factor = np.float32(scale / (self.unit or 1.0))
         self.scale = scale
         if factor != 1.0:
+            self.constants = Counter({float(value * factor): num for value, num in self.constants.items()})
             self.medians.change(lambda median: float(median * factor))
             self.kept.change(lambda kept: kept if kept.depth is None else replace(kept, depth=kept.depth * factor))
             changed = [t if t.depth is None else replace(t, depth=t.depth * factor) for t in self.thumbnails]
@@ -136,6 +139,16 @@ class ImageWatch:
         self.count += 1
         self.encodings[encoding] += 1
         self.sizes[width, height] += 1
+
+
+def _constant(depth: Float32) -> list[float]:
+    """The largest of some depths [m] where many have it exactly and it stands apart, as a code for no return does."""
+    values, counts = np.unique(depth, return_counts=True)
+    if len(values) < 2 or counts[-1] < limits.CONSTANT_SHARE * depth.size:
+        return []
+    is_ahead = values[-1] >= limits.CONSTANT_AHEAD * values[-2]
+    is_apart = len(values) > limits.CONSTANT_VALUES and counts[-1] > limits.CONSTANT_RATIO * counts[:-1].max()
+    return [float(values[-1])] if is_ahead or is_apart else []
 
 
 def stride_of(height: int) -> int:
@@ -204,9 +217,13 @@ def depth_findings(images: ImageWatch) -> list[Finding]:
     if images.num_invalid:
         text = (
             f"{images.num_invalid} depth pixels of {images.num_decoded} images are NaN, infinite, negative or 65535"
+            " (or a like code): they count as none"
         )
-        text += ": they count as none"
         found.append(note("depth-invalid", where, text, value=images.num_invalid))
+    for value, num in images.constants.most_common(1):
+        if num >= limits.CONSTANT_IMAGES * images.num_decoded:
+            text = f"many pixels are exactly {value:.6g} m, the largest depth of {num} of {images.num_decoded} images"
+            found.append(warning("depth-constant", where, f"{text}: a code for no return?", value=value, unit="m"))
     if images.num_repeats:
         text = f"{images.num_repeats} of {images.num_decoded} depth images equal the one before to the bit"
         found.append(warning("depth-repeats", where, text, value=images.num_repeats))

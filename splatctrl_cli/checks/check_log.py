@@ -1,6 +1,6 @@
 """Everything that is wrong with a log, from one pass over it."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from splatctrl_cli.checks.check_cameras import calibration_findings, camera_findings, tf_findings
@@ -20,6 +20,7 @@ from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_
 from splatctrl_cli.checks.log_pass import LogWatch, checked_camera, image_motion, ready
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.cameras import image_topics
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
 from splatctrl_cli.logs.messages import COLOR_CONVERSIONS, DEPTH_ENCODINGS
 from splatctrl_cli.logs.rig import camera_topics, check_mask_topics, missing
@@ -34,7 +35,12 @@ SAID = (" are never closer than ", " images as ", "distortion model ", " says re
 
 
 def check_log(
-    log: RawLog, options: SourceOptions, *, model: RobotModel | None = None, num_images: int | None = None
+    log: RawLog,
+    options: SourceOptions,
+    *,
+    model: RobotModel | None = None,
+    num_images: int | None = None,
+    only_errors: bool = False,
 ) -> CheckReport:
     """Read `log` once, in bounded memory; with `num_images` up to as many of a topic.
 
@@ -52,7 +58,7 @@ def check_log(
         if camera is not None and camera.depth_scale is not None and topics.depth in watch.images:
             watch.images[topics.depth].rescale(camera.depth_scale)
     findings += _time_findings(watch, found, cameras)
-    findings += _image_findings(watch, cameras)
+    findings += _image_findings(watch, cameras, {t.topic.name for t in image_topics(found, "unlike")})
     findings += calibration_findings(found, cameras, watch.changed_infos)
     findings += tf_findings(found, cameras, options)
     for topics, camera in rig:
@@ -88,7 +94,7 @@ def check_log(
         states_lack=of_states.lack,
         cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
     )
-    return judged(evidence, [*findings, *of_states.findings], of_states.model)
+    return judged(evidence, [*findings, *of_states.findings], of_states.model, only_errors=only_errors)
 
 
 def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
@@ -151,8 +157,10 @@ def _is_beside(watch: LogWatch, name: str, cameras: Sequence[CameraTopics]) -> b
     return bool(cameras) and name in watch.images and not any(name in (c.color, c.depth) for c in cameras)
 
 
-def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics]) -> list[Finding]:
-    """Those of topics that no camera is made of are notes: nothing reads them."""
+def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics], unlike: Collection[str]) -> list[Finding]:
+    """Those of topics that no camera is made of are notes: nothing reads them. unlike: topics that are no depth,
+    though their encoding is.
+    """
     findings = []
     for name, images in sorted(watch.images.items()):
         its = image_findings(images)
@@ -164,7 +172,7 @@ def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics]) -> list[Fi
             its.append(warning("encoding", name, f"encoding {unread[0]!r} is not read", remedy))
         if _is_beside(watch, name, cameras):
             its = [replace(f, severity=Severity.NOTE, what=f"{f.what}; no camera uses the topic") for f in its]
-        elif kinds & set(DEPTH_ENCODINGS) and images.num_decoded:
+        elif kinds & set(DEPTH_ENCODINGS) and images.num_decoded and name not in unlike:
             its += depth_findings(images)
         findings += its
     return [*findings, *sample_findings(list(watch.images.values()))]

@@ -71,7 +71,7 @@ robot-clock | note, warning |  | the offset of cameras and robot: with `--urdf` 
     its uncertainty)
 sampled | note |  | not every image was decoded
 undecodable | note, warning, error | all | images that do not decode; an error where none does | they are left out;
-    copy the file again, or look at the recorder
+    record a form that is read, or copy the file again where it is named as damaged too
 encoding | note, warning |  | an encoding that is not read, or that changes
 image-size | note, warning |  | images of one topic of several sizes | record one size; frames of another than the
     camera's are left out
@@ -87,7 +87,10 @@ depth-share | note, warning |  | less than half of the pixels have depth; a warn
     unseen: dark or shiny things, too near, or warped depth with holes
 depth-empty | warning, error | later | depth images without any depth; an error where all are | is the projector on,
     and the scene within its range?
-depth-invalid | note |  | pixels that are NaN, infinite, negative or 65535, the format's largest count
+depth-invalid | note |  | pixels that are NaN, infinite, negative or a code for no return: 65535, the largest count of
+    16 bits, 65.535 m, or 100 km and more
+depth-constant | warning |  | the largest depth is one exact value in many pixels, and far behind all others: a code
+    for no return that nothing declares | let the driver write 0 or NaN for no return; as it stands, it is a surface
 depth-repeats | warning |  | depth images that equal the one before to the bit | look for a driver that publishes its
     last image again; repeated depth is no new evidence, and only depth that was made without noise may repeat
 principal-point | warning, error | later | cx or cy over 15 % of the size off the middle; an error, naming the size,

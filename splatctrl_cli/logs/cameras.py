@@ -15,6 +15,7 @@ import numpy as np
 from splatctrl_cli.containers.log_formats import told_formats
 from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.image_file import JPEG
 from splatctrl_cli.libraries import is_installed
 from splatctrl_cli.logs.decoder import (
     CAMERA_INFO,
@@ -27,6 +28,7 @@ from splatctrl_cli.logs.decoder import (
     is_ros,
     stamp_ns,
 )
+from splatctrl_cli.logs.image_names import DEPTH, is_other, word_of
 from splatctrl_cli.logs.messages import ImageMessage
 from splatctrl_cli.logs.registration import is_distorted, lens_model
 from splatctrl_cli.logs.source_options import CameraTopics, PoseTopic, SourceOptions
@@ -40,9 +42,22 @@ _ENCODINGS = ("cdr", "ros1", "protobuf", "json")  # of messages
 
 
 def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
-    """Topics whose first image is of this kind: color, depth or other."""
-    topics = survey.of_type(IMAGE, COMPRESSED_IMAGE)
-    return [t for t in topics if t.first_image is not None and t.first_image.kind == kind]
+    """Topics whose first image is of this kind: color, depth or other; ``unlike`` are those whose name says that they
+    are not what they look like, as infrared of sixteen bits or depth in a JPEG.
+    """
+    topics = [(t, t.first_image) for t in survey.of_type(IMAGE, COMPRESSED_IMAGE)]
+    return [t for t, image in topics if image is not None and kind == ("unlike" if _unlike(t) else image.kind)]
+
+
+def _unlike(topic: TopicSurvey) -> str:
+    """The word in the names of a topic or its frame that says that its images are neither depth nor colour."""
+    image, parts = topic.first_image, _parts(topic.topic.name)
+    assert image is not None
+    if image.kind == "depth":
+        word = word_of(parts) or word_of((image.frame_id,))
+        return word if is_other(word) else ""
+    word = word_of(parts, is_device=False)
+    return word if image.kind == "color" and word == DEPTH else ""
 
 
 def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraTopics, ...]:
@@ -77,6 +92,8 @@ def _camera(
     survey: Survey, namespace: tuple[str, ...], color: TopicSurvey, depths: list[TopicSurvey]
 ) -> CameraTopics:
     info = find_info(survey, color, namespace)
+    depths = [d for d in depths if word_of(_parts(d.topic.name)) == DEPTH] or depths
+    names = {_family(d.topic.name): d.topic.name for d in reversed(depths) if word_of(_parts(d.topic.name)) != DEPTH}
     depth, depth_info = min(
         [(depth, find_info(survey, depth, namespace)) for depth in depths],
         key=lambda item: (
@@ -89,8 +106,19 @@ def _camera(
     name = "/".join(namespace)
     info = info or (depth_info if _is_of_file(color) else "")
     return CameraTopics(
-        name=name, color=color.topic.name, depth=depth.topic.name, info=info or "", depth_info=depth_info or ""
+        name=name,
+        color=color.topic.name,
+        depth=depth.topic.name,
+        info=info or "",
+        depth_info=depth_info or "",
+        rivals=tuple(sorted(names.values())) if len(names) > 1 else (),
     )
+
+
+def _family(name: str) -> tuple[str, ...]:
+    """What raw, rectified and compressed images of one sensor share of their topics."""
+    parts = _parts(name)
+    return (*parts[:-1], re.sub("_?(rect|raw)", "", parts[-1]))
 
 
 def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | None = None) -> str:
@@ -210,10 +238,21 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
     """The refusal of a log in which no colour and depth belong together."""
     colors = [t.topic.name for t in image_topics(survey, "color")]
     depths = [t.topic.name for t in image_topics(survey, "depth")]
-    if colors and not depths:
+    broken = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
+    rgbd = [t for t in survey.topics.values() if t.count and t.topic.type_name.rpartition("/")[2].startswith("RGBD")]
+    if rgbd and not (colors and depths):
         return InputError(
-            f"{log.path}: no depth topic; colour topics there: {listed(colors)}",
-            remedy="record 16UC1, mono16 or 32FC1 depth images (info and replay of joint states work without)",
+            f"{log.path}: colour and depth are in one message, which is not read: {rgbd[0].topic.type_name} on"
+            f" {rgbd[0].topic.name}",
+            remedy="record the camera's own topics instead: colour and aligned depth images, their camera_info, tf",
+        )
+    if colors and not depths:
+        unlike, chosen = image_topics(survey, "unlike"), "; if one of these is depth, give --camera NAME=COLOR,DEPTH"
+        unread = "".join(f"; {note}" for note in survey.damage.remarks if any(name in note for name in broken))
+        return InputError(
+            f"{log.path}: no depth topic{_named_unlike(survey)}{unread}; colour topics there: {listed(colors)}",
+            remedy="record 16UC1, mono16 or 32FC1 depth images (info and replay of joint states work without)"
+            f"{chosen if unlike else ''}",
         )
     videos = sorted(t.topic.name for t in survey.topics.values() if t.count and is_video(t.topic))
     if videos and not colors:
@@ -221,16 +260,17 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
     lost = next((note for note in survey.damage.notes if KEY_FRAME in note), "")
     if lost and not colors:
         return InputError(f"{log.path}: no image of the video can be decoded ({lost})", remedy=OFTENER)
-    broken = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
     if broken:
-        why = next((note for note in survey.damage.notes if "image" in note), "see `splatctrl info`")
+        notes = survey.damage.all_notes
+        why = next((note for note in notes if "image" in note or broken[0] in note), "see `splatctrl info`")
         return InputError(
             f"{log.path}: no image of {listed(broken)} can be decoded ({why})",
             remedy="record raw images, JPEG or PNG; decode video to images first",
         )
     if depths and not colors:
         return InputError(
-            f"{log.path}: no colour topic; depth topics there: {listed(depths)}", remedy="record the colour images"
+            f"{log.path}: no colour topic{_named_unlike(survey)}; depth topics there: {listed(depths)}",
+            remedy="record the colour images",
         )
     topics = [t.topic for t in survey.topics.values() if t.count]
     kinds = sorted({_kind(topic) for topic in topics})
@@ -245,6 +285,18 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
         f"{log.path}: no image topics; message types there: {listed(kinds)}",
         remedy="expected sensor_msgs Image or CompressedImage",
     )
+
+
+def _named_unlike(survey: Survey) -> str:
+    """The topics whose names say that they are neither depth nor colour, and why; begins with a semicolon."""
+    found = []
+    for topic in image_topics(survey, "unlike"):
+        image, name = topic.first_image, topic.topic.name
+        assert image is not None
+        is_jpeg = image.compressed is not None and image.compressed.startswith(JPEG)
+        lossy = "depth in a JPEG: JPEG loses depth: record PNG" if is_jpeg else f"named depth, but {image.encoding}"
+        found.append(f"{name} ({f'named {_unlike(topic)}' if image.kind == 'depth' else lossy})")
+    return f"; neither depth nor colour: {listed(found)}" if found else ""
 
 
 def _unread_video(what: str, *, has_depth: bool) -> InputError:

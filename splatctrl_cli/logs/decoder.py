@@ -46,11 +46,16 @@ _KNOWN = frozenset(  # what is read by its fields
 _IMAGE_HEAD = struct.Struct("<4siIIII")
 _MOST_TEXT = 1 << 20  # characters of a definition
 _MOST_ITEMS = 1 << 16  # of a fixed array in a definition: code is generated for each item that is not a number
+_DIRECTIVE = re.compile(r"^[ \t]*#.*$", re.MULTILINE)  # of IDL: what it includes is another part of the text
 _ARRAY = re.compile(r"\[\s*(\d+)\s*\]|,\s*(\d+)\s*>")  # `type[N]` of .msg, `sequence<type, N>` of .idl
 
 
 class UndecodableMessageError(ValueError):
     """A message whose bytes do not fit its type."""
+
+
+class UnreadFormError(UndecodableMessageError):
+    """A message of a form that is not read, or is refused; nothing says that its bytes are damaged."""
 
 
 def is_ros(topic: Topic) -> bool:
@@ -95,7 +100,7 @@ class MessageDecoder:
             except Exception as error:  # a parser over foreign text, RecursionError and MemoryError included
                 self._refused[topic] = " ".join(str(error).split())[:200] or type(error).__name__
         if topic in self._refused:
-            raise UndecodableMessageError(
+            raise UnreadFormError(
                 f"{topic.name}: the definition of {topic.type_name} is not usable: {self._refused[topic]}"
             )
         return self._stores[topic]
@@ -164,11 +169,20 @@ def _store_of(definition: str, form: str, type_name: str) -> Any:
         parts = [part for part in definition.split("=" * 80 + "\n") if part.strip()]
         for part in parts:
             body = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
-            store.register(get_types_from_idl(body))
+            store.register(get_types_from_idl(_DIRECTIVE.sub("", body)))
     else:
         store.register(get_types_from_msg(definition, type_name))
     _check_fields(store)
+    named = {name for _, fields in store.fielddefs.values() for _, kind in fields for name in _names(kind)}
+    if form == "idl" and (missing := sorted(named - store.fielddefs.keys())):
+        raise ValueError(f"it names {', '.join(missing)}, which its text does not define")
     return store
+
+
+def _names(description: Any) -> list[str]:
+    """The types that a field names."""
+    kind, detail = description
+    return [detail] if kind == Nodetype.NAME else [] if kind == Nodetype.BASE else _names(detail[0])
 
 
 def _check_fields(store: Any) -> None:

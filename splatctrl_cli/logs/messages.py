@@ -7,14 +7,14 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.files.image_file import JPEG, decode_file, image_head
-from splatctrl_cli.logs.decoder import IMAGE, UndecodableMessageError, stamp_ns
+from splatctrl_cli.files.image_file import JPEG, PNG, decode_file, image_head
+from splatctrl_cli.logs.decoder import IMAGE, UndecodableMessageError, UnreadFormError, stamp_ns
 from splatctrl_cli.records import MILLIMETRE, Float32, UInt8
 
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
@@ -65,7 +65,10 @@ _LAYOUT = {  # channels and dtype by encoding
     "32FC1": (1, "f4"),
 }
 NO_RETURN = 65535  # counts by which a camera of 16 bits says that it measured nothing
+NO_RETURN_M = np.float32(65.535)  # the same as metres
+FARTHEST = np.float32(1e5)  # units of a float depth, be they metres or millimetres, from which on none is measured
 _DEPTH_HEAD = 12  # bytes of compressed_depth_image_transport before its image
+_FILES = (JPEG, PNG, b"RIFF", b"II*\0", b"MM\0*", b"BM")  # how files begin that should decode
 _MOSAICS = frozenset({*BAYER, *BAYER_16})
 _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
 
@@ -75,7 +78,8 @@ class ImageMessage:
     """An image as recorded, of any type and encoding; only who asks for its pixels has a JPEG or PNG decoded.
 
     width, height [px]; decode gives pixels (H, W[, channels]) in `encoding`, or raises UndecodableMessageError;
-    compressed is the image file's bytes where the message held one (JPEG, PNG) that decodes to `pixels`.
+    compressed is the image file's bytes where the message held one (JPEG, PNG) that decodes to `pixels`; remark says
+    where its bytes are not laid out as its format says.
     """
 
     stamp_ns: int
@@ -85,6 +89,7 @@ class ImageMessage:
     height: int
     decode: Callable[[], NDArray[Any]]
     compressed: bytes | None = None
+    remark: str = ""
 
     @cached_property
     def pixels(self) -> NDArray[Any]:
@@ -122,16 +127,21 @@ def read_image(message: Any, type_name: str, *, lazily: bool = False) -> ImageMe
     if type_name == IMAGE:
         pixels = raw_pixels(message)
         return _image(message, message.encoding, pixels.shape, lambda: pixels, None)
-    data = bytes(message.data)
-    if lazily and (found := _plain(message.format, data)) is not None:
-        encoding, size, file, color = found
-        return _image(message, encoding, size, partial(_decoded, message.format, file, color=color), file)
-    pixels, encoding, compressed = _compressed_pixels(message.format, data)
-    return _image(message, encoding, pixels.shape, lambda: pixels, compressed)
+    packed = _packed(message.format, bytes(message.data))
+    if lazily and (found := _plain(packed)) is not None:
+        encoding, size, color = found
+        return _image(message, encoding, size, partial(_decoded, packed, color=color), packed.file)
+    pixels, encoding, compressed = _compressed_depth(packed) if packed.is_depth else _compressed_pixels(packed)
+    return _image(message, encoding, pixels.shape, lambda: pixels, compressed, packed.remark)
 
 
 def _image(
-    message: Any, encoding: str, size: tuple[int, ...], decode: Callable[[], NDArray[Any]], compressed: bytes | None
+    message: Any,
+    encoding: str,
+    size: tuple[int, ...],
+    decode: Callable[[], NDArray[Any]],
+    compressed: bytes | None,
+    remark: str = "",
 ) -> ImageMessage:
     return ImageMessage(
         stamp_ns=stamp_ns(message.header),
@@ -141,29 +151,79 @@ def _image(
         width=int(size[1]),
         decode=decode,
         compressed=compressed,
+        remark=remark,
     )
 
 
-def _plain(form: str, data: bytes) -> tuple[str, tuple[int, int], bytes, bool] | None:
-    """Encoding, (height, width), file and whether it is colour of a file that needs no decoding to be kept."""
-    is_depth = "compressedDepth" in form
-    recorded = form.partition(";")[0].strip()
-    if is_depth and ("rvl" in form.lower() or recorded == "32FC1"):
+class _Packed(NamedTuple):
+    """The image file of a CompressedImage, and the bytes that compressedDepth puts before it."""
+
+    form: str
+    file: bytes
+    is_depth: bool = False
+    head: bytes = b""
+    remark: str = ""
+
+    @property
+    def recorded(self) -> str:
+        """The encoding that was compressed, where the format says it."""
+        return self.form.partition(";")[0].strip()
+
+    @property
+    def is_rvl(self) -> bool:
+        """Whether the format says RVL."""
+        return "rvl" in self.form.lower()
+
+
+def _packed(form: str, data: bytes) -> _Packed:
+    """Where the file of a message begins, by its first bytes: not all publishers write what `format` says.
+
+    Raises UnreadFormError for depth that JPEG has changed, and for RVL that is called something else.
+    """
+    says_depth, head, file = "compressedDepth" in form, data[:_DEPTH_HEAD], data[_DEPTH_HEAD:]
+    plain, behind = _Packed(form, data), _Packed(form, file, True, head)
+    if plain.recorded in DEPTH_ENCODINGS or says_depth:
+        if data.startswith(JPEG) or (says_depth and file.startswith(JPEG)):
+            raise UnreadFormError(f"depth in a JPEG ({form}): JPEG loses depth: record PNG")
+        if plain.is_rvl and not says_depth:
+            raise UnreadFormError(f"RVL under the format {form!r}: expected {plain.recorded}; compressedDepth rvl")
+    if says_depth and data.startswith(PNG):
+        if plain.recorded == "32FC1":
+            raise UnreadFormError(f"compressed depth ({form}): 32FC1 without the 12 bytes that say what a count is")
+        return _Packed(form, data, True, remark=f"compressed depth ({form}): its PNG begins at byte 0, not 12")
+    if says_depth and not plain.is_rvl and not file.startswith(PNG) and _is_rvl(file):
+        raise UnreadFormError(f"RVL under the format {form!r}: expected {plain.recorded}; compressedDepth rvl")
+    if not says_depth and file.startswith(PNG):
+        return behind._replace(remark=f"compressed image ({form}): a PNG behind 12 bytes, read as compressedDepth")
+    return behind if says_depth else plain
+
+
+def _is_rvl(file: bytes) -> bool:
+    try:
+        return _rvl_counts(file).any() > 0
+    except UndecodableMessageError:
+        return False
+
+
+def _plain(packed: _Packed) -> tuple[str, tuple[int, int], bool] | None:
+    """Encoding, (height, width) and whether it is colour of a file that needs no decoding to be kept."""
+    is_depth = packed.is_depth
+    if is_depth and (packed.is_rvl or packed.recorded == "32FC1"):
         return None
-    file = data[_DEPTH_HEAD:] if is_depth else data
-    head = image_head(file)
-    if head is None or (is_depth and head.channels != 1) or recorded in _MOSAICS:
+    head = image_head(packed.file)
+    if head is None or (is_depth and head.channels != 1) or packed.recorded in _MOSAICS:
         return None
     size = (head.height, head.width)
     if is_depth or (head.channels, head.bits) == (1, 16):
-        return ("16UC1", size, file, False) if head.bits == 16 else None
-    return ("mono8" if head.channels == 1 else "rgb8", size, file, head.channels != 1)
+        return ("16UC1", size, False) if head.bits == 16 else None
+    return ("mono8" if head.channels == 1 else "rgb8", size, head.channels != 1)
 
 
-def _decoded(form: str, data: bytes, *, color: bool) -> NDArray[Any]:
-    pixels = decode_file(data, color=color)
+def _decoded(packed: _Packed, *, color: bool) -> NDArray[Any]:
+    pixels = decode_file(packed.file, color=color)
     if pixels is None:
-        raise UndecodableMessageError(f"compressed image ({form}): {len(data)} bytes that are not an image file")
+        what = f"compressed image ({packed.form}): {len(packed.file)} bytes that are not an image file"
+        raise (UndecodableMessageError if packed.file.startswith(_FILES) else UnreadFormError)(what)
     return pixels
 
 
@@ -237,14 +297,19 @@ def depth_of(image: ImageMessage, scale: float | None) -> Float32:
 
 
 def num_invalid(depth: NDArray[Any]) -> int:
-    """Pixels of a depth image (H, W) as recorded that are NaN, infinite, negative or `NO_RETURN`: not measured."""
-    return int((depth == NO_RETURN if depth.dtype.kind == "u" else ~np.isfinite(depth) | (depth < 0)).sum())
+    """Pixels of a depth image (H, W) as recorded that are negative, NaN, infinite or a code for no return."""
+    is_invalid = depth == NO_RETURN
+    if depth.dtype.kind != "u":
+        is_invalid |= ~(depth >= 0) | (np.abs(depth - NO_RETURN_M) < 1e-4) | (depth >= FARTHEST)
+    return int(is_invalid.sum())
 
 
 def measured(depth: NDArray[Any], scale: float) -> Float32:
-    """Float depth (H, W) as float32 [m]; 0, negative and non-finite values (REP 118: no measurement) become 0."""
-    values = depth * np.float32(scale)
-    return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+    """Float depth (H, W) as float32 [m]; what is not measured becomes 0: 0, negative and non-finite values (REP 118),
+    65535 and 65.535 (counts without return, and the same as metres), and all from `FARTHEST` on.
+    """
+    is_code = (depth == NO_RETURN) | (np.abs(depth - NO_RETURN_M) < 1e-4)
+    return np.where((depth > 0) & (depth < FARTHEST) & ~is_code, depth * np.float32(scale), 0).astype(np.float32)
 
 
 def metres(counts: NDArray[Any], scale: float) -> Float32:
@@ -257,13 +322,11 @@ def metres(counts: NDArray[Any], scale: float) -> Float32:
     return depth
 
 
-def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes | None]:
-    if "compressedDepth" in form:
-        return _compressed_depth(form, data)
+def _compressed_pixels(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None]:
+    form, data, recorded = packed.form, packed.file, packed.recorded
     if data.startswith(JPEG) and (head := image_head(data)) is not None and head.channels == 3:
-        return _decoded(form, data, color=True), "rgb8", data
-    pixels = _decoded(form, data, color=False)
-    recorded = form.partition(";")[0].strip()
+        return _decoded(packed, color=True), "rgb8", data
+    pixels = _decoded(packed, color=False)
     if pixels.ndim == 2 and recorded in _MOSAICS and pixels.dtype == (np.uint8 if recorded in BAYER else np.uint16):
         return pixels, recorded, None  # a mosaic in a file: its bytes are not a colour image
     if pixels.ndim == 2 and pixels.dtype == np.uint16:
@@ -271,7 +334,7 @@ def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes
     if pixels.ndim == 2 and pixels.dtype == np.float32:  # TIFF, as compressed_image_transport stores 32FC1
         return pixels, "32FC1", None
     if pixels.ndim == 3 and (pixels.dtype != np.uint8 or pixels.shape[2] != 3):
-        return _decoded(form, data, color=True), "rgb8", data
+        return _decoded(packed, color=True), "rgb8", data
     if pixels.dtype != np.uint8:
         raise UndecodableMessageError(
             f"compressed image ({form}): pixels of {pixels.dtype}, neither colour nor depth"
@@ -279,17 +342,18 @@ def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes
     return pixels, "mono8" if pixels.ndim == 2 else "bgr8", data
 
 
-def _compressed_depth(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes | None]:
+def _compressed_depth(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None]:
     """compressed_depth_image_transport: 12 bytes (int32, two float32 A, B), then a PNG or the sizes (two int32) and
     RVL; 32FC1 is A / (count - B) (its codec.cpp and rvl_codec.cpp).
     """
-    is_rvl, file = "rvl" in form.lower(), data[_DEPTH_HEAD:]
-    counts = _rvl_counts(file) if is_rvl else decode_file(file, color=False)
+    counts = _rvl_counts(packed.file) if packed.is_rvl else decode_file(packed.file, color=False)
     if counts is None or counts.ndim != 2:
-        raise UndecodableMessageError(f"compressed depth ({form}): {len(data)} bytes that hold no depth image")
-    if not form.strip().startswith("32FC1"):
-        return counts, "16UC1", None if is_rvl or counts.dtype != np.uint16 else file
-    _, a, b = struct.unpack_from("<iff", data)
+        what = f"compressed depth ({packed.form}): {len(packed.file)} bytes that hold no depth image"
+        is_cut = packed.file.startswith(_FILES) and counts is None
+        raise (UndecodableMessageError if is_cut else UnreadFormError)(what)
+    if packed.recorded != "32FC1":
+        return counts, "16UC1", None if packed.is_rvl or counts.dtype != np.uint16 else packed.file
+    _, a, b = struct.unpack("<iff", packed.head)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.where(counts > 0, a / (counts.astype(np.float64) - b), 0.0)
     return depth.astype(np.float32), "32FC1", None

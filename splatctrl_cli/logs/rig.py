@@ -202,6 +202,7 @@ class _Builder:
     def build(self) -> Camera:
         """The camera. Raises InputError for the first thing it lacks."""
         topics = self._topics
+        self._check_depth()
         self._check_clock()
         calibration = self._calibration(topics.info, topics.color)
         undistortion = self._undistortion(calibration, topics.info)
@@ -227,6 +228,7 @@ class _Builder:
         found = []
         intrinsics = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
         steps: list[Callable[[], object]] = [
+            self._check_depth,
             self._check_clock,
             lambda: self._calibration(self._topics.info, self._topics.color),
             self._check_world,
@@ -273,13 +275,19 @@ class _Builder:
         image = self._survey.topics[image_topic].first_image
         assert image is not None
         size, expected = (image.width, image.height), (calibration.width, calibration.height)
-        if expected == (0, 0):
+        if expected == (0, 0) and not calibration.cut:
             expected = size
+        by_hand = f", or give --intrinsics {self._topics.name}=FX,FY,CX,CY of the recorded images"
+        remedy = f"name the right CameraInfo with --camera{by_hand if calibration.cut else ''}"
+        if not calibration.is_possible:
+            what = f"{info} says {calibration.cut}, which it is not inside of, for images of {size[0]}x{size[1]}"
+            raise InputError(f"{self._where}: topic {image_topic}: {what}", remedy=remedy)
         if size != expected:
+            cut = f" ({calibration.cut})" if calibration.cut else ""
             raise InputError(
-                f"{self._where}: topic {image_topic}: expected {expected[0]}x{expected[1]} images as {info} says,"
-                f" got {size[0]}x{size[1]}",
-                remedy="name the right CameraInfo with --camera",
+                f"{self._where}: topic {image_topic}: expected {expected[0]}x{expected[1]} images as {info}"
+                f" says{cut}, got {size[0]}x{size[1]}",
+                remedy=remedy,
             )
         sized = replace(calibration, width=size[0], height=size[1])
         lens = image_lens(self._survey, image_topic, sized)
@@ -311,6 +319,22 @@ class _Builder:
             distortion=np.array(distortion),
             frame_id=image.frame_id,
         )
+
+    def _check_depth(self) -> None:
+        """Raise InputError where the depth topic holds something else, or several could be it."""
+        topics = self._topics
+        image = self._survey.topics[topics.depth].first_image
+        assert image is not None
+        if image.kind != "depth":
+            raise InputError(
+                f"{self._where}: topic {topics.depth}: expected depth images, got {image.encoding}",
+                remedy="name a topic of depth images with --camera",
+            )
+        if topics.rivals:
+            raise InputError(
+                f"{self._where}: {', '.join(topics.rivals)} could each be its depth, and no name says which",
+                remedy=f"give --camera {topics.name}={topics.color},DEPTH with the one that is depth",
+            )
 
     def _check_clock(self) -> None:
         """Raise InputError where a clock went back: one stamp stands for two times then, of images and of tf."""
@@ -374,6 +398,12 @@ class _Builder:
                 f"camera {topics.name}: {topics.info} and {topics.depth_info} differ in distortion: colour and depth"
                 " are undistorted each by its own"
             )
+        color_info = self._survey.topics[topics.info].calibration if topics.info else None
+        if T_color_depth is None and frame == color_frame and color_info is not None:
+            is_one_sensor = (calibration.cut or color_info.cut) and np.allclose(
+                calibration.sensor_K, color_info.sensor_K, rtol=0.01
+            )
+            T_color_depth = np.eye(4) if is_one_sensor else None
         if T_color_depth is None and frame == color_frame:
             raise InputError(
                 f"{what}: their CameraInfo differ but both say frame {frame!r}",

@@ -173,7 +173,7 @@ class RosLogSource:
                 lost.damage.add(f"camera {camera.name} at {planned.stamp_ns} ns: {error}")
                 continue
             human = self._human(camera, masks[0]) if masks else None
-            if not depth.is_counts:
+            if depth.compressed is None:
                 lost.num_invalid += num_invalid(depth.pixels)
             stored = _stored_frame(planned, color, depth, human, messages)
             if camera.name not in checked:

@@ -13,13 +13,16 @@ PERTURB = "--perturb "  # likewise, what was done to them
 
 @dataclass(frozen=True, kw_only=True)
 class CameraTopics:
-    """The topics of one RGB-D camera; an empty info or depth_info means that none was found."""
+    """The topics of one RGB-D camera; an empty info or depth_info means that none was found. rivals: topics that
+    could each be its depth, where nothing tells which is.
+    """
 
     name: str
     color: str
     depth: str
     info: str = ""
     depth_info: str = ""
+    rivals: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,7 @@ from splatctrl_cli.logs.decoder import (
     MessageDecoder,
     RealSense,
     UndecodableMessageError,
+    UnreadFormError,
     header_stamp_ns,
     is_ros,
     stamp_ns,
@@ -138,6 +139,9 @@ class Calibration:
     """What a CameraInfo says: size [px], K (3, 3) of the raw image with its distortion, projection (3, 3) of the
     rectified image (the left part of P; zero where unset), rotation (3, 3) from the raw camera's axes to those of the
     rectified (zero where unset), frame. valid (H, W): of a rectified image, False where the lens did not see a pixel.
+
+    Of images that are binned or cut out, these are theirs and sensor_K (3, 3) is that of the whole sensor; cut says
+    how in words ("" where they are whole), is_possible whether the region lies inside the sensor.
     """
 
     width: int
@@ -149,6 +153,9 @@ class Calibration:
     distortion: Float64
     frame_id: str
     valid: Bool | None = None
+    sensor_K: Float64 | None = None
+    cut: str = ""
+    is_possible: bool = True
 
 
 @dataclass(kw_only=True)
@@ -213,12 +220,15 @@ def add_message(result: Survey, decoder: MessageDecoder, message: RawMessage) ->
     if is_ros(message.topic):
         try:
             _take(result, entry, decoder, message)
+        except UnreadFormError as error:
+            name = message.topic.name
+            result.damage.remark(str(error) if str(error).startswith(name) else f"{name}: {error}")
         except (UndecodableMessageError, ValueError) as error:
             result.damage.add(str(error))
         except OverflowError:
             result.damage.add(f"{message.topic.name}: a time beyond 2^63 ns")
         except AttributeError as error:  # a definition of a known name with other fields
-            result.damage.add(f"{message.topic.name}: a {message.topic.type_name} of another definition: {error}")
+            result.damage.remark(f"{message.topic.name}: a {message.topic.type_name} of another definition: {error}")
 
 
 def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: RawMessage) -> None:
@@ -230,8 +240,12 @@ def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: 
         result.realsense.add_image(message)
         if entry.first_image is None:
             entry.first_image = read_image(decoder.decode(message), kind)
+            if entry.first_image.remark:
+                result.damage.remark(f"{message.topic.name}: {entry.first_image.remark}")
     elif kind == CAMERA_INFO and entry.calibration is None:
         entry.calibration = _calibration(decoder.decode(message))
+        if entry.calibration is not None and entry.calibration.cut and entry.calibration.is_possible:
+            result.damage.remark(f"{message.topic.name}: says {entry.calibration.cut}: K is moved and scaled to that")
     elif kind in STATE_TYPES and (message.topic.definition or kind in STANDARD_TYPES):
         entry.joints.extend(_states(result, decoder.decode(message), message))
     elif kind in {TRANSFORM, OPTION} and message.topic.name.startswith("/device_"):
@@ -248,7 +262,7 @@ def _calibration(message: Any) -> Calibration | None:
     K = np.asarray(fields["k"], dtype=np.float64).reshape(3, 3)
     if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
         return None  # an uncalibrated driver publishes zeros
-    return Calibration(
+    calibration = Calibration(
         width=int(message.width),
         height=int(message.height),
         K=K,
@@ -257,6 +271,33 @@ def _calibration(message: Any) -> Calibration | None:
         distortion_model=str(message.distortion_model),
         distortion=np.asarray(fields["d"], dtype=np.float64),
         frame_id=message.header.frame_id.strip("/"),
+        sensor_K=K,
+    )
+    return _cut(calibration, message)
+
+
+def _cut(whole: Calibration, message: Any) -> Calibration:
+    """The camera of images that are binned or cut out of those of the whole sensor, as image_geometry takes it: moved
+    by the region's corner, then divided by the binning.
+    """
+    across, down = (max(1, int(getattr(message, name, 0))) for name in ("binning_x", "binning_y"))
+    roi, size = getattr(message, "roi", None), (whole.width, whole.height)
+    x, y, width, height = (int(getattr(roi, name, 0)) for name in ("x_offset", "y_offset", "width", "height"))
+    is_whole = not any((x, y, width, height)) or (x, y, width, height) == (0, 0, *size)
+    if is_whole and across == down == 1:
+        return whole
+    width, height = size if is_whole else (width, height)
+    region = "" if is_whole else f"region of {width}x{height} at ({x}, {y}) of {size[0]}x{size[1]}"
+    binning = f"binning {across}x{down} of {size[0]}x{size[1]}" if across * down > 1 else ""
+    A = np.array([[1 / across, 0, -x / across], [0, 1 / down, -y / down], [0, 0, 1]])
+    return replace(
+        whole,
+        width=width // across,
+        height=height // down,
+        K=A @ whole.K,
+        projection=A @ whole.projection,
+        cut=", ".join(filter(None, (region, binning))),
+        is_possible=width > 0 and height > 0 and x + width <= size[0] and y + height <= size[1],
     )
 
 

@@ -1,12 +1,16 @@
 """Containers of other recorders."""
 
+import copy
+import re
 import sqlite3
+import struct
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
@@ -14,10 +18,11 @@ from splatctrl_cli.captures.capture_header import read_capture_header
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.raw_log import RawMessage
 from splatctrl_cli.logs.survey import survey
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float32, Float64, RgbdFrame
 from splatctrl_cli.sources.source import open_source
 from tests.cases.case import Case, Run
-from tests.logs.make_log import STORE, LogRecipe, T, encoded, header, make_log, messages_of, write_raw
+from tests.logs.make_log import STORE, LogRecipe, T, broken_log, encoded, header, make_log, messages_of, write_raw
+from tests.logs.make_rvl import encoded_rvl
 
 
 def recorded(folder: Path, recipe: LogRecipe | None = None) -> list[RawMessage]:
@@ -26,6 +31,11 @@ def recorded(folder: Path, recipe: LogRecipe | None = None) -> list[RawMessage]:
     messages = list(messages_of(path))
     path.unlink()
     return messages
+
+
+def first_depth(path: Path) -> Float32:
+    """The depth [m] of a recording's first frame."""
+    return next(record for record in open_source(path).records() if isinstance(record, RgbdFrame)).depth
 
 
 def write_db3(folder: Path, messages: Iterable[RawMessage], mode: CompressionMode = CompressionMode.NONE) -> Path:
@@ -166,8 +176,280 @@ def _examine_sdk(folder: Path, out: Path, run: Run) -> None:
         T_color_depth = found.T_between(f"{SDK_COLOR}/image/data", f"{SDK_DEPTH}/image/data")
         np.testing.assert_allclose(T_color_depth, expected, atol=1e-6)
         assert found.depth_unit(f"{SDK_DEPTH}/image/data") == (0.00025 if is_turned else 0.001)
-        depth = next(iter(open_source(out / f"{path.name}.capture").records())).depth
+        depth = first_depth(out / f"{path.name}.capture")
         assert is_turned or abs(np.median(depth[depth > 0]) - 1.2) < 0.002
+
+
+def _change_depth(folder: Path, name: str, change: Callable[[Any], Any], encoding: str = "16UC1") -> None:
+    """A good log of six frames whose depth messages are what `change` makes of them, under their topic or another."""
+
+    def changed(log_ns: int, topic: str, kind: str, message: Any) -> Iterable[tuple[int, str, str, Any]]:
+        is_depth = topic == "/cam0/depth/image_raw"
+        message = change(message) if is_depth else message
+        is_packed = is_depth and message.__msgtype__.endswith("CompressedImage")
+        yield log_ns, f"{topic}/compressedDepth" if is_packed else topic, kind, message
+
+    broken_log(folder / name, changed, LogRecipe(num_frames=6, depth_encoding=encoding))
+    (folder / name).with_suffix(".good.mcap").unlink()
+
+
+def _with_code(value: float, dtype: str) -> Callable[[Any], Any]:
+    def change(message: Any) -> Any:
+        pixels = np.frombuffer(message.data.tobytes(), dtype).reshape(message.height, message.width).copy()
+        pixels[:5] = value
+        message.data = np.frombuffer(pixels.tobytes(), np.uint8)
+        return message
+
+    return change
+
+
+CODES = {"14-65535": 65535, "float-mm": 65.535, "float-far": 1e6, "float-max": np.finfo(np.float32).max}
+CONSTANTS = {"ten-metres": 10.0, "four-metres": 4.0, "counts-65534": 65534}
+
+
+def _make_codes(folder: Path) -> None:
+    for name, value in {**CODES, **CONSTANTS}.items():
+        is_counts = isinstance(value, int)
+        encoding, dtype = ("16UC1", "<u2") if is_counts else ("32FC1", "<f4")
+        _change_depth(folder, f"{name}.mcap", _with_code(value, dtype), encoding)
+
+
+def _examine_codes(folder: Path, out: Path, run: Run) -> None:
+    for path in sorted(folder.glob("*.mcap")):
+        result = run(["check", path])
+        assert result.code == 0, result.text
+        if path.stem in CODES:
+            assert re.search(r"\d+ depth pixels of 6 images are [^.]*65535 .*count as none", result.text)
+            assert "depth-constant" not in result.text
+        else:
+            value = {"counts-65534": 65.534}.get(path.stem, CONSTANTS[path.stem])
+            assert f"many pixels are exactly {value:g} m, the largest depth of 6 of 6 images" in result.text
+        result = run(["ingest", path, "-o", out / f"{path.stem}.capture"])
+        assert result.code == 0, result.text
+        if path.stem in CODES:
+            assert read_capture_header(out / f"{path.stem}.capture")["loss"]["invalid_depth"] > 500
+            depth = first_depth(out / f"{path.stem}.capture")
+            assert depth.max() < 2.0
+            words = [
+                "--set",
+                "scene.first_iterations=2",
+                "--set",
+                "scene.iterations_per_step=1",
+                "--max-splats",
+                "200",
+            ]
+            result = run(["reconstruct", path, "-o", out / f"{path.stem}.scene", *words])
+            assert result.code == 0, result.text
+
+
+def _png(message: Any) -> bytes:
+    counts = np.frombuffer(message.data.tobytes(), "<u2").reshape(message.height, message.width)
+    return bytes(cv2.imencode(".png", counts)[1])
+
+
+def _packed(form: str, head: bytes, pack: Callable[[Any], bytes] = _png) -> Callable[[Any], Any]:
+    def change(message: Any) -> Any:
+        data = np.frombuffer(head + pack(message), np.uint8)
+        return T["sensor_msgs/msg/CompressedImage"](header=message.header, format=form, data=data)
+
+    return change
+
+
+def _jpeg(message: Any) -> bytes:
+    counts = np.frombuffer(message.data.tobytes(), "<u2").reshape(message.height, message.width)
+    return bytes(cv2.imencode(".jpg", (counts >> 4).astype(np.uint8))[1])
+
+
+def _rvl(message: Any) -> bytes:
+    counts = np.frombuffer(message.data.tobytes(), "<u2")
+    return struct.pack("<ii", message.width, message.height) + encoded_rvl(counts)
+
+
+HEAD = struct.pack("<iff", 0, 0.0, 0.0)
+READ = {
+    "04-cd-nohead": _packed("16UC1; compressedDepth", b""),
+    "04-cd-16uc1": _packed("16UC1; png compressed ", HEAD),
+    "png-nohead": _packed("16UC1; compressedDepth png", b""),
+    "just-png": _packed("png", HEAD),
+}
+REFUSED = {
+    "rvl-unsaid": (_packed("16UC1; compressedDepth", HEAD, _rvl), "RVL under the format '16UC1; compressedDepth'"),
+    "rvl-other": (_packed("16UC1; rvl", HEAD, _rvl), "RVL under the format '16UC1; rvl'"),
+    "jpeg-inside": (_packed("16UC1; compressedDepth", HEAD, _jpeg), "JPEG loses depth: record PNG"),
+    "jpeg-said": (_packed("16UC1; jpeg compressed ", b"", _jpeg), "JPEG loses depth: record PNG"),
+    "jpeg": (_packed("jpeg", b"", _jpeg), "JPEG loses depth: record PNG"),
+    "float-nohead": (_packed("32FC1; compressedDepth", b""), "32FC1 without the 12 bytes"),
+}
+
+
+def _make_packed(folder: Path) -> None:
+    for name, change in (*READ.items(), *((name, change) for name, (change, _) in REFUSED.items())):
+        _change_depth(folder, f"{name}.mcap", change)
+
+
+def _examine_packed(folder: Path, out: Path, run: Run) -> None:
+    for path in sorted(folder.glob("*.mcap")):
+        result = run(["ingest", path, "-o", out / f"{path.stem}.capture"])
+        assert "damaged" not in result.text
+        assert "copy the file" not in result.text
+        if path.stem in READ:
+            assert result.code == 0, result.text
+            assert result.text.count("its PNG begins at byte 0") + result.text.count("a PNG behind 12 bytes") == 1
+            depth = first_depth(out / f"{path.stem}.capture")
+            assert 1.0 < np.median(depth[depth > 0]) < 1.3
+        else:
+            assert result.code == 4, result.text
+            assert REFUSED[path.stem][1] in result.text
+            assert "/cam0/depth/image_raw/compressedDepth" in result.text
+            assert REFUSED[path.stem][1] in run(["check", path]).text
+
+
+def _rename(folder: Path, name: str, topics: dict[str, str], encoding: str = "mono16", color: str = "rgb8") -> None:
+    """A good log of six frames under other names; a depth topic may have several, or none."""
+
+    def changed(log_ns: int, topic: str, kind: str, message: Any) -> Iterable[tuple[int, str, str, Any]]:
+        for known, others in topics.items():
+            if topic == known:
+                for other in filter(None, others.split()):
+                    yield log_ns, other, kind, message
+                return
+        yield log_ns, topic, kind, message
+
+    recipe = LogRecipe(num_frames=6, depth_encoding=encoding, color_format=color)
+    broken_log(folder / f"{name}.mcap", changed, recipe)
+    (folder / f"{name}.good.mcap").unlink()
+
+
+COLOR_0, DEPTH_0 = "/cam0/color/image_raw", "/cam0/depth/image_raw"
+NO_DEPTH = {  # the topic of sixteen bits, and its word
+    "21-k4a-ironly": ("/ir/image_raw", "ir"),
+    "infra": ("/cam0/infra1/image_rect_raw", "infra"),
+    "infra-plain": ("/cam0/infra/image_raw", "infra"),
+    "aux": ("/cam0/aux/image_raw", "aux"),
+    "kinect2": ("/cam0/sd/image_ir_rect", "ir"),
+    "thermal": ("/cam0/thermal/image_raw", "thermal"),
+    "amplitude": ("/cam0/depth/amplitude", "amplitude"),
+    "confidence": ("/cam0/depth/confidence_map", "confidence"),
+    "intensity": ("/cam0/intensity", "intensity"),
+    "disparity": ("/cam0/stereo/disparity", "disparity"),
+}
+DEPTHS = {  # topics of sixteen bits, and which of them is depth
+    "mono16": "/cam0/depth/image_raw",
+    "beside": "/cam0/depth/image_raw /cam0/a_ir/image_raw",
+    "aligned-to-infra": "/cam0/aligned_depth_to_infra1/image_raw /cam0/infra1/image_rect_raw",
+    "in-an-ir-device": "/cam0/ir_camera/depth/image_raw /cam0/ir_camera/image_mono",
+    "unnamed-beside": "/cam0/z16/image_raw /cam0/ir/image_raw",
+    "k4a": "/cam0/depth_to_rgb/image_raw /cam0/ir/image_raw",
+}
+
+
+def _make_infrared(folder: Path) -> None:
+    for name, (topic, _) in NO_DEPTH.items():
+        _rename(folder, name, {DEPTH_0: topic}, encoding="16UC1" if name == "aux" else "mono16")
+    for name, topics in DEPTHS.items():
+        _rename(folder, name, {DEPTH_0: topics})
+    _rename(folder, "rivals", {DEPTH_0: "/cam0/one/image_raw /cam0/two/image_raw"})
+    _rename(folder, "gray-depth", {COLOR_0: DEPTH_0, DEPTH_0: "/cam0/z16"}, color="mono8")
+
+
+def _examine_infrared(folder: Path, out: Path, run: Run) -> None:
+    for path in sorted(folder.glob("*.mcap")):
+        capture = out / f"{path.stem}.capture"
+        result = run(["ingest", path, "-o", capture])
+        if path.stem in NO_DEPTH:
+            topic, word = NO_DEPTH[path.stem]
+            assert result.code == 4, result.text
+            assert f"no depth topic; neither depth nor colour: {topic} (named {word})" in result.text
+            assert "give --camera NAME=COLOR,DEPTH" in result.text
+            assert "no depth topic" in run(["check", path]).text
+        elif path.stem in DEPTHS:
+            assert result.code == 0, result.text
+            assert DEPTHS[path.stem].split()[0] in run(["info", path]).out.splitlines()[-1]
+        elif path.stem == "gray-depth":
+            assert result.code == 4, result.text
+            assert "/cam0/depth/image_raw (named depth, but mono8)" in result.text
+        else:
+            assert result.code == 4, result.text
+            assert "/cam0/one/image_raw, /cam0/two/image_raw could each be its depth" in result.text
+            given = "cam0=/cam0/color/image_raw,/cam0/two/image_raw"
+            assert "give --camera cam0=/cam0/color/image_raw,DEPTH" in result.text
+            assert "could each be its depth" in run(["info", path]).text
+            assert run(["ingest", path, "-o", capture, "--camera", given]).code == 0
+
+
+def _with_info(
+    folder: Path, name: str, lens: tuple[float, float, float], size: tuple[int, int], cut: tuple[int, ...], of: str
+) -> None:
+    """A good log of 32x24 images whose CameraInfo `of` color or depth says this lens (f, cx, cy) and size of the
+    sensor, and is cut: binning, x, y, width and height of the region, whether it is to be rectified.
+    """
+
+    def changed(log_ns: int, topic: str, kind: str, message: Any) -> Iterable[tuple[int, str, str, Any]]:
+        if not topic.endswith("camera_info"):
+            yield log_ns, topic, kind, message
+            return
+        if of == "depth":
+            yield log_ns, topic, kind, message
+        said = copy.deepcopy(message)
+        (f, cx, cy), (binning, x, y, width, height, rectify) = lens, cut
+        said.width, said.height = size
+        said.k, said.p = np.array([f, 0, cx, 0, f, cy, 0, 0, 1]), np.array([f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1, 0])
+        said.binning_x = said.binning_y = binning
+        roi = {"x_offset": x, "y_offset": y, "width": width, "height": height, "do_rectify": bool(rectify)}
+        said.roi = T["sensor_msgs/msg/RegionOfInterest"](**roi)
+        yield log_ns, topic.replace("color", of), kind, said
+
+    broken_log(folder / f"{name}.mcap", changed, LogRecipe(num_frames=6))
+    (folder / f"{name}.good.mcap").unlink()
+
+
+CUT = {  # lens and size of the whole sensor, the cut, and fx, cx, cy of the images
+    "binning": ((60, 31.5, 23.5), (64, 48), (2, 0, 0, 0, 0, 0), (30, 15.75, 11.75)),
+    "roi": ((30, 25.5, 18.5), (64, 48), (0, 10, 7, 32, 24, 1), (30, 15.5, 11.5)),
+    "roi-raw": ((30, 25.5, 18.5), (64, 48), (1, 10, 7, 32, 24, 0), (30, 15.5, 11.5)),
+    "both": ((60, 41.5, 33.5), (128, 96), (2, 10, 10, 64, 48, 0), (30, 15.75, 11.75)),
+    "whole": ((30, 15.5, 11.5), (32, 24), (0, 0, 0, 32, 24, 0), (30, 15.5, 11.5)),
+    "one": ((30, 15.5, 11.5), (32, 24), (1, 0, 0, 0, 0, 0), (30, 15.5, 11.5)),
+}
+SHARED_CUT = {"02-binning": (60, 31.75, 23.75), "02-roi": (60, 31.5, 23.5)}
+CONTRADICTED = {  # lens, size and cut as above, and what is said
+    "02-roi-size": ((30, 18.5, 13.5), (32, 24), (0, 3, 2, 32, 24, 0), "says region of"),
+    "offset": ((30, 25.5, 18.5), (32, 24), (0, 3, 2, 29, 22, 0), "(region of 29x22 at (3, 2) of 32x24), got 32x24"),
+    "no-size": ((30, 25.5, 18.5), (64, 48), (0, 3, 2, 0, 0, 0), "says region of 0x0 at (3, 2) of 64x48"),
+    "other-size": ((30, 25.5, 18.5), (64, 48), (0, 10, 7, 40, 24, 0), "region of 40x24 at (10, 7) of 64x48), got"),
+    "unbinned": ((30, 15.5, 11.5), (32, 24), (2, 0, 0, 0, 0, 0), "(binning 2x2 of 32x24), got 32x24"),
+}
+
+
+def _make_cut(folder: Path) -> None:
+    for name, (lens, size, cut, _) in CUT.items():
+        _with_info(folder, name, lens, size, cut, "color")
+    for name, (lens, size, cut, _) in CONTRADICTED.items():
+        _with_info(folder, name, lens, size, cut, "color")
+    _with_info(folder, "depth-alone", (30, 21.5, 11.5), (64, 48), (0, 10, 0, 32, 24, 0), "depth")
+
+
+def _examine_cut(folder: Path, out: Path, run: Run) -> None:
+    for path in sorted(folder.glob("*.mcap")):
+        capture = out / f"{path.stem}.capture"
+        result = run(["ingest", path, "-o", capture])
+        if path.stem in CONTRADICTED:
+            assert result.code == 4, result.text
+            assert CONTRADICTED[path.stem][3] in result.text
+            name = re.search(r"camera (\w+):", result.text)[1]
+            by_hand = f"{name}=60,60,31.5,23.5"
+            assert f"give --intrinsics {name}=FX,FY,CX,CY of the recorded images" in result.text
+            assert run(["check", path]).code != 0
+            assert run(["ingest", path, "-o", capture, "--intrinsics", by_hand]).code == 0
+            continue
+        assert result.code == 0, result.text
+        camera = next(iter(read_capture_header(capture)["cameras"].values()))
+        if path.stem == "depth-alone":
+            assert "/cam0/depth/camera_info: says region of 32x24 at (10, 0) of 64x48" in result.text
+            continue
+        f, cx, cy = SHARED_CUT[path.stem] if path.stem in SHARED_CUT else CUT[path.stem][3]
+        assert [camera[key] for key in ("fx", "fy", "cx", "cy")] == [f, f, cx, cy]
+        assert ("K is moved and scaled to that" in result.text) == (path.stem not in {"whole", "one"})
 
 
 def _make_foreign(folder: Path) -> None:
@@ -194,8 +476,12 @@ def _examine_foreign(folder: Path, out: Path, run: Run) -> None:
 
 
 CASES: tuple[Case, ...] = (
+    Case(name="09-ir-taken-for-depth", make=_make_infrared, examine=_examine_infrared, has_shared=True),
+    Case(name="10-depth-65535", make=_make_codes, examine=_examine_codes, has_shared=True),
     Case(name="21-realsense-sdk-db3", make=_make_sdk, examine=_examine_sdk, has_shared=True),
     Case(name="23-db3-wal-all", make=_make_killed, examine=_examine_killed, has_shared=True),
     Case(name="24-message-zstd-single-db3", make=_make_message_mode, examine=_examine_message_mode, has_shared=True),
+    Case(name="25-compressedDepth-without-header", make=_make_packed, examine=_examine_packed, has_shared=True),
+    Case(name="27-camera-info-binning-roi", make=_make_cut, examine=_examine_cut, has_shared=True),
     Case(name="34-record3d-mkv", make=_make_foreign, examine=_examine_foreign, has_shared=True),
 )

@@ -4,6 +4,7 @@ depth.
 
 import struct
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,11 +14,13 @@ import pytest
 
 from splatctrl_cli.containers.raw_log import RawMessage, Topic
 from splatctrl_cli.logs import decoder
-from splatctrl_cli.logs.decoder import COMPRESSED_IMAGE, MessageDecoder, UndecodableMessageError
+from splatctrl_cli.logs.decoder import COMPRESSED_IMAGE, MessageDecoder, UndecodableMessageError, UnreadFormError
 from splatctrl_cli.logs.messages import decode_rvl, depth_of, read_image
+from splatctrl_cli.logs.survey import Survey, add_message
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import describe, open_source
 from tests.logs.make_log import START_NS, STORE, T, header, make_log, messages_of, write_raw
+from tests.logs.make_rvl import encoded_rvl
 
 DEEP = "\n".join(f"{'=' * 80}\nMSG: a/T{i}\nT{i + 1} x" for i in range(2000))
 HOSTILE = {
@@ -129,9 +132,11 @@ def test_an_alien_schema_costs_one_topic(tmp_path: Path) -> None:
     source = open_source(with_alien)
     assert len([r for r in source.records() if isinstance(r, RgbdFrame)]) == 5
     assert len(list(source.records())) == whole
-    assert source.loss.damaged == 3
-    assert all("/alien" in note for note in source.loss.notes)
-    assert describe(with_alien).damaged == 3
+    assert source.loss.damaged == 0  # a definition that cannot be used is no damage
+    assert [note.partition(":")[0] for note in source.loss.notes] == ["/alien"]
+    assert "is not usable" in source.loss.notes[0]
+    assert "(3 times)" in source.loss.notes[0]
+    assert describe(with_alien).damaged == 0
 
 
 def _with_alien(log: Path, path: Path) -> Path:
@@ -143,32 +148,6 @@ def _with_alien(log: Path, path: Path) -> Path:
 
 
 COUNTS = np.array([[0, 1, 500], [1000, 40000, 65534]], dtype=np.uint16)
-
-
-def encoded_rvl(pixels: np.ndarray[Any, np.dtype[np.uint16]]) -> bytes:
-    """Wilson's encoder, number by number."""
-    nibbles: list[int] = []
-
-    def put(value: int) -> None:
-        while True:
-            low, value = value & 7, value >> 3
-            nibbles.append(low | (8 if value else 0))
-            if not value:
-                return
-
-    flat, previous, index = pixels.ravel().astype(int).tolist(), 0, 0
-    while index < len(flat):
-        zeros = next((k for k, v in enumerate(flat[index:]) if v), len(flat) - index)
-        values = next((k for k, v in enumerate(flat[index + zeros :]) if not v), len(flat) - index - zeros)
-        put(zeros)
-        put(values)
-        for value in flat[index + zeros : index + zeros + values]:
-            delta, previous = value - previous, value
-            put((delta << 1) ^ (delta >> 63))
-        index += zeros + values
-    nibbles += [0] * (-len(nibbles) % 8)
-    words = [int("".join(f"{n:x}" for n in nibbles[k : k + 8]), 16) for k in range(0, len(nibbles), 8)]
-    return struct.pack(f"<{len(words)}I", *words)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -197,3 +176,38 @@ def test_the_rvl_transport_is_depth_and_a_cut_or_bloated_one_is_refused() -> Non
         read(stream[:12] + b"\xff\xff\xff\x7f" * 2 + stream[20:])
     with pytest.raises(UndecodableMessageError, match="33 bits"):
         read(stream[:20] + b"\xff" * 36 + bytes(4))
+
+
+PART = "=" * 80 + "\n"
+IDL_TIME = f"""{PART}IDL: builtin_interfaces/msg/Time
+module builtin_interfaces {{ module msg {{ struct Time {{ int32 sec; uint32 nanosec; }}; }}; }};
+"""
+IDL_HEADER = f"""{PART}IDL: std_msgs/msg/Header
+#include "builtin_interfaces/msg/Time.idl"
+module std_msgs {{ module msg {{ struct Header {{ builtin_interfaces::msg::Time stamp; string frame_id; }}; }}; }};
+"""
+IDL_THING = """// generated
+#ifndef X
+#include <std_msgs/msg/Header.idl>
+module x_msgs { module msg { struct Thing { std_msgs::msg::Header header; double value; }; }; };
+#endif
+"""
+THING = Topic(name="/x", type_name="x_msgs/msg/Thing", encoding="cdr", definition_format="idl")
+
+
+def test_an_idl_schema_is_read_with_what_it_includes() -> None:
+    topic = replace(THING, definition=f"{IDL_THING}{IDL_HEADER}{IDL_TIME}")
+    data = struct.pack("<4siIi4sd", b"\0\1\0\0", 7, 8, 2, b"a\0\0\0", 1.5)
+    read = MessageDecoder().decode(RawMessage(topic=topic, log_time_ns=0, data=data))
+    assert (read.header.stamp.sec, read.header.frame_id, read.value) == (7, "a", 1.5)
+
+
+def test_what_an_idl_schema_includes_and_does_not_hold_is_named_and_no_damage() -> None:
+    topic = replace(THING, definition=IDL_THING)
+    with pytest.raises(UnreadFormError, match="it names std_msgs/msg/Header, which its text does not define"):
+        MessageDecoder().decode(RawMessage(topic=topic, log_time_ns=0, data=bytes(32)))
+    found, image = Survey(), replace(topic, type_name=COMPRESSED_IMAGE)
+    for _ in range(3):
+        add_message(found, MessageDecoder(), RawMessage(topic=image, log_time_ns=0, data=bytes(32)))
+    assert found.damage.count == 0
+    assert [note.endswith("(3 times)") for note in found.damage.all_notes] == [True]

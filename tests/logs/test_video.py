@@ -213,6 +213,7 @@ def test_without_the_library_the_extra_is_named(tmp_path: Path, monkeypatch: pyt
         open_source(log)
     monkeypatch.setattr(libraries, "import_module", lambda name: (_ for _ in ()).throw(ImportError(name)))
     with pytest.raises(UsageError, match=r"video files need the library av.*splatctrl-cli\[video\]"):
+        (tmp_path / "color.csv").write_text("0.0\n")
         open_logs([write_mp4(tmp_path / "color.mp4")])
 
 
