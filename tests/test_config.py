@@ -54,7 +54,10 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
         ("scene.max_depth_error=0.01", "scene.min_depth_error: expected at most scene.max_depth_error = 0.01 m"),
         ("occupancy.log_odds_limit=0.8", "occupancy.log_odds_limit: expected above 0.847, the log-odds of"),
         ("occupancy.max_range=0.2", "occupancy.max_range: expected above occupancy.min_range = 0.2 m, got 0.2"),
-        ("field.length_scale=-1", "field.length_scale: expected 1e-10 to 1000 m, got -1.0; see docs/config.md"),
+        (
+            "field.length_scale=-1",
+            "field.length_scale: expected 1e-10 to 1000 m, got -1.0; see splatctrl help config",
+        ),
         (
             "occupancy.free_below=0.9",
             "occupancy.free_below: expected at most occupancy.occupied_above = 0.7, got 0.9",
@@ -75,7 +78,7 @@ def test_an_unknown_key_that_is_near_none_is_told_a_few_of_the_known() -> None:
     with pytest.raises(UsageError) as refused:
         load_config(None, ["scene.zzz=9"])
     assert str(refused.value).count(",") == 8
-    assert str(refused.value).endswith("... (docs/config.md has all)")
+    assert str(refused.value).endswith("... (splatctrl help config has all)")
 
 
 def test_files_that_are_missing_or_no_toml_are_named(tmp_path: Path) -> None:

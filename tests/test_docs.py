@@ -244,6 +244,26 @@ def test_every_page_and_heading_that_the_code_names_is_there() -> None:
         assert not heading or heading.lower() in anchors_on(ROOT / "docs" / page), f"{path}: {page}, {heading}"
 
 
+def test_what_a_message_points_to_is_in_a_wheel_too() -> None:
+    """A wheel has no docs/ where it is used: ``splatctrl help PAGE`` prints the page."""
+    num_named = 0
+    for path in ROOT.glob("splatctrl_cli/**/*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        bare = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}  # docstrings
+        texts = [
+            node.value
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in bare
+        ]
+        assert not [text for text in texts if re.search(r"\bdocs/\w+\.md", text)], path
+        for page, heading in re.findall(r"splatctrl help ([a-z]+)(?:, ([A-Z]\w+))?", "\n".join(texts)):
+            num_named += 1
+            assert (ROOT / "docs" / f"{page}.md").is_file(), f"{path}: {page}"
+            assert not heading or heading.lower() in anchors_on(ROOT / "docs" / f"{page}.md"), f"{path}: {heading}"
+    assert num_named > 25
+    assert "docs/*.md" in (ROOT / "CMakeLists.txt").read_text(), "the wheel's copy"
+
+
 def commands_on(page: Path) -> list[str]:
     """Command lines of indented or fenced code, continuation lines joined, shell variables as the page sets them."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")

@@ -157,7 +157,7 @@ def _unit_remedy(names: Sequence[str]) -> str:
             "LeRobot's numbers are -100 to 100 of a calibrated range, or degrees where it was told so (use_degrees):"
             " convert them to radians with the arm's calibration file"
         )
-    return 'record radians (REP 103), or give the states as CSV or NPZ with unit = "deg" (docs/replay.md, Logs)'
+    return 'record radians (REP 103), or give them as CSV or NPZ with unit = "deg" (splatctrl help replay, Logs)'
 
 
 def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgreement | None:
@@ -287,7 +287,7 @@ def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) 
         return RobotStates(model=model, lack=str(wrong), findings=findings)
     findings += [note("joints", "joint states", text) for text in loss.notes]
     if not len(states):
-        lack = "no joint states; record /joint_states, or give the states apart (docs/replay.md, Logs)"
+        lack = "no joint states; record /joint_states, or give the states apart (splatctrl help replay, Logs)"
         return RobotStates(model=model, lack=lack, findings=findings)
     of_robot = robot_states(model, names, states)
     is_said = any(f.code == "joints-degrees" for f in findings)

@@ -225,7 +225,7 @@ COMMANDS = {
         options=scene_options.QUERY,
     ),
     "score": Command(
-        summary="compare renders of a scene with recorded views: PSNR, SSIM, depth error; or fit scans first (--fit)",
+        summary="compare renders with recorded views: PSNR, SSIM, depth; or fit scans first (--fit)",
         examples=(
             "score out/scene --reference out/x.capture --cameras cam3 -o out/score",
             "score out/scan --dtu sample_data/dtu --protocol holdout:2,5 --require 'psnr_all>=20'",
@@ -333,6 +333,12 @@ COMMANDS = {
         examples=("completion bash", "completion zsh"),
         run="config:run_completion",
         options=_COMPLETION,
+    ),
+    "help": Command(
+        summary="print a page of the documentation, or their list",
+        examples=("help", "help replay"),
+        run="config:run_help",
+        options=(option("TOPIC", "the page's name, such as ci", nargs="?"),),
     ),
     "demo": Command(
         summary="run the main job on a sample recording, with pictures",

@@ -1,8 +1,9 @@
 """``splatctrl config``: what a run would use and where each setting comes from; a template; the schema of --json;
-and ``completion``: a script by which a shell completes commands, options, their choices and files.
+``completion``: a script by which a shell completes commands, options, their choices and files; ``help``: a page.
 """
 
 import argparse
+import difflib
 import json
 from pathlib import Path
 
@@ -12,7 +13,11 @@ from splatctrl_cli.cli.commands import build_parser
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import SCHEMA_FILE
+from splatctrl_cli.config.ranges import shown
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.settings import resolved_settings, template_of, toml_of
+
+ROOTS = (Path(__file__).parents[1], Path(__file__).parents[2])  # of docs/: of a wheel, of the repository
 
 
 def run(args: argparse.Namespace) -> int:
@@ -30,6 +35,18 @@ def run_completion(args: argparse.Namespace) -> int:
     _complete_files(parser)
     script = shtab.complete(parser, shell=args.shell).rstrip("\n")
     return Console(args).result({"shell": args.shell, "script": script}, [script])
+
+
+def run_help(args: argparse.Namespace) -> int:
+    folder = next(place / "docs" for place in ROOTS if (place / "docs" / "README.md").is_file())
+    names = sorted(page.stem for page in folder.glob("*.md"))
+    topic = args.topic or "README"
+    if topic not in names:
+        near = difflib.get_close_matches(topic, names, n=1)
+        remedy = f"did you mean {near[0]}?" if near else f"give one of: {', '.join(names)}"
+        raise UsageError(f"help: no page {shown(topic)}", remedy=remedy)
+    text = (folder / f"{topic}.md").read_text(encoding="utf-8")
+    return Console(args).result({"topic": topic, "text": text}, text.splitlines())
 
 
 def _complete_files(parser: Parser) -> None:

@@ -171,7 +171,7 @@ def output(what: str, *, default: str) -> tuple[Adds, ...]:
 
 def settings(example: str = "") -> tuple[Adds, ...]:
     """``--set`` and ``--preset``, which is the first of the settings."""
-    paper = "paper: as printed, where docs/paper.md departs from it"
+    paper = "paper: as printed (splatctrl help paper has our departures)"
     return (
         option("--set SECTION.KEY=VALUE ...", f"one setting{example}"),
         option("--preset NAME", paper, _preset, dest="set", action="append"),
@@ -195,12 +195,12 @@ JUNIT = (  # which every command that judges has
 THREADS = of_run(
     option("--threads THREADS", "threads, at most 16 or one per core (default: one per core)", whole(0, 1024))
 )
-CONFIG_FILE = option("--config FILE.toml", "configuration, see docs/config.md", Path)
+CONFIG_FILE = option("--config FILE.toml", "configuration, see splatctrl help config", Path)
 CONFIG = (CONFIG_FILE, *settings(), of_run(seed("everything random")), THREADS)
 DEVICE = of_run(
     option(
         "--device NAME",
-        "where to compute: auto, cpu, cuda or cuda:N; auto takes a card that is worth its start (docs/gpu.md)",
+        "where to compute: auto, cpu, cuda or cuda:N; auto takes a card that is worth its start (splatctrl help gpu)",
         _device,
         "auto",
     )
@@ -245,7 +245,7 @@ SCAN = (  # the options of a DTU scan
     option(
         "--protocol NAME",
         "which views train and which are scored: dtu-train, dtu-holdout8, regnerf-3, regnerf-6, regnerf-9, mvsnerf,"
-        " holdout:everyN, holdout:everyN+FIRST or holdout:2,5 (docs/score.md)",
+        " holdout:everyN, holdout:everyN+FIRST or holdout:2,5 (splatctrl help score)",
     ),
     option("--depths DIR", "depth_map_0000.pfm and so on of a scan in IDR's layout", Path),
     option(
@@ -263,7 +263,7 @@ DISAGREEMENT = (  # by how much a log may contradict itself
     ),
     option("--allow-disagreement", "continue although cameras disagree about surfaces"),
 )
-DECLARE = option("--declare FILE.toml", "what the robot carries, and contact that is meant (docs/declare.md)", Path)
+DECLARE = option("--declare FILE.toml", "what the robot carries, contact meant (splatctrl help declare)", Path)
 PACKAGES = option(
     "--packages DIR ...", "where package:// paths of the URDF are found (default: the folders above it)", Path
 )

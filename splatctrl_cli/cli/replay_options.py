@@ -124,7 +124,7 @@ REPLAY = (  # what people use, and in groups the rest
         option("--require-evidence", "not evaluable (exit 5) without a bound on the map's error"),
         option(
             "--unseen",
-            "space beside the arm that no camera saw free is judged by a table (docs/verdict.md), or is an obstacle",
+            "space beside the arm that no camera saw free: judge by a table (splatctrl help verdict), or obstacle",
             UNSEEN_IS,
             "judge",
         ),

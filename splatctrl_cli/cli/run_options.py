@@ -38,7 +38,7 @@ VIEW = (
     option("--root DIR ...", ROOT, Path),
 )
 BATCH = (
-    option("SUITE", "TOML file of recordings and jobs (docs/batch.md); with --list also a batch's folder", Path),
+    option("SUITE", "TOML file of recordings and jobs (splatctrl help batch); with --list also an output", Path),
     option(
         "-o/--out DIR", "folder of the batch, where it goes on (default: what the suite says, or SUITE.out)", Path
     ),
@@ -60,7 +60,7 @@ SWEEP = (
     option(
         "--over KEY=A:B ...",
         "what is varied, from A to B: splats, cameras-out, depth-noise, pose-error, pose-turn, latency, margin, ..."
-        " (docs/sweep.md), or a setting",
+        " (splatctrl help sweep), or a setting",
     ),
     option("-o/--out DIR", "folder of the sweep, where it goes on (default: sweep)", Path),
     option(
@@ -81,7 +81,7 @@ STUDY = (
     ),
     option("-o/--out DIR", "folder of the study, where it goes on (default: STUDY)", Path),
     option("--trials N", "problems of each kind (default: as many as the paper's)", whole(1, 100_000)),
-    option("--methods A,B", "some of the study's (docs/study.md; default: all that are installed)", _names),
+    option("--methods A,B", "some of the study's (splatctrl help study; default: all that are installed)", _names),
     option(
         "--problems DIR", "table2: MotionBenchMaker's (default: of SPLATCTRL_REAL_DATA); dtu: a tree of scans", Path
     ),

@@ -72,7 +72,7 @@ EXPORT = (
     *output(
         f"the file to write; its suffix is the format: {', '.join(SPLAT_FORMATS)}", default="SCENE.ply, beside SCENE"
     ),
-    option("--mcap", "write an MCAP of Foxglove's schemas, over time (default of --out: SCENE.mcap); docs/report.md"),
+    option("--mcap", "write an MCAP for Foxglove, over time (default of --out: SCENE.mcap; splatctrl help report)"),
     option("--labels NAME,...", "only splats of these labels: object, robot, human (default: all)"),
     option(
         "--layout",
@@ -197,7 +197,7 @@ SCORE = (
             ("all", "best-worst", "none"),
             "best-worst",
         ),
-        option("--lpips FILE.npz", "weights of LPIPS (docs/score.md); none are included", Path),
+        option("--lpips FILE.npz", "weights of LPIPS (splatctrl help score); none are included", Path),
     ),
     group(
         "surface",

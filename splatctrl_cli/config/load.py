@@ -180,7 +180,7 @@ def _parse_value(text: str) -> Any:
 
 def _some(names: Collection[str]) -> str:
     """The first eight; the rest is in docs/config.md."""
-    return ", ".join(list(names)[:8]) + (", ... (docs/config.md has all)" if len(names) > 8 else "")
+    return ", ".join(list(names)[:8]) + (", ... (splatctrl help config has all)" if len(names) > 8 else "")
 
 
 def type_name(hint: Any) -> str:

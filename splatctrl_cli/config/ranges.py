@@ -93,7 +93,7 @@ def _declared(hint: Any) -> Declared:
 def check(holds: bool, name: str, expected: str, value: object) -> None:
     """Raise UsageError with the key, what it may be, and its value, unless that holds."""
     if not holds:
-        raise UsageError(f"{name}: expected {expected}, got {shown(value)}", remedy="see docs/config.md")
+        raise UsageError(f"{name}: expected {expected}, got {shown(value)}", remedy="see splatctrl help config")
 
 
 def shown(value: object) -> str:

@@ -7,8 +7,8 @@ from pathlib import Path
 from splatctrl_cli.errors import InputError
 
 _BAG = "and record its image, camera_info and tf topics with `ros2 bag record`"
-_FOLDER = "write colour and 16-bit PNG depth with poses as an image folder (docs/input.md)"
-_TABLE = f"describe joint states in it in a .toml (docs/replay.md, Logs); of images {_FOLDER}"
+_FOLDER = "write colour and 16-bit PNG depth with poses as an image folder (splatctrl help input)"
+_TABLE = f"describe joint states in it in a .toml (splatctrl help replay, Logs); of images {_FOLDER}"
 AZURE_KINECT = f"play it with azure_kinect_ros_driver (recording_file:=FILE) {_BAG}, depth from /depth_to_rgb"
 _ENDS = 1 << 20  # bytes at either end of a file that are searched for its marks
 

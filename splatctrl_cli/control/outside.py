@@ -67,7 +67,8 @@ class Program:
             self.close()
             is_gone = error.fault in {Fault.CRASHED, Fault.ENDED}
             remedy = "what it is to do" if is_gone else "answer each line with one, and flush it"
-            raise InputError(f"{name}: at the start: {error}", remedy=f"{remedy}: docs/controllers.md") from None
+            remedy = f"{remedy} (splatctrl help controllers)"
+            raise InputError(f"{name}: at the start: {error}", remedy=remedy) from None
         except BaseException:
             self.close()
             raise

@@ -173,7 +173,7 @@ class Description:
     is_depth_resized: bool = False
     unpaired: tuple[int, int] = (0, 0)
     num_damaged: int = 0
-    supply: str = "describe colour and depth files in a .toml (docs/input.md)"
+    supply: str = "describe colour and depth files in a .toml (splatctrl help input)"
     notes: tuple[str, ...] = ()
 
     @property
@@ -192,7 +192,7 @@ T = TypeVar("T")
 
 
 def _refused(what: str) -> InputError:
-    return InputError(what, remedy="see docs/input.md")
+    return InputError(what, remedy="see splatctrl help input")
 
 
 def read_description(path: Path, root: Path | None = None) -> Description:

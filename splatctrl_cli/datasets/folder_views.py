@@ -274,7 +274,8 @@ def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
         stamp_ns = stamp_of_text(view.name)
         if stamp_ns is None:
             raise InputError(
-                f"{description.path}: stamps.names: expected seconds, got {view.name!r}", remedy="see docs/input.md"
+                f"{description.path}: stamps.names: expected seconds, got {view.name!r}",
+                remedy="see splatctrl help input",
             )
         return stamp_ns
     if stamps.rate is not None:

@@ -276,7 +276,7 @@ class ImageFolderSource:
         if counts.dtype != np.uint16 or counts.ndim != 2:
             raise InputError(
                 f"{path}: expected a 16-bit grey image, got {counts.dtype} with {counts.ndim} axes",
-                remedy="see docs/input.md",
+                remedy="see splatctrl help input",
             )
         if table.encoding == "uint16-rotated3":
             counts = (counts >> 3) | (counts << 13)

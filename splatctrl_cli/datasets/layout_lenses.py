@@ -275,7 +275,7 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
         poses=PosesTable(format="matrix-files", file=_CAMERAS, convention="world_to_camera"),
         depth=DepthTable(encoding="float32", scale=unit),
         is_depth_resized=True,
-        supply="add a folder depths/ with a .pfm for each number, or describe the files in a .toml (docs/input.md)",
+        supply="add a folder depths/ with a .pfm for each number, or describe them in a .toml (splatctrl help input)",
         notes=tuple(notes),
     )
 

@@ -48,14 +48,14 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
             f"{folder}: a folder that is neither a capture nor a ROS 2 bag, nor laid out as {names}",
             remedy=f"give one that is in it: {inside}"
             if inside
-            else "give the capture, the bag, one scene of the dataset, or for other images a .toml (docs/input.md)",
+            else "give the capture, the bag, one scene of the dataset, or a .toml for images (splatctrl help input)",
         )
     options.refuse(("root",), f"a folder laid out as {layout.name}", folder)
     return ImageFolderSource(folder, options, layout.read(folder, options))
 
 
 BARE_REMEDY = (
-    "describe colour, depth, intrinsics and poses in a .toml (docs/input.md); info, score and reconstruct --points"
+    "describe colour, depth, lens and poses in a .toml (splatctrl help input); info, score and reconstruct --points"
     " CLOUD.ply work without depth, but not without poses: a transforms.json (ns-process-data writes it)"
 )
 

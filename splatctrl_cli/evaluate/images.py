@@ -213,7 +213,7 @@ def _read(path: Path) -> dict[str, Float32]:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception as error:  # numpy raises many kinds for a file that is not an archive
         raise InputError(
-            f"{path}: expected LPIPS weights as .npz, got: {error}", remedy="docs/score.md says how to make them"
+            f"{path}: expected LPIPS weights as .npz: {error}", remedy="splatctrl help score says how to make them"
         ) from None
 
 
@@ -221,7 +221,7 @@ def _array(path: Path, weights: dict[str, Float32], name: str) -> Float32:
     if name not in weights:
         raise InputError(
             f"{path}: expected LPIPS weights of alex or vgg, got none called {name}",
-            remedy="docs/score.md says how to make them",
+            remedy="splatctrl help score says how to make them",
         )
     return weights[name]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Bool, Box
 
-REMEDY = "see docs/declare.md for the keys of a declaration"
+REMEDY = "see splatctrl help declare for the keys of a declaration"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,7 +30,7 @@ def preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(
             f"{folder / INFO}: expected total_episodes and the feature {POSITION}, got no usable {error}",
-            remedy="describe the columns in a .toml (docs/replay.md, Logs)",
+            remedy="describe the columns in a .toml (splatctrl help replay, Logs)",
         ) from None
     if episode is None and num != 1:
         raise InputError(f"{folder}: {num} episodes", remedy="choose one in a .toml: [states] preset, file, episode")

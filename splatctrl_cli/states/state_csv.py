@@ -16,7 +16,7 @@ from splatctrl_cli.logs.state_messages import NAMELESS, pose_of_columns
 from splatctrl_cli.logs.state_track import RawTrack
 from splatctrl_cli.records import Float64, Stamps
 
-_DESCRIBE = "describe the columns in a .toml (docs/replay.md, Logs)"
+_DESCRIBE = "describe the columns in a .toml (splatctrl help replay, Logs)"
 
 
 @dataclass(frozen=True, kw_only=True)

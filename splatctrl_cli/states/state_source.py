@@ -76,7 +76,7 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
     if path.suffix.lower() in ARRAY_FILES:
         raise InputError(
             f"{path}: a file of arrays, of which none is known to be joint states",
-            remedy="describe them in a .toml and give that (docs/replay.md, Logs)",
+            remedy="describe them in a .toml and give that (splatctrl help replay, Logs)",
         )
     if is_lerobot(path):
         options.refuse(_NOT_FOR_TABLES, "a LeRobot dataset", path)
@@ -117,7 +117,7 @@ def _libfranka(path: Path, joints: Sequence[str]) -> StateSource:
     if not is_libfranka(table):
         raise InputError(
             f"{path}: expected libfranka's columns (time, q[0], ...), got {', '.join(table.names[:4])}, ...",
-            remedy="describe the columns in a .toml and give that (docs/replay.md, Logs)",
+            remedy="describe the columns in a .toml and give that (splatctrl help replay, Logs)",
         )
     raw = libfranka_track(table)
     names = with_prefix(raw.names, joints)

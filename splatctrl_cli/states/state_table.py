@@ -26,7 +26,7 @@ ARRAY_FILES: Mapping[str, type[ArrayFile]] = {
     ".parquet": ParquetFile,
 }
 PRESETS: Mapping[str, Callable[[Path, int | None], Mapping[str, Any]]] = {"lerobot": lerobot.preset}
-_SEE = "see docs/replay.md, Logs"
+_SEE = "see splatctrl help replay, Logs"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ def dataset_track(folder: Path) -> tuple[RawTrack, Path]:
     if "joints" not in found:
         raise InputError(
             f"{folder / lerobot.INFO}: {lerobot.POSITION} has no name for each joint",
-            remedy="give a .toml: [states] preset, file, joints (docs/replay.md, Logs)",
+            remedy="give a .toml: [states] preset, file, joints (splatctrl help replay, Logs)",
         )
     return _of_episode(StatesTable(**found), found["episode"], folder)
 

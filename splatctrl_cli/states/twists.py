@@ -15,7 +15,7 @@ from splatctrl_cli.states.state_table import TIME_UNITS_NS, columns_of
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 TABLE = "twists"
-_SEE = "see docs/replay.md, Twists"
+_SEE = "see splatctrl help replay, Twists"
 
 
 @dataclass(frozen=True, kw_only=True)

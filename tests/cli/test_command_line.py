@@ -21,9 +21,12 @@ from splatctrl_cli.cli.commands import COMMANDS, Command, build_parser, function
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.sources.source import open_source
 from tests.cli import here
+from tests.conftest import ROOT
 from tests.logs.make_log import LogRecipe, make_log
 
-NO_OUTPUT = ("info", "check", "batch", "sweep", "study", "compare", "config", "completion")  # or one where it goes on
+NO_OUTPUT = (  # or one where it goes on
+    *("info", "check", "batch", "sweep", "study", "compare", "config", "completion", "help"),
+)
 WRITERS = [command for command in COMMANDS if command not in NO_OUTPUT]
 HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "trimesh", "mcap", "clarabel")
 QUICK = (
@@ -138,6 +141,15 @@ def test_what_people_look_for_is_in_the_short_help(
     with pytest.raises(SystemExit):
         build_parser(command).parse_args([command, "--help"])
     assert re.search(rf"(^|\s){word}\b", capsys.readouterr().out)
+
+
+def test_help_prints_a_page_and_names_the_nearest_for_a_wrong_word(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["help", "ci"]) == 0
+    assert capsys.readouterr().out == (ROOT / "docs" / "ci.md").read_text()
+    assert main(["help"]) == 0
+    assert capsys.readouterr().out == (ROOT / "docs" / "README.md").read_text()
+    assert main(["help", "replays"]) == 2
+    assert capsys.readouterr().err == "splatctrl: help: no page 'replays'; did you mean replay?\n"
 
 
 def leaves(commands: dict[str, Command]) -> Iterator[tuple[list[str], Command]]:

@@ -81,7 +81,7 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: is not TOML: {error}", remedy="see docs/batch.md for an example") from None
+        raise UsageError(f"{path}: is not TOML: {error}", remedy="see splatctrl help batch for an example") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder", remedy="give the suite's file, or --list with it") from None
     except OSError as error:
