@@ -3,13 +3,14 @@
 Depth images show the arm where forward kinematics puts it, at the time of the joint states, or with two exchanged.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from splatctrl_cli.checks import limits
+from splatctrl_cli.checks.check_views import rescaled
 from splatctrl_cli.checks.clock_offset import ClockOffset, ImageMotion, estimate_clock_offset, states_asked
 from splatctrl_cli.checks.finding import Finding, note, warning
 from splatctrl_cli.geometry import strided_lens
@@ -151,8 +152,8 @@ def _exchanged(posture: Posture, i: int, j: int) -> Posture:
     return exchanged
 
 
-def arm_finding(where: str, agreement: ArmAgreement) -> Finding:
-    """One sentence on a camera that shows the arm where the joints say, but for its scale."""
+def arm_finding(where: str, agreement: ArmAgreement, units: Iterable[float | None]) -> Finding:
+    """One sentence on a camera that shows the arm where the joints say, but for its scale (units: `rescaled`)."""
     share = f"{100 * agreement.seen_through:.0f} % of {agreement.num_pixels} pixels"
     seen = f"in {agreement.num_frames} depth images {share} show what is behind it"
     if agreement.is_good and agreement.scale is None:
@@ -160,7 +161,7 @@ def arm_finding(where: str, agreement: ArmAgreement) -> Finding:
         return note("arm", where, text, value=round(1e3 * agreement.median, 1), unit="mm")
     assert agreement.scale is not None
     text = f"depth shows the arm at {agreement.scale:.3g} times the distance that the joints say"
-    remedy = f"multiply --depth-scale by {1 / agreement.scale:.3g}, or check --base and the camera's pose"
+    remedy = f"{rescaled(units, 1 / agreement.scale)}, or check --base and the camera's pose"
     return warning("arm", where, text, remedy, value=round(agreement.scale, 3))
 
 
@@ -177,16 +178,20 @@ def misplaced_finding(bad: Mapping[str, ArmAgreement], cause: str) -> Finding:
 
 
 def motion_findings(
-    frames: Sequence[RgbdFrame], motion: ImageMotion, states: StateColumns, model: RobotModel | None
+    frames: Sequence[RgbdFrame],
+    motion: ImageMotion,
+    states: StateColumns,
+    model: RobotModel | None,
+    units: Iterable[float | None] = (None,),
 ) -> list[Finding]:
     """What the cameras say of the joint states (in the model's order where there is one).
 
-    frames: reduced, a few of each camera; motion: of the first images of each.
+    frames: reduced, a few of each camera; motion: of the first images of each; units: of depth, as of `rescaled`.
     """
     found: list[Finding] = []
     timings: list[ArmTiming] = []
     if model is not None:
-        timings, found = _arm_findings(model, frames, states)
+        timings, found = _arm_findings(model, frames, states, units)
     if timings:
         return [*_timing_findings(timings), *found]
     asked = states.select(states_asked(states.stamp_ns, motion))
@@ -196,7 +201,7 @@ def motion_findings(
 
 
 def _arm_findings(
-    model: RobotModel, frames: Sequence[RgbdFrame], states: StateColumns
+    model: RobotModel, frames: Sequence[RgbdFrame], states: StateColumns, units: Iterable[float | None]
 ) -> tuple[list[ArmTiming], list[Finding]]:
     posture = states.postures(limits.ARM_CLOSE_NS)
     found: list[Finding] = []
@@ -214,7 +219,7 @@ def _arm_findings(
             timings.append(timing)
             agreement = arm_agreement(model, its, posture, offset_s=timing.offset_s) or agreement
         if agreement.is_good or agreement.scale is not None:
-            found.append(arm_finding(where, agreement))
+            found.append(arm_finding(where, agreement, units))
         else:
             bad[camera] = agreement
     if bad:

@@ -76,7 +76,8 @@ def judged(evidence: Evidence, found: Sequence[Finding], model: RobotModel | Non
     findings += views.findings
     findings += exposure_findings(views.corrected)
     if evidence.states is not None and not any(finding.code == "joints-degrees" for finding in findings):
-        findings += motion_findings(views.corrected, evidence.motion, evidence.states, model)
+        units = evidence.depth_units.values()
+        findings += motion_findings(views.corrected, evidence.motion, evidence.states, model, units)
     findings += [note("quick", evidence.path.name, evidence.cut)] if evidence.cut else []
     return CheckReport(
         path=str(evidence.path),
@@ -242,7 +243,7 @@ def check_folder(
         findings += _camera_findings(camera, has_clock=source.has_clock)
     findings += sample_findings([camera.images for camera in cameras.values()])
     logged = watch.states.columns()
-    lack = "" if len(logged) else "no joint states; give them apart (docs/replay.md, Logs)"
+    lack = "" if len(logged) else "no joint states; give them apart (splatctrl help replay, Logs)"
     of_states = RobotStates(model=model, lack=lack)
     if len(logged) and source.has_clock:
         of_states = robot_states(model, source.joint_names, logged)

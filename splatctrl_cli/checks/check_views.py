@@ -1,6 +1,6 @@
 """Whether views of one scene fit together: by which depth scale, and by which move of one camera, they would."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -75,7 +75,7 @@ def check_views(frames: Sequence[RgbdFrame], used: Mapping[str, float | None], *
             moves = wrong_poses(fitted, pairs)
         else:  # moves explain more
             scales, scaled = {}, list(frames)
-    findings = _scale_findings(scales, used) if scales else _overlap_findings(views, pairs, is_sure=is_sure)
+    findings = _scale_findings(scales, used) if scales else _overlap_findings(views, pairs, used, is_sure=is_sure)
     findings += [_pose_finding(move, sorted(used)) for move in moves]
     by_camera = {move.camera: move.T_camera_corrected for move in moves}
     corrected = [replace(f, T_world_camera=f.T_world_camera @ by_camera.get(f.camera, np.eye(4))) for f in scaled]
@@ -145,7 +145,9 @@ def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> lis
     return moves
 
 
-def _overlap_findings(views: Sequence[_View], pairs: Sequence[tuple[int, int]], *, is_sure: bool) -> list[Finding]:
+def _overlap_findings(
+    views: Sequence[_View], pairs: Sequence[tuple[int, int]], used: Mapping[str, float | None], *, is_sure: bool
+) -> list[Finding]:
     """Of depths that are unusual, and with which views that would meet at a tenth or at ten times do not; where
     nothing is sure, at any other scale.
     """
@@ -161,11 +163,21 @@ def _overlap_findings(views: Sequence[_View], pairs: Sequence[tuple[int, int]], 
         return []
     text = f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times it"
     said = warning if is_sure else error
-    return [said("views-scale", "cameras", text, "if so, multiply --depth-scale by it", value=scale)]
+    return [said("views-scale", "cameras", text, f"if so, {rescaled(used.values(), scale)}", value=scale)]
 
 
 def _scaled(frames: Sequence[RgbdFrame], scales: Mapping[str, float]) -> list[RgbdFrame]:
     return [replace(f, depth=f.depth * np.float32(scales.get(f.camera, 1.0))) for f in frames]
+
+
+def rescaled(units: Iterable[float | None], factor: float) -> str:
+    """Name the --depth-scale by which depths are `factor` times as large as they are by `units` [m] per count, None
+    for floats in metres.
+    """
+    read = sorted({unit or 1.0 for unit in units})
+    if len(read) != 1:
+        return f"record depth {factor:.3g} times as large: cameras differ in their unit, and --depth-scale is of all"
+    return f"give --depth-scale {read[0] * factor:.3g} (it is {read[0]:g} m per count)"
 
 
 def _scale_findings(scales: Mapping[str, float], used: Mapping[str, float | None]) -> list[Finding]:
@@ -173,9 +185,9 @@ def _scale_findings(scales: Mapping[str, float], used: Mapping[str, float | None
     is_all = len(scales) == len(used) and len(shared) == 1
     units = {used[camera] or 1.0 for camera in scales}
     if is_all and len(units) == 1:
-        factor, unit = shared.pop(), units.pop()
+        factor = shared.pop()
         text = f"views of one scene fit together only where all depths are multiplied by {factor:.3g}"
-        remedy = f"give --depth-scale {unit * factor:.3g} (it is {unit:g} m per count), or correct the poses' unit"
+        remedy = f"{rescaled(units, factor)}, or correct the poses' unit"
         return [error("views-scale", "cameras", text, remedy, value=factor)]
     found = []
     for camera, factor in sorted(scales.items()):

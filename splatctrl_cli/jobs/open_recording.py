@@ -3,9 +3,10 @@
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
+from typing import cast
 
 from splatctrl_cli.captures.capture_header import is_capture
-from splatctrl_cli.checks.check_views import are_far, check_views
+from splatctrl_cli.checks.check_views import are_far, check_views, rescaled
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.datasets.dtu_source import DtuSource, view_numbers
@@ -15,7 +16,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.stored_frame import FrameSource
+from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements, largest_jump
 from splatctrl_cli.scene.time_steps import TimeStep
@@ -138,13 +139,14 @@ def check_pose_jumps(source: FrameSource, limit: float) -> None:
 class CameraAgreement:
     """disagreement [m]: of each pair of cameras that see enough of the same, how far apart they see it.
 
-    name: of the recording. is_allowed: what does not fit is said, not refused. is_still: the scene does not move, so
+    source: the recording. is_allowed: what does not fit is said, not refused. is_still: the scene does not move, so
     that all views of a time step show the same. guess: in words, that the unit of lengths was guessed.
     """
 
-    def __init__(self, name: str, *, is_allowed: bool, is_still: bool, guess: str = "") -> None:
+    def __init__(self, source: RecordSource, *, is_allowed: bool, is_still: bool, guess: str = "") -> None:
         self.disagreement: dict[str, float] = {}
-        self._name, self._is_allowed, self._is_still, self._guess = name, is_allowed, is_still, guess
+        self._source, self._name = source, source.name
+        self._is_allowed, self._is_still, self._guess = is_allowed, is_still, guess
 
     def check(self, step: TimeStep, limits: OccupancyConfig, console: Progress) -> None:
         """Compare once each pair of cameras, and of a still scene whether another depth scale would fit the views.
@@ -183,11 +185,21 @@ class CameraAgreement:
             if finding.code == "views-scale" and not self._is_allowed:
                 raise InputError(
                     f"{self._name}: {finding.what}",
-                    remedy=f"multiply --depth-scale by {finding.value:.4g}, or correct the poses' unit; if both are"
+                    remedy=f"{rescaled(self._units(), float(finding.value))}, or correct the poses' unit; if both are"
                     " right, give --allow-disagreement",
                 )
             if finding.code == "views-scale":
                 console.log(f"warning: {self._name}: {finding.what}")
+
+    def _units(self) -> set[float | None]:
+        """Metres per count of depth, of each camera; those of a DTU scan are floats."""
+        units = dict[str, float | None]()
+        for frame in () if isinstance(self._source, DtuSource) else cast(FrameSource, self._source).stored():
+            if isinstance(frame, StoredFrame):
+                units.setdefault(frame.camera, frame.depth_unit)
+            if len(units) == len(self._source.cameras):
+                break
+        return {*units.values()} or {None}
 
     def _has_new_pairs(self, step: TimeStep) -> bool:
         """Whether two views of this time step are from cameras that have not been compared yet."""

@@ -98,8 +98,10 @@ def test_views_that_meet_in_another_unit_only_are_refused(
     folder = written(tmp_path / "set", views, poses=poses, depths=depths)
     said = refusal(folder)
     assert re.search(rf"(do at|multiplied by) {factor}\b", said)
-    assert f"multiply --depth-scale by {factor}, or correct the poses' unit" in said
-    assert any(finding.code == "views-scale" for finding in check(CheckRequest(paths=(folder,))).report.findings)
+    unit = re.search(r"give --depth-scale (\S+) \(it is (\S+) m per count\), or correct the poses' unit", said)
+    assert unit is not None and float(unit[1]) == pytest.approx(float(unit[2]) * float(factor))
+    found = check(CheckRequest(paths=(folder,))).report.findings
+    assert any(finding.code == "views-scale" and unit[0].partition(",")[0] in finding.remedy for finding in found)
 
 
 def test_a_robot_is_in_metres_and_takes_no_guess(tmp_path: Path, views: list[RgbdFrame], plain_arm: Path) -> None:
