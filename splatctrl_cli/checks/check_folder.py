@@ -67,17 +67,22 @@ class Evidence:
     is_guessed: bool = False
 
 
-def judged(evidence: Evidence, found: Sequence[Finding], model: RobotModel | None) -> CheckReport:
-    """With what was found on the way, and what the frames and states say of each other."""
+def judged(
+    evidence: Evidence, found: Sequence[Finding], model: RobotModel | None, *, only_errors: bool = False
+) -> CheckReport:
+    """With what was found on the way, and what the frames and states say of each other; `only_errors`: what can stop
+    a command, which is a fifth of the work.
+    """
     findings = [*found, *alignment_findings(evidence.frames)]
     frames, is_still = usable_frames(evidence.frames, findings), evidence.start_ns is None
     is_sure = not is_still or not (evidence.is_guessed or are_far(frames))
-    views = check_views(frames, evidence.depth_units, is_sure=is_sure)
+    views = check_views(frames, evidence.depth_units, is_sure=is_sure, only_errors=only_errors)
     findings += views.findings
-    findings += exposure_findings(views.corrected)
-    if evidence.states is not None and not any(finding.code == "joints-degrees" for finding in findings):
+    findings += () if only_errors else exposure_findings(views.corrected)
+    states = None if only_errors else evidence.states
+    if states is not None and not any(finding.code == "joints-degrees" for finding in findings):
         units = evidence.depth_units.values()
-        findings += motion_findings(views.corrected, evidence.motion, evidence.states, model, units)
+        findings += motion_findings(views.corrected, evidence.motion, states, model, units)
     findings += [note("quick", evidence.path.name, evidence.cut)] if evidence.cut else []
     return CheckReport(
         path=str(evidence.path),
@@ -221,7 +226,12 @@ class _SourceWatch:
 
 
 def check_folder(
-    path: Path, options: SourceOptions, *, model: RobotModel | None = None, num_images: int | None = None
+    path: Path,
+    options: SourceOptions,
+    *,
+    model: RobotModel | None = None,
+    num_images: int | None = None,
+    only_errors: bool = False,
 ) -> CheckReport:
     """Read the frames of `path` once; with `num_images` up to as many of a camera."""
     kind = "capture" if is_capture(path) else "image folder"
@@ -266,7 +276,7 @@ def check_folder(
         is_guessed=isinstance(source, ImageFolderSource) and source.guess != "",
         cut="" if watch.is_whole else f"only the first {num_images} frames of a camera were read",
     )
-    return judged(evidence, findings, of_states.model)
+    return judged(evidence, findings, of_states.model, only_errors=only_errors)
 
 
 def _refused(path: Path, kind: str, wrong: InputError) -> CheckReport:

@@ -57,8 +57,14 @@ class ViewsCheck:
     corrected: list[RgbdFrame]
 
 
-def check_views(frames: Sequence[RgbdFrame], used: Mapping[str, float | None], *, is_sure: bool = True) -> ViewsCheck:
-    """Compare views from different places, of one moment or a still scene.
+def check_views(
+    frames: Sequence[RgbdFrame],
+    used: Mapping[str, float | None],
+    *,
+    is_sure: bool = True,
+    only_errors: bool = False,
+) -> ViewsCheck:
+    """Compare views from different places, of one moment or a still scene; `only_errors` leaves poses to others.
 
     used: metres per count of each camera's depth, None where it is stored as floats. is_sure: False where something
     speaks for another unit: then views must meet.
@@ -67,7 +73,8 @@ def check_views(frames: Sequence[RgbdFrame], used: Mapping[str, float | None], *
     pairs = _pairs(views)
     if not pairs:
         return ViewsCheck(findings=[], scaled=list(frames), corrected=list(frames))
-    scales, moves = wrong_scales(views, pairs), wrong_poses(views, pairs)
+    scales = wrong_scales(views, pairs)
+    moves = wrong_poses(views, pairs) if scales or not only_errors else []
     scaled = _scaled(frames, scales)
     if scales:
         fitted = [_view(frame) for frame in _chosen(scaled)]

@@ -88,7 +88,7 @@ def _view(
 ) -> ListedView:
     """A frame; its own values stand before those of the file."""
     name, said = str(entry["file_path"]), {**content, **entry}
-    color = _image(path.parent / name)
+    color = _image(path.parent / _of_any_system(name))
     depth = next((str(entry[key]) for key in _DEPTHS if entry.get(key)), None)
     scale = next((said[key] for key in _SCALES if key in said), None)
     mask = entry.get("mask_path")
@@ -102,12 +102,17 @@ def _view(
     return ListedView(
         name=name,
         color=color,
-        depth=None if depth is None else path.parent / depth,
+        depth=None if depth is None else path.parent / _of_any_system(depth),
         matrix=matrix,
         camera=description.camera or lenses.named(_camera(said, color, path), str(path)),
         depth_scale=unit,
-        valid=None if not mask else path.parent / str(mask),
+        valid=None if not mask else path.parent / _of_any_system(str(mask)),
     )
+
+
+def _of_any_system(name: str) -> str:
+    """A path as Windows may have written it."""
+    return name.replace("\\", "/")
 
 
 def _image(path: Path) -> Path:

@@ -40,7 +40,7 @@ from splatctrl_cli.datasets.layout import (
     pose_or_none,
     read_K,
 )
-from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_tum, rigid, stamp_of_text
+from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_tum, rigid, stamp_of_text, tum_rows
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
@@ -115,7 +115,9 @@ def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
     colors, depths = listed(folder / "rgb.txt"), listed(folder / "depth.txt")
     series = _series(folder)
     file = folder / "groundtruth.txt"
-    trajectory = Trajectory(read_tum(file) if file.is_file() else {})
+    rows = tum_rows(file) if file.is_file() else {}
+    trajectory, num_lost = Trajectory(rows), sum(T is None for T in rows.values())
+    lost = (f"{file.name}: {num_lost} of {len(rows)} lines are no pose (nan)",) if num_lost else ()
     pairs = paired_by_stamp(folder / "rgb.txt", colors, depths, trajectory.at, options)
     return described(
         pairs.moved(marker_to_camera) if series is _BONN else pairs,
@@ -125,7 +127,7 @@ def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
         lens=lambda image: _lens(folder, series, image),
         depth=DepthTable(scale=SCALE),
         has_stamps=True,
-        notes=(_BONN_NOTE,) if series is _BONN else (),
+        notes=((_BONN_NOTE,) if series is _BONN else ()) + lost,
     )
 
 
@@ -138,7 +140,7 @@ def listed(path: Path) -> list[tuple[int, Path]]:
             stamp_ns = stamp_of_text(words[0])
             if stamp_ns is None or len(words) != 2:
                 raise InputError(f"{path}:{number}: expected 'stamp file', got {line!r}", remedy="correct the line")
-            found.append((stamp_ns, path.parent / words[1]))
+            found.append((stamp_ns, path.parent / words[1].replace("\\", "/")))
     return found
 
 

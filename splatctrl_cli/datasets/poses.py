@@ -79,9 +79,17 @@ def read_trajectory_log(path: Path) -> dict[str, Float64]:
 
 
 def read_tum(path: Path) -> dict[str, Float64]:
-    """``stamp tx ty tz qx qy qz qw`` lines, by stamp [s] as written."""
-    poses: dict[str, Float64] = {}
+    """``stamp tx ty tz qx qy qz qw`` lines, by stamp [s] as written; a line with NaN is no pose."""
+    return {stamp: T for stamp, T in tum_rows(path).items() if T is not None}
+
+
+def tum_rows(path: Path) -> dict[str, Float64 | None]:
+    """The lines that `read_tum` reads, None for one whose pose is NaN."""
+    poses: dict[str, Float64 | None] = {}
     for where, words, values in read_rows(path):
+        if len(values) == 8 and np.isfinite(values[0]) and np.isnan(values[1:]).any():
+            poses[words[0]] = None
+            continue
         is_pose = len(values) == 8 and bool((np.abs(values[1:]) < MAX_PLACE).all())
         if not is_pose or not any(values[4:]):
             raise InputError(
@@ -135,17 +143,31 @@ def read_numbers(path: Path) -> list[float]:
 
 
 class Trajectory:
-    """Poses of one camera by stamp [s, as text], interpolated as those of tf."""
+    """Poses of one camera by stamp [s, as text], interpolated as those of tf, but not past a stamp without a pose
+    (None).
+    """
 
-    def __init__(self, poses: Mapping[str, Float64]) -> None:
+    def __init__(self, poses: Mapping[str, Float64 | None]) -> None:
         self._tree = TfTree()
+        known, lost = [], []
         for text, T in poses.items():
             stamp_ns = stamp_of_text(text)
-            if stamp_ns is not None:
+            if stamp_ns is not None and T is not None:
+                known.append(stamp_ns)
                 self._tree.add("world", "camera", stamp_ns, T[:3, 3], quat_from_rotation(T[:3, :3]), static=False)
+            elif stamp_ns is not None:
+                lost.append(stamp_ns)
+        self._known, self._lost = np.array(sorted(known), dtype=np.int64), np.array(sorted(lost), dtype=np.int64)
 
     def at(self, stamp_ns: int) -> Float64 | None:
         """T_world_camera (4, 4); None where the trajectory does not reach."""
+        after = np.searchsorted(self._known, stamp_ns)
+        is_known = after < len(self._known) and self._known[after] == stamp_ns
+        before = self._known[after : after + 1] if is_known else self._known[max(after - 1, 0) : after]
+        later = self._known[after : after + 1]
+        first, last = (part[0] if len(part) else stamp_ns for part in (before, later))
+        if ((self._lost >= first) & (self._lost <= last)).any():
+            return None
         return self._tree.lookup("world", "camera", stamp_ns, POSE_TOLERANCE_NS)
 
 

@@ -1,15 +1,15 @@
 """A check from its request to its result: what is wrong with a recording, before it costs an hour."""
 
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from splatctrl_cli.checks.check_folder import check_folder
 from splatctrl_cli.checks.check_log import check_log
-from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, error, note, warning
+from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Need, Severity, error, note, warning
 from splatctrl_cli.checks.limits import VIEWS_RANGE
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.logged_robot import TAKE, differs, logged_urdf
@@ -58,16 +58,33 @@ def check(request: CheckRequest) -> CheckResult:
     if request.num_images is not None and request.num_images < 1:
         raise UsageError(f"--quick {request.num_images}: expected 1 or more")
     model = posed_robot(request.paths, request.urdf, request.spheres, base=request.base, locked=request.locked)
-    log = open_logs(request.paths)
     other = "" if request.urdf is None or model is None else differs(model.urdf, request.paths)
-    if log is None:
-        report = check_folder(request.paths[0], request.options, model=model, num_images=request.num_images)
-    else:
-        report = check_log(log, request.options, model=model, num_images=request.num_images)
+    report = _report(request, model)
     findings = [warning("robot-model", str(request.urdf), other, TAKE)] if other else []
-    report = replace(report, findings=[*report.findings, *_agreement(report), *findings])
+    report = replace(report, findings=[*report.findings, *findings])
     verdict = _verdict(report, request.fail_on)
     return CheckResult(report=report, verdict=verdict, exit_code=0 if request.fail_on == NEVER else verdict.exit_code)
+
+
+def refuse_errors(path: Path, options: SourceOptions, command: str, allowed: Collection[str] = ()) -> None:
+    """Raise InputError where `check` finds an error that keeps this command from a recording; `allowed`: codes of
+    errors that somebody takes upon himself.
+    """
+    report = _report(CheckRequest(paths=(path,), options=options), None, only_errors=True)
+    errors = [f for f in report.refusing(Need(command=command, lacks=())) if f.code not in allowed]
+    if errors:
+        first, more = errors[0], f"; {len(errors) - 1} more: splatctrl check {path}" if len(errors) > 1 else ""
+        remedy = first.remedy or CHECKS[first.code].remedy
+        raise InputError(f"{path}: {first.where}: {first.what} [{first.code}]", remedy=f"{remedy}{more}")
+
+
+def _report(request: CheckRequest, model: RobotModel | None, *, only_errors: bool = False) -> CheckReport:
+    log, options, num = open_logs(request.paths), request.options, request.num_images
+    if log is None:
+        report = check_folder(request.paths[0], options, model=model, num_images=num, only_errors=only_errors)
+    else:
+        report = check_log(log, options, model=model, num_images=num, only_errors=only_errors)
+    return replace(report, findings=[*report.findings, *_agreement(report)])
 
 
 def posed_robot(

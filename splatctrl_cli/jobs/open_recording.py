@@ -1,5 +1,6 @@
 """Which recording a job trains on or compares with, how it is opened, and whether what its cameras saw agrees."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -14,6 +15,7 @@ from splatctrl_cli.datasets.image_folder import ImageFolderSource
 from splatctrl_cli.datasets.layouts import has_views
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
+from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
@@ -49,10 +51,15 @@ class RecordingRequest:
 
 
 def open_to_train(
-    recording: RecordingRequest, *, max_pose_jump: float = POSE_JUMP, needs_depth: bool = True
+    recording: RecordingRequest,
+    *,
+    max_pose_jump: float = POSE_JUMP,
+    needs_depth: bool = True,
+    allowed: Collection[str] = (),
 ) -> RecordSource:
     """The recording without the views that it holds out. Raises UsageError for options that do not belong to it, and
-    InputError for a scan without depth and for a camera that jumps farther than `max_pose_jump` [m].
+    InputError for a scan without depth, for a camera that jumps farther than `max_pose_jump` [m], and for what
+    `check` calls an error, but for `allowed` codes.
     """
     if recording.is_dtu:
         scan = open_dtu(recording)
@@ -67,6 +74,9 @@ def open_to_train(
         return open_held_out(recording, needs_depth=needs_depth)[0]
     source = open_source(recording.path, recording.options, needs_depth=needs_depth)
     check_pose_jumps(source, max_pose_jump)
+    if needs_depth:
+        jumps = () if max_pose_jump == POSE_JUMP else ("pose-jump",)
+        refuse_errors(recording.path, recording.options, "reconstruct", (*allowed, *jumps))
     return source
 
 

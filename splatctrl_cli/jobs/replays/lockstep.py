@@ -14,6 +14,7 @@ from splatctrl_cli.control.audit import Observed
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import Stopwatch, write_run
+from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.jobs.device import CUDA, TO_CPU, FitDevice
 from splatctrl_cli.jobs.open_recording import check_pose_jumps
 from splatctrl_cli.jobs.progress import Progress
@@ -101,6 +102,9 @@ def from_log(
     config = request.config
     source = _training_source(request, model, source)
     check_pose_jumps(source, request.max_pose_jump)
+    allowed = ("agreement", "views-scale", "alignment") if request.allow_disagreement else ()
+    jumps = () if request.max_pose_jump == POSE_JUMP else ("pose-jump",)
+    refuse_errors(request.log, request.options, "reconstruct", (*allowed, *jumps))
     place = folder / FOLDER
     place.mkdir()
     asked = ReconstructRequest(
