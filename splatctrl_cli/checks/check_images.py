@@ -220,10 +220,11 @@ def depth_findings(images: ImageWatch) -> list[Finding]:
             " (or a like code): they count as none"
         )
         found.append(note("depth-invalid", where, text, value=images.num_invalid))
-    for value, num in images.constants.most_common(1):
-        if num >= limits.CONSTANT_IMAGES * images.num_decoded:
-            text = f"many pixels are exactly {value:.6g} m, the largest depth of {num} of {images.num_decoded} images"
-            found.append(warning("depth-constant", where, f"{text}: a code for no return?", value=value, unit="m"))
+    for value, times in images.constants.most_common(1):
+        if times >= limits.CONSTANT_IMAGES * images.num_decoded:
+            of = f"the largest depth of {times} of {images.num_decoded} images"
+            text = f"many pixels are exactly {value:.6g} m, {of}: a code for no return?"
+            found.append(warning("depth-constant", where, text, value=value, unit="m"))
     if images.num_repeats:
         text = f"{images.num_repeats} of {images.num_decoded} depth images equal the one before to the bit"
         found.append(warning("depth-repeats", where, text, value=images.num_repeats))

@@ -246,13 +246,14 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
             f" {rgbd[0].topic.name}",
             remedy="record the camera's own topics instead: colour and aligned depth images, their camera_info, tf",
         )
-    if colors and not depths:
-        unlike, chosen = image_topics(survey, "unlike"), "; if one of these is depth, give --camera NAME=COLOR,DEPTH"
+    named = _named_unlike(survey)
+    if not depths and (colors or named):
+        chosen = "; if one of these is depth, give --camera NAME=COLOR,DEPTH" if "(named " in named else ""
         unread = "".join(f"; {note}" for note in survey.damage.remarks if any(name in note for name in broken))
         return InputError(
-            f"{log.path}: no depth topic{_named_unlike(survey)}{unread}; colour topics there: {listed(colors)}",
+            f"{log.path}: no depth topic{named}{unread}; colour topics there: {listed(colors)}",
             remedy="record 16UC1, mono16 or 32FC1 depth images (info and replay of joint states work without)"
-            f"{chosen if unlike else ''}",
+            f"{chosen}",
         )
     videos = sorted(t.topic.name for t in survey.topics.values() if t.count and is_video(t.topic))
     if videos and not colors:
@@ -269,7 +270,7 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
         )
     if depths and not colors:
         return InputError(
-            f"{log.path}: no colour topic{_named_unlike(survey)}; depth topics there: {listed(depths)}",
+            f"{log.path}: no colour topic{named}; depth topics there: {listed(depths)}",
             remedy="record the colour images",
         )
     topics = [t.topic for t in survey.topics.values() if t.count]
@@ -294,7 +295,9 @@ def _named_unlike(survey: Survey) -> str:
         image, name = topic.first_image, topic.topic.name
         assert image is not None
         is_jpeg = image.compressed is not None and image.compressed.startswith(JPEG)
-        lossy = "depth in a JPEG: JPEG loses depth: record PNG" if is_jpeg else f"named depth, but {image.encoding}"
+        lossy = (
+            "depth in a JPEG: JPEG loses depth: record PNG" if is_jpeg else f"{image.encoding} that is named depth"
+        )
         found.append(f"{name} ({f'named {_unlike(topic)}' if image.kind == 'depth' else lossy})")
     return f"; neither depth nor colour: {listed(found)}" if found else ""
 

@@ -49,6 +49,7 @@ COLOR_CONVERSIONS = {
     "uyvy": cv2.COLOR_YUV2RGB_UYVY,
     "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
     "yuyv": cv2.COLOR_YUV2RGB_YUY2,
+    "YUYV": cv2.COLOR_YUV2RGB_YUY2,  # as the RealSense SDK writes it
     **BAYER,
     **_DEEP,
     **dict.fromkeys([*_PLANAR, _NV24]),  # converted as they are read
@@ -60,7 +61,7 @@ _LAYOUT = {  # channels and dtype by encoding
     **dict.fromkeys(["rgb16", "bgr16", "16UC3"], (3, "u2")),
     **dict.fromkeys(["rgba16", "bgra16", "16UC4"], (4, "u2")),
     **dict.fromkeys(BAYER_16, (1, "u2")),
-    **dict.fromkeys(["yuv422", "uyvy", "yuv422_yuy2", "yuyv"], (2, "u1")),
+    **dict.fromkeys(["yuv422", "uyvy", "yuv422_yuy2", "yuyv", "YUYV"], (2, "u1")),
     **dict.fromkeys(["16UC1", "mono16"], (1, "u2")),
     "32FC1": (1, "f4"),
 }
@@ -200,7 +201,7 @@ def _packed(form: str, data: bytes) -> _Packed:
 
 def _is_rvl(file: bytes) -> bool:
     try:
-        return _rvl_counts(file).any() > 0
+        return bool(_rvl_counts(file).any())
     except UndecodableMessageError:
         return False
 

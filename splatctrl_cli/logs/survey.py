@@ -153,7 +153,7 @@ class Calibration:
     distortion: Float64
     frame_id: str
     valid: Bool | None = None
-    sensor_K: Float64 | None = None
+    sensor_K: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
     cut: str = ""
     is_possible: bool = True
 

@@ -367,7 +367,7 @@ def _examine_infrared(folder: Path, out: Path, run: Run) -> None:
             assert DEPTHS[path.stem].split()[0] in run(["info", path]).out.splitlines()[-1]
         elif path.stem == "gray-depth":
             assert result.code == 4, result.text
-            assert "/cam0/depth/image_raw (named depth, but mono8)" in result.text
+            assert "/cam0/depth/image_raw (mono8 that is named depth)" in result.text
         else:
             assert result.code == 4, result.text
             assert "/cam0/one/image_raw, /cam0/two/image_raw could each be its depth" in result.text
