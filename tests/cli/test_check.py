@@ -11,7 +11,17 @@ import pytest
 
 from splatctrl_cli.checks.finding import CHECKS
 from tests.cli.test_ingest import run
-from tests.logs.make_log import LogRecipe, Message, broken_log, make_log
+from tests.logs.make_log import (
+    STORE,
+    LogRecipe,
+    Message,
+    broken_log,
+    encoded,
+    header,
+    make_log,
+    messages_of,
+    write_raw,
+)
 
 GOOD = LogRecipe(num_frames=20)
 
@@ -127,3 +137,25 @@ def test_a_capture_is_checked_as_its_log(tmp_path: Path, capsys: pytest.CaptureF
     (capture / "depth/cam0/000003.png").write_bytes(b"")
     code, printed, _ = run(capsys, "check", capture, "--fail-on", "warning")
     assert "depth/cam0/000003.png: its checksum differs" in printed
+
+
+@pytest.mark.parametrize(("num", "is_folded"), [(3, False), (4, True), (66, True)])
+def test_info_folds_topics_that_no_command_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], num: int, is_folded: bool
+) -> None:
+    """A camera's driver records dozens beside its images; what is read, and a pose, stays."""
+    text = STORE.types["std_msgs/msg/String"]
+    pose = STORE.types["geometry_msgs/msg/PoseStamped"]
+    point, turn = STORE.types["geometry_msgs/msg/Point"], STORE.types["geometry_msgs/msg/Quaternion"]
+    at = pose(header(1, "world"), STORE.types["geometry_msgs/msg/Pose"](point(0, 0, 0), turn(0, 0, 0, 1)))
+    others = [encoded(1, f"/device/option_{k}", text(data="x"), STORE) for k in range(num)]
+    good = messages_of(make_log(tmp_path / "good.mcap", GOOD))
+    log = write_raw(tmp_path / "log.mcap", [encoded(1, "/tool_pose", at, STORE), *others, *good])
+    code, printed, _ = run(capsys, "info", log)
+    assert code == 0
+    assert ("/device/option_0 " in printed) is not is_folded
+    assert (f"and {num} topics that no command reads; -v prints them" in printed) is is_folded
+    assert all(name in printed for name in ("/tool_pose", "/cam0/depth/", "/tf"))
+    assert f"/device/option_{num - 1} " in run(capsys, "info", log, "-v")[1]
+    topics = json.loads(run(capsys, "info", log, "--json")[1])["topics"]
+    assert sum(row["topic"].startswith("/device/") for row in topics) == num
