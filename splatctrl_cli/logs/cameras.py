@@ -265,7 +265,7 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
         notes = survey.damage.all_notes
         why = next((note for note in notes if "image" in note or broken[0] in note), "see `splatctrl info`")
         return InputError(
-            f"{log.path}: no image of {listed(broken)} can be decoded ({why})",
+            f"{log.path}: no image of {listed(broken)} can be decoded ({why.removeprefix(f'{broken[0]}: ')})",
             remedy="record raw images, JPEG or PNG; decode video to images first",
         )
     if depths and not colors:
