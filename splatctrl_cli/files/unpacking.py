@@ -33,14 +33,14 @@ class Budget:
         return unpacked(data, compression, size)
 
 
-def unpacked(data: bytes, compression: str, size: int) -> bytes:
+def unpacked(data: bytes, compression: str, size: int, largest: int = MAX_BLOCK) -> bytes:
     """The `size` bytes that `data` holds.
 
-    Raises BadBlockError where it is compressed in an unknown way, announces more than MAX_BLOCK, does not decompress,
+    Raises BadBlockError where it is compressed in an unknown way, announces more than `largest`, does not decompress,
     or holds another number of bytes than announced (never more than announced are made).
     """
-    if size > MAX_BLOCK:
-        raise BadBlockError(f"announces {size} bytes unpacked, at most {MAX_BLOCK} are read")
+    if size > largest:
+        raise BadBlockError(f"announces {size} bytes unpacked, at most {largest} are read")
     content = _unpacked_up_to(data, compression, size + 1)
     if len(content) != size:
         raise BadBlockError(

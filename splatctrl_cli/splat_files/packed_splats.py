@@ -5,10 +5,12 @@
 Three float32 of the centre, three float32 of the sigmas, then bytes: red, green, blue, opacity (255 is 1), and a
 quaternion w x y z as 128 q + 128. Colour by side, labels and comments have no place in it; the axes are world's.
 
-``.spz`` files (Niantic's compressed Gaussians): version 3 is written, 2 and 3 are read.
+``.spz`` files (Niantic's compressed Gaussians): version 3 is written, 2 to 4 are read.
 
 A gzip stream: a header of 16 bytes, then by attribute the centres (24-bit fixed point), opacities, colours, log
-sigmas and rotations in bytes, and the harmonics above degree 0. The format names its axes right, up, back; centres
+sigmas and rotations in bytes, and the harmonics above degree 0. Version 4 has the same bytes: its header is plain, 32
+bytes long, and says where a table of two numbers (64 bits, bytes packed and unpacked) for each attribute begins; a
+zstd stream for each follows. That of no harmonics may be left out. The format names its axes right, up, back; centres
 and rotations are written in the axes of world as they are, so that they read back in world: a viewer that takes y for
 up shows a world whose z is up lying on its back.
 """
@@ -18,12 +20,15 @@ import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
+from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.unpacking import FREE_BYTES, BadBlockError, unpacked
 from splatctrl_cli.records import Float32, Float64, GaussianSet, UInt8
 from splatctrl_cli.splat_files.gaussian_ply import check_gaussians
 from splatctrl_cli.splat_files.splat_format import (
@@ -102,7 +107,10 @@ _SPLAT_DOCS = """
 
 MAGIC = 0x5053474E  # NGSP
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, number, degree, fraction bits, flags, reserved
-HAS_EXTENSIONS = 0x2
+GZIP, PLAIN = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # a file of versions 2 and 3 begins so, one of version 4
+PLAIN_HEADER = 32  # bytes
+WAS_ANTIALIASED = 0x1  # of the flags: how it was trained, which changes no value
+SPZ_RATIO = 100  # times the file's size, that splats unpack to beside FREE_BYTES: measured 2 to 9
 FRACTION_BITS = 12  # steps of 0.24 mm up to 2 km, what other writers use; fewer for what is farther
 COLOR_SCALE = 0.15 * 255.0  # steps per unit of an f_dc coefficient
 LOG_SIGMAS = (-10.0, 255.0 / 16.0 - 10.0)  # of a byte / 16 - 10: 0.045 mm to 377 m
@@ -132,14 +140,12 @@ def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
 
 
 def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
-    """The Gaussians of an ``.spz`` file of version 2 or 3, in the file's axes, and no comments.
+    """The Gaussians of an ``.spz`` file of version 2 to 4, in the file's axes, and no comments.
 
     Raises InputError for a file that is not whole, of another version, or that holds what no Gaussian is.
     """
     try:
-        content = gzip.decompress(path.read_bytes())
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise InputError(f"{path}: no whole .spz file: {error}", remedy="copy or write the file again") from None
+        content = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     bits, (centers, opacities, colors, sigmas, quats, rest) = _columns(path, content)
@@ -182,24 +188,76 @@ def spz_bound(gaussians: GaussianSet) -> Differences:
 
 def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
     """The fraction bits, and the bytes of each attribute, a row per Gaussian, of a file of no more and no fewer."""
-    if len(content) < HEADER.size or HEADER.unpack_from(content)[0] != MAGIC:
-        raise InputError(f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {content[:4].hex()}")
-    _, version, num, degree, bits, flags, _ = HEADER.unpack_from(content)
-    if version not in (2, 3):
-        raise InputError(f"{path}: .spz version: expected 2 or 3, got {version}", remedy="write it as version 3")
+    start = content[:4]
+    if start == PLAIN:
+        num, bits, widths = _parsed(path, content, (4,), len(content))
+        parts = _streams(path, content, [num * width for width in widths])
+    elif start[:2] == GZIP:
+        num, bits, widths, body = _unzipped(path, content)
+        ends = np.cumsum([0, *widths]) * num
+        parts = [body[i:j] for i, j in pairwise(ends)]
+    else:
+        raise InputError(f"{path}: no .spz file: expected it to start as gzip or with NGSP, got {start.hex()}")
+    tables = [np.frombuffer(part, np.uint8).reshape(num, w) for part, w in zip(parts, widths, strict=True)]
+    return bits, tables
+
+
+def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
+    """The number of Gaussians, the fraction bits and the bytes of each attribute; size: of the file."""
+    if len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC:
+        raise InputError(f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}")
+    _, version, num, degree, bits, flags, _ = HEADER.unpack_from(head)
+    if version not in versions:
+        known = "2 or 3 in gzip and 4 in plain"
+        raise InputError(f"{path}: .spz version: expected {known}, got {version}", remedy="write it as version 3")
     if degree > 3 or bits > 23:
         raise InputError(f"{path}: expected degree 0 to 3 and 0 to 23 fraction bits, got {degree} and {bits}")
-    if flags & HAS_EXTENSIONS:
-        raise InputError(f"{path}: has vendor extensions, expected none", remedy="write it without them")
+    if flags & ~WAS_ANTIALIASED:
+        raise InputError(
+            f"{path}: has vendor extensions (flags {flags:#x}), expected none", remedy="write it without them"
+        )
     widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1))
-    expected = HEADER.size + num * sum(widths)
-    if len(content) != expected:
-        raise InputError(f"{path}: expected {expected} bytes for {num} splats, got {len(content)}")
-    tables, offset = list[UInt8](), HEADER.size
-    for width in widths:
-        tables.append(np.frombuffer(content, np.uint8, num * width, offset).reshape(num, width))
-        offset += num * width
-    return bits, tables
+    if num * sum(widths) > FREE_BYTES + SPZ_RATIO * size:
+        raise InputError(f"{path}: announces {num} splats, more than a file of {size} bytes holds")
+    return num, bits, widths
+
+
+def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], bytes]:
+    """What `_parsed` gives, and all attributes, of a gzip stream: no more is unpacked than its header says."""
+    try:
+        with gzip.GzipFile(fileobj=BytesIO(content)) as stream:
+            num, bits, widths = _parsed(path, stream.read(HEADER.size), (2, 3), len(content))
+            expected = num * sum(widths)
+            body = stream.read(expected + 1)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise InputError(f"{path}: no whole .spz file: {error}", remedy="copy or write the file again") from None
+    if len(body) != expected:
+        got = "more" if len(body) > expected else len(body)
+        raise InputError(f"{path}: expected {expected} bytes for {num} splats, got {got}")
+    return num, bits, widths, body
+
+
+def _streams(path: Path, content: bytes, sizes: list[int]) -> list[bytes]:
+    """The attributes of version 4, of these sizes."""
+    num_streams, place = content[HEADER.size - 1], int.from_bytes(content[HEADER.size : HEADER.size + 4], "little")
+    start = place + 16 * num_streams
+    if num_streams not in (len(sizes), 5 if sizes[5] == 0 else 6) or not PLAIN_HEADER <= place <= len(content) - 16:
+        raise InputError(f"{path}: .spz version 4: expected 6 streams after {PLAIN_HEADER} bytes, got {num_streams}")
+    table = np.frombuffer(content[place:start].ljust(16 * num_streams, b"\0"), "<u8").reshape(-1, 2).tolist()
+    if (expected := start + sum(packed for packed, _ in table)) != len(content):
+        raise InputError(
+            f"{path}: expected {expected} bytes, got {len(content)}", remedy="copy or write the file again"
+        )
+    parts = [b""] * len(sizes)
+    for index, (packed, size) in enumerate(table):
+        if size != sizes[index]:
+            raise InputError(f"{path}: stream {index}: expected {sizes[index]} bytes unpacked, got {size}")
+        try:
+            parts[index] = unpacked(content[start : start + packed], "zstd", size, size)
+        except BadBlockError as error:
+            raise InputError(f"{path}: stream {index}: {error}", remedy="copy or write the file again") from None
+        start += packed
+    return parts
 
 
 def _fraction_bits(centers: Float32) -> int:
@@ -268,9 +326,9 @@ def _of_words(words: NDArray[np.uint32]) -> Float64:
 
 
 _SPZ_DOCS = """
-`.spz` | version 3 (gzip) | centre 0.12 mm (within 2 km), sigma 3.2 %, colour 0.0037, opacity 1/510, rotation 0.28
-    degrees, harmonics 1/256 | labels, density, comments; sigmas below 0.045 mm, colours outside -0.44 to 1.44,
-    harmonics outside -1 to 1
+`.spz` | version 3 (gzip); 2 to 4 are read | centre 0.12 mm (within 2 km), sigma 3.2 %, colour 0.0037, opacity 1/510,
+    rotation 0.28 degrees, harmonics 1/256 | labels, density, comments; sigmas below 0.045 mm, colours outside -0.44
+    to 1.44, harmonics outside -1 to 1
 """
 
 ENTRIES = (
@@ -285,7 +343,7 @@ ENTRIES = (
         docs=_SPLAT_DOCS,
     ),
     SplatFormat(
-        name=".spz version 3",
+        name=".spz",
         order=2,
         suffix=".spz",
         write=write_spz,

@@ -1,11 +1,14 @@
 """Splat files, point clouds and exports of other tools."""
 
+import gzip
 import json
+import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 from splatctrl_cli.files.ply import read_points, read_positions
@@ -233,11 +236,97 @@ def _examine_faces(folder: Path, out: Path, run: Run) -> None:
         assert sentence in refused.text
 
 
+def spz_parts(degree: int = 0) -> list[bytes]:
+    """Centres, opacities, colours, sigmas, rotations and harmonics of a plane of 400 splats at z = 0.5."""
+    grid = np.rint(4096 * np.linspace(0, 1, SIDE)).astype(int)
+    places = [(x, y, 2048) for y in grid.tolist() for x in grid.tolist()]
+    centers = b"".join(value.to_bytes(3, "little", signed=True) for place in places for value in place)
+    num, sigma = len(places), round(16 * (np.log(0.02) + 10))
+    rotations = struct.pack("<I", 3 << 30) * num  # w is the largest, the others are 0
+    harmonics = bytes([128]) * (num * 3 * ((degree + 1) ** 2 - 1))
+    return [centers, bytes([240]) * num, bytes([200]) * 3 * num, bytes([sigma]) * 3 * num, rotations, harmonics]
+
+
+def spz_4(
+    parts: Sequence[bytes], *, version: int = 4, degree: int = 0, place: int = 32, flags: int = 0, level: int = 3
+) -> bytes:
+    """A file of version 4: a plain header, sizes, a stream of zstd for each of the parts."""
+    packed = [zstandard.ZstdCompressor(level=level, write_content_size=level > 1).compress(part) for part in parts]
+    head = struct.pack("<IIIBBBBI12x", 0x5053474E, version, SIDE * SIDE, degree, 12, flags, len(parts), place)
+    table = b"".join(struct.pack("<QQ", len(short), len(part)) for short, part in zip(packed, parts, strict=True))
+    return head.ljust(place, b"\0") + table + b"".join(packed)
+
+
+def _spz(folder: Path) -> None:
+    (folder / "06-v4.spz").write_bytes(spz_4(spz_parts()))
+
+
+def _examine_spz(folder: Path, out: Path, run: Run) -> None:
+    assert exported(run, folder / "06-v4.spz", out / "a.ply")["num_splats"] == SIDE * SIDE
+    centers = read_positions(out / "a.ply")
+    assert np.abs(centers[:, 2] - 0.5).max() < 1e-3
+    assert np.abs(np.sort(np.unique(centers[:, 0].round(3))) - np.linspace(0, 1, SIDE)).max() < 1e-3
+    baked(run, folder / "06-v4.spz", out / "field")
+    assert "0.0195, 0.0195, 0.0195" in run(["info", folder / "06-v4.spz"]).text
+
+
+def _other_spz(folder: Path) -> None:
+    parts, whole = spz_parts(), spz_4(spz_parts())
+    header = struct.pack("<IIIBBBB", 0x5053474E, 3, SIDE * SIDE, 0, 12, 0, 0)
+    many = struct.pack("<IIIBBBB", 0x5053474E, 3, 1 << 31, 0, 12, 0, 0)
+    files = {
+        "five.spz": spz_4(parts[:5]),
+        "far.spz": spz_4(parts, place=64, level=1),
+        "harmonics.spz": spz_4(spz_parts(3), degree=3),
+        "v3.spz": gzip.compress(header + b"".join(parts)),
+        "v5.spz": spz_4(parts, version=5),
+        "v9.spz": gzip.compress(header.replace(b"\x03", b"\x09", 1) + b"".join(parts)),
+        "cut.spz": whole[:-3],
+        "header.spz": whole[:20],
+        "damaged.spz": whole[:300] + bytes(40) + whole[340:],
+        "wrong.spz": spz_4([parts[0][:-9], *parts[1:]]),
+        "three.spz": spz_4(parts[:3]),
+        "extended.spz": spz_4(parts, flags=2),
+        "bomb.spz": gzip.compress(header + bytes(1 << 26)),
+        "many.spz": gzip.compress(many + bytes(1 << 20)),
+        "text.spz": b"splats",
+    }
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+
+
+def _examine_other_spz(folder: Path, out: Path, run: Run) -> None:
+    for name in ("five.spz", "far.spz", "harmonics.spz", "v3.spz"):
+        assert exported(run, folder / name, out / f"{name}.ply")["num_splats"] == SIDE * SIDE
+        assert (read_positions(out / f"{name}.ply")[:, 2] == 0.5).all()
+    sentences = {
+        "v5.spz": "expected 2 or 3 in gzip and 4 in plain, got 5",
+        "v9.spz": "expected 2 or 3 in gzip and 4 in plain, got 9",
+        "cut.spz": "copy or write the file again",
+        "header.spz": "expected 6 streams after 32 bytes",
+        "damaged.spz": "stream 0: cannot be decompressed; copy or write the file again",
+        "wrong.spz": "stream 0: expected 3600 bytes unpacked, got 3591",
+        "three.spz": "expected 6 streams after 32 bytes, got 3",
+        "extended.spz": "has vendor extensions (flags 0x2), expected none; write it without them",
+        "bomb.spz": "expected 8000 bytes for 400 splats, got more",
+        "many.spz": "announces 2147483648 splats, more than a file of",
+        "text.spz": "expected it to start as gzip or with NGSP",
+    }
+    for name, sentence in sentences.items():
+        for command in ("export", "sdf-bake"):
+            refused = run([command, folder / name, "-o", out / f"{command}.ply"])
+            assert refused.code == 4, name
+            assert sentence in refused.text, refused.text
+            assert ("write the file again" in refused.text) is ("write the file again" in sentence)
+
+
 CASES: tuple[Case, ...] = (
     Case(name="08-ply-double-utm", make=_double, examine=_examine_double, has_shared=True),
     Case(name="ply-double-and-float-coordinates", make=_siblings_of_double, examine=_examine_siblings_of_double),
     Case(name="33-ply-linear-scales", make=_linear, examine=_examine_linear, has_shared=True),
     Case(name="ply-scales-of-other-kinds", make=_siblings_of_linear, examine=_examine_siblings_of_linear),
+    Case(name="18-spz-v4", make=_spz, examine=_examine_spz, has_shared=True),
+    Case(name="spz-of-other-versions", make=_other_spz, examine=_examine_other_spz),
     Case(name="19-ply-empty-face-element", make=_empty_faces, examine=_examine_empty_faces, has_shared=True),
     Case(name="ply-faces-before-and-after", make=_faces, examine=_examine_faces),
 )
