@@ -195,7 +195,7 @@ class CameraAgreement:
             if finding.code == "views-scale" and not self._is_allowed:
                 raise InputError(
                     f"{self._name}: {finding.what}",
-                    remedy=f"{rescaled(self._units(), float(finding.value))}, or correct the poses' unit; if both are"
+                    remedy=f"{rescaled(self._units(), finding.value or 1.0)}, or correct the poses' unit; if both are"
                     " right, give --allow-disagreement",
                 )
             if finding.code == "views-scale":

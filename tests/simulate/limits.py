@@ -4,7 +4,7 @@ import numpy as np
 
 from splatctrl_cli.simulate.recording import JOINT_RATE, Recording
 
-DURATIONS = (0.5, 1.0, 2.0, 7.0)  # [s]
+DURATIONS = (0.5, 1.0, 1.5, 2.0, 7.0)  # [s]
 
 
 def assert_keeps_limits(recording: Recording) -> None:
