@@ -3,6 +3,9 @@
 Wording is ``thing: expected X, got Y``; the remedy follows on the same line after a semicolon.
 """
 
+DAMAGED = 3  # exit code: done, but part of the recording is damaged
+DAMAGE = "part of the recording is damaged and left out"
+
 
 class SplatCtrlError(Exception):
     """An expected failure: `message` names the thing, `remedy` says what to do about it."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from splatctrl_cli.checks.finding import CheckReport
 from splatctrl_cli.cli.common import Console, shown, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
-from splatctrl_cli.evaluate.verdict import DAMAGED
+from splatctrl_cli.errors import DAMAGED
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.sources.source import describe

@@ -8,6 +8,8 @@ from enum import StrEnum
 from functools import partial
 from typing import Any, Generic, TypeVar
 
+from splatctrl_cli.errors import DAMAGE, DAMAGED
+
 E = TypeVar("E")  # what a criterion looks at
 
 
@@ -20,8 +22,6 @@ class Outcome(StrEnum):
 
 
 EXIT_CODES = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.NOT_EVALUABLE: 5}
-DAMAGED = 3
-DAMAGE = "part of the recording is damaged and left out"
 SHORT = 80  # characters of a value that `brief` prints
 _WORST_FIRST = (Outcome.FAILED, Outcome.NOT_EVALUABLE, Outcome.PASSED)  # a definite failure outranks missing evidence
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.config import Config, SceneConfig
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import DAMAGED, InputError, UsageError
 from splatctrl_cli.evaluate.images import psnr
-from splatctrl_cli.evaluate.verdict import DAMAGED, Outcome, Reason, Verdict, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.grid_files.npz_grid import read_npz

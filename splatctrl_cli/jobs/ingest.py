@@ -11,8 +11,7 @@ from splatctrl_cli import __version__
 from splatctrl_cli.captures.capture_pack import pack_capture, unpack_capture
 from splatctrl_cli.captures.capture_writer import JOURNAL, CaptureSummary, read_identity, write_capture
 from splatctrl_cli.datasets.image_folder import HOLDOUT
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.verdict import DAMAGED
+from splatctrl_cli.errors import DAMAGED, InputError, UsageError
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstructions.resume import check_same_run, told_how_to_go_on

@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError, SplatCtrlError
-from splatctrl_cli.evaluate.verdict import DAMAGE
+from splatctrl_cli.errors import DAMAGE, InputError, SplatCtrlError
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.jobs.batches.graph import columns_of
 from splatctrl_cli.jobs.progress import SILENT, Progress

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any, TextIO
 from xml.etree import ElementTree
 
-from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.verdict import DAMAGE, DAMAGED
+from splatctrl_cli.errors import DAMAGE, DAMAGED, UsageError
 from splatctrl_cli.files.output import output_path
 
 

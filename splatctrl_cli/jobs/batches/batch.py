@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.verdict import DAMAGED, Outcome, Reason, Verdict, damage_mark, verdict_of
+from splatctrl_cli.errors import DAMAGED, InputError, UsageError
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, damage_mark, verdict_of
 from splatctrl_cli.files.output import MARKERS, write_durably, write_json
 from splatctrl_cli.jobs.batches.graph import COMMANDS, CommandLine, Node, nodes_of, of_shard
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run, keys_of
