@@ -148,8 +148,7 @@ def read_sphere_file(path: Path) -> SphereFile:
     section = _xrdf(path, tree) if is_xrdf else _section(tree)
     table = section.get("collision_spheres")
     is_lula = isinstance(table, list) and all(isinstance(entry, dict) for entry in table)
-    if is_lula:
-        table = _joined(path, table)
+    table = _joined(path, table or []) if is_lula else table
     source = path
     if isinstance(table, str):
         source = path.parent / table
