@@ -20,6 +20,10 @@ from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
 from splatctrl_cli.sources.source import open_logs
 
 NEVER = "never"
+_ALLOWING = {  # the options that take an error on
+    **dict.fromkeys(("agreement", "views-scale", "alignment"), "--allow-disagreement"),
+    "pose-jump": "--max-pose-jump",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +79,7 @@ def refuse_errors(path: Path, options: SourceOptions, command: str, allowed: Col
     if errors:
         first, more = errors[0], f"; {len(errors) - 1} more: splatctrl check {path}" if len(errors) > 1 else ""
         remedy = first.remedy or CHECKS[first.code].remedy
+        remedy += f"; if it is right, give {_ALLOWING[first.code]}" if first.code in _ALLOWING else ""
         raise InputError(f"{path}: {first.where}: {first.what} [{first.code}]", remedy=f"{remedy}{more}")
 
 

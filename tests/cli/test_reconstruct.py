@@ -171,7 +171,7 @@ def test_cameras_that_disagree_are_refused_before_anything_is_fitted(
     description = write_folder(tmp_path / "in", two_cameras(0.09), has_clock=has_clock)
     assert reconstruct_folder(description, tmp_path / "scene", "-q") == 4
     err = capsys.readouterr().err
-    assert "camera cam0 and cam1: depths disagree by 90 mm" in err
+    assert "cameras cam0 and cam1: depths differ by 90.0 mm" in err
     assert "expected at most 30 mm" in err
     assert "poses are off, or so little depth is left (a short range, a clip, holes)" in err
     assert "--cameras cam0" in err
