@@ -124,8 +124,8 @@ def test_a_replay_agrees_with_its_own_steps_and_another_is_told_by_step_and_join
     capsys.readouterr()
     other = ("--set", "control.posture_gain=0.6", "--golden", golden)
     assert desk.replay(*drive, *other, out="other") == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "golden: step 0 at 0.000 s: joint joint" in line and "within 1e-06, got" in line
+    said = capsys.readouterr().out
+    assert "golden: step 0 at 0.000 s: joint joint" in said and "within 1e-06, got" in said
     assert desk.replay(*drive, *other, "--golden-tolerance", "10", out="loose") == 0
     assert desk.metrics("loose")["num_steps"] == desk.metrics()["num_steps"]
 
@@ -151,7 +151,7 @@ def test_a_gate_that_fails_names_the_first_time_that_breaks_it(
     moving(desk)
     gates = ("--require", "min_clearance>=0.03", "--require", "num_below_margin<=0", "--require", "unknown_share>=2")
     assert desk.replay(*scene_of(desk, ball_ahead(arm, 0.01)), "-q", *gates) == 1
-    message = capsys.readouterr().err
+    message = capsys.readouterr().out
     rows = desk.rows()
     first = next(row for row in rows if float(row["clearance_exact"]) < 0.03)
     second = next(row for row in rows if float(row["clearance_exact"]) < 0.02)

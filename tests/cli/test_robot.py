@@ -59,13 +59,13 @@ def test_the_table_names_links_and_what_sticks_out(capsys: pytest.CaptureFixture
 def test_gates_hold_a_set_to_its_figures(capsys: pytest.CaptureFixture[str], urdf: Path) -> None:
     spheres = written(urdf.parent, "collision_spheres: {tip: [{center: [0, 0, 0], radius: 0.07}]}", "s.yaml")
     check = ("check", "--urdf", urdf, "--spheres", spheres, "-q", "--require")
-    code, _, err = run(capsys, *check, "uncovered_share<=0.2")
+    code, out, _ = run(capsys, *check, "uncovered_share<=0.2")
     assert code == 1
     assert (
-        "robot check: GATE FAILED (1 spheres on 2 links): --require uncovered_share<=0.2: uncovered_share is 1" in err
+        "robot check: GATE FAILED (1 spheres on 2 links): --require uncovered_share<=0.2: uncovered_share is 1" in out
     )
-    code, _, err = run(capsys, *check, "max_deficit<=0.2")
-    assert code == 5 and "max_deficit is unknown, required <= 0.2" in err
+    code, out, _ = run(capsys, *check, "max_deficit<=0.2")
+    assert code == 5 and "max_deficit is unknown, required <= 0.2" in out
     code, _, err = run(capsys, *check, "deficit<=0.2")
     assert (code, "did you mean max_deficit?" in err) == (2, True)
 
