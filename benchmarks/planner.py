@@ -12,14 +12,16 @@ import numpy as np
 from benchmarks.measure import Limit, Options, Result
 from benchmarks.ompl_planner import notes_beside_ompl
 from splatctrl_cli.config import ControlConfig, PlannerConfig
+from splatctrl_cli.control.goals import pose_error
+from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.jobs.simulated_task import solids_of
 from splatctrl_cli.jobs.studies.problems import Problem, panda, read_archive
 from splatctrl_cli.planner.birrt import Plan, plan
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
-from splatctrl_cli.planner.path import effector_length, joint_length, least_clearance, resampled, timed
-from splatctrl_cli.planner.tracking import TrackingRun, follow_joints, follow_with_controller
+from splatctrl_cli.planner.path import TimedPath, effector_length, joint_length, least_clearance, resampled, timed
+from splatctrl_cli.planner.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.records import Bool, Float64
 
 FRAME = "panda_grasptarget"
@@ -86,13 +88,38 @@ def _solved(problem: Problem, answer: Plan, cpu: float, room: Clearance) -> Solv
     )
 
 
-def _followed(solved: Solved, room: Clearance) -> tuple[TrackingRun, TrackingRun]:
+@dataclass(frozen=True, kw_only=True)
+class Followed:
+    """Figures of a path that was followed: effector [m], [degrees]; joint_length [rad]; least_clearance [m]."""
+
+    is_success: bool
+    joint_length: float
+    effector: tuple[float, float]
+    least_clearance: float
+    duration: float
+
+
+def _followed(solved: Solved, room: Clearance) -> tuple[Followed, Followed]:
     """The path followed in joint space, and by QP-IK without a margin of its own."""
     planner, control = PlannerConfig(), ControlConfig(margin=0.0, self_margin=0.0, max_time=60.0, solver="daqp")
     path = timed(solved.plan.waypoints, room.model.velocity_limit, planner.max_acceleration)
     slow = timed(solved.plan.waypoints, room.model.velocity_limit / 4, planner.max_acceleration)
-    joints, scene = follow_joints(path, room, FRAME, planner, control), solids_of(solved.problem.things)
-    return joints, follow_with_controller(slow, room, lambda stamp_ns: scene, FRAME, planner, control)
+    joints, scene = follow_joints(path, room.model, planner, control), solids_of(solved.problem.things)
+    guided, _ = follow_with_controller(slow, room.model, lambda stamp_ns: scene, FRAME, planner, control)
+    return _figures(joints, path, room, control), _figures(guided, slow, room, control)
+
+
+def _figures(position: Float64, path: TimedPath, room: Clearance, control: ControlConfig) -> Followed:
+    """Success: the goal was reached, and no posture was in collision."""
+    model, least = room.model, float(np.min(room.at(position)))
+    error = pose_error(model.frame_pose(position[-1], FRAME), model.frame_pose(path.waypoints[-1], FRAME))
+    return Followed(
+        is_success=is_at_goal(error, control) and least > 0,
+        joint_length=joint_length(position),
+        effector=effector_length(model, position, FRAME),
+        least_clearance=least,
+        duration=control.period * (len(position) - 1),
+    )
 
 
 def _edge_checks(clearance: Clearance, problems: Sequence[Problem]) -> dict[str, float]:
@@ -153,7 +180,7 @@ def _result(
     failed: Sequence[str],
     invalid: Sequence[str],
     edges: dict[str, float],
-    runs: Sequence[tuple[TrackingRun, TrackingRun]],
+    runs: Sequence[tuple[Followed, Followed]],
     notes: Sequence[str],
 ) -> Result:
     families = sorted({s.problem.environment for s in solved})
@@ -219,7 +246,7 @@ def _edge_notes(edges: dict[str, float]) -> list[str]:
     ]
 
 
-def _tracking_notes(runs: Sequence[tuple[TrackingRun, TrackingRun]]) -> list[str]:
+def _tracking_notes(runs: Sequence[tuple[Followed, Followed]]) -> list[str]:
     notes = []
     for way, kind in (("in joint space", 0), ("by QP-IK, a quarter of the speed, no margin", 1)):
         chosen = [pair[kind] for pair in runs]
@@ -228,8 +255,8 @@ def _tracking_notes(runs: Sequence[tuple[TrackingRun, TrackingRun]]) -> list[str
             notes.append(
                 f"followed {way}: {len(good)}/{len(chosen)} succeed, means of these: "
                 f"{statistics.mean(r.joint_length for r in good):.2f} rad, "
-                f"{statistics.mean(r.effector_length for r in good):.2f} m, "
-                f"{statistics.mean(r.effector_turn for r in good):.0f} deg, "
+                f"{statistics.mean(r.effector[0] for r in good):.2f} m, "
+                f"{statistics.mean(r.effector[1] for r in good):.0f} deg, "
                 f"least clearance {1e3 * statistics.mean(r.least_clearance for r in good):.1f} mm, "
                 f"{statistics.mean(r.duration for r in good):.1f} s"
             )

@@ -8,8 +8,8 @@ the version of Python.
 import inspect
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import fields
+from collections.abc import Container, Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -21,10 +21,11 @@ from splatctrl_cli.config.load import type_name
 from splatctrl_cli.config.ranges import OneOf, Section
 from splatctrl_cli.datasets.layout import Layout
 from splatctrl_cli.datasets.layouts import LAYOUTS
+from splatctrl_cli.evaluate.metrics import Better, Scale
 from splatctrl_cli.evaluate.verdict import Criterion
 from splatctrl_cli.grid_files.grid_format import GridFormat
 from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
-from splatctrl_cli.jobs.judged_runs import Compared, documented
+from splatctrl_cli.jobs.judged_runs import scales
 from splatctrl_cli.jobs.replays.criteria_input import Judged
 from splatctrl_cli.jobs.replays.evidence_criteria import LIMITS, PROOF, Limit
 from splatctrl_cli.jobs.replays.verdict import CRITERIA
@@ -38,6 +39,57 @@ INPUT = "input"  # the group of options that say how a recording is read
 HELP = ("help", "help_all")
 SIMPLE = ("int", "float", "str")  # types that a default shows
 TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n)((?:[|-].*\n)*)")
+WORDS = {  # of a name in the documentation, for those that it stands for
+    "METHOD": ("closed_loop", "log", "birrt_ik", "birrt", "standstill"),
+    "FIELD": ("exact", "barrier", "certified"),
+    "REGION": ("seen", "all", "masked"),
+    "FIT": ("3dgs", "ours"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compared:
+    """Figures of a command that are compared alike, as the documentation's table has them."""
+
+    command: str
+    names: tuple[str, ...]
+    scale: Scale
+
+    @property
+    def docs(self) -> str:
+        """The row of the table, its cells separated by |."""
+        scale, shown = self.scale, ", ".join(f"`{name}`" for name in self.names)
+        parts = [f"{scale.absolute:g} {scale.unit}".rstrip()] if scale.absolute else []
+        parts += [f"{100 * scale.relative:g} %"] if scale.relative else []
+        return f"{self.command} | {shown} | {scale.unit or '-'} | {scale.better} | {' + '.join(parts) or '0'}"
+
+
+def documented() -> Iterator[Compared]:
+    """The rows of the documentation's table: figures that have a direction, alike ones together."""
+    for command, of_name in scales().items():
+        alike: dict[Scale, list[str]] = {}
+        for name, scale in of_name.items():
+            if scale.better is not Better.NEITHER:
+                alike.setdefault(scale, []).append(_general(name, of_name))
+        for scale, names in alike.items():
+            yield Compared(command=command, names=tuple(dict.fromkeys(names)), scale=scale)
+
+
+def _general(name: str, names: Container[str]) -> str:
+    """A name with a word for what is one of several among `names`: ``seen.FIELD.BAND.rmse``, ``METHOD_success``."""
+    if name.startswith(("everywhere.", "seen.")):
+        where, *_, figure = name.split(".")
+        return f"{where}.FIELD.BAND.{figure}"
+    for word, choices in WORDS.items():
+        for choice in choices:
+            head, tail = name.removeprefix(f"{choice}_"), name.removesuffix(f"_{choice}")
+            if head != name and sum(f"{other}_{head}" in names for other in choices) > 1:
+                return f"{word}_{head}"
+            if tail != name and sum(f"{tail}_{other}" in names for other in choices) > 1:
+                return f"{tail}_{word}"
+    return name
+
+
 Entry = SplatFormat | GridFormat | Layout | Check | Criterion[Judged] | Limit | Compared
 REGISTRIES: dict[str, tuple[tuple[str, ...], Iterable[Entry]]] = {
     "splat_files": (("suffix", "what it is", "rounds to", "does not hold"), SPLAT_FORMATS.values()),

@@ -11,7 +11,6 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction
 from splatctrl_cli.control.barriers import scene_margin
-from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, pose_error
 from splatctrl_cli.control.preconditions import (
     StaticViolation,
@@ -370,8 +369,3 @@ def _has_stalled(positions: list[Float64], config: ControlConfig) -> bool:
         return False
     moved = np.max(np.abs(positions[-1] - positions[-1 - num_back]))
     return bool(moved < config.stall_speed * config.stall_time)
-
-
-def num_on_rung(trace: ReplayTrace, rung: Rung) -> int:
-    """How many steps came about on a rung of the ladder."""
-    return sum(step.rung is rung for step in trace.steps)

@@ -1,6 +1,5 @@
 """What a job says while it works."""
 
-import sys
 import time
 from typing import Protocol, Self
 
@@ -24,16 +23,6 @@ class Silent:
 
     def log(self, line: str) -> None:
         """Drop the line."""
-
-
-class Lines:
-    """Prints on stderr."""
-
-    is_quiet = False
-
-    def log(self, line: str) -> None:
-        sys.stderr.write(line + "\n")
-        sys.stderr.flush()
 
 
 SILENT = Silent()

@@ -33,7 +33,7 @@ class Plan:
     """What a search found: waypoints (W, J) [rad] from the start to goal number `goal`, none unless it is solved.
 
     found (V, J) is the path before it was shortened. num_checks postures were asked, on num_edges edges, over
-    num_iterations; num_nodes stand in both trees; search_time and shortcut_time [s] are wall clock.
+    num_iterations; search_time and shortcut_time [s] are wall clock.
     """
 
     outcome: PlanOutcome
@@ -41,7 +41,6 @@ class Plan:
     found: Float64
     goal: int
     num_iterations: int
-    num_nodes: int
     num_edges: int
     num_checks: int
     search_time: float
@@ -197,7 +196,6 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
         found=found,
         goal=goal,
         num_iterations=search.num_iterations,
-        num_nodes=trees[0].size + trees[1].size,
         num_edges=search.num_edges,
         num_checks=search.num_checks,
         search_time=searched - began,

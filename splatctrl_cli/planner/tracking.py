@@ -1,61 +1,38 @@
 """A planned path, followed in closed loop: in joint space, or by the QP-IK controller with its barriers."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig
+from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.goals import Guide, guided_goal, pose_error
 from splatctrl_cli.control.replay import FieldAt, is_at_goal
 from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController
-from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.path import TimedPath, effector_length, joint_length
+from splatctrl_cli.planner.path import TimedPath
 from splatctrl_cli.records import Float64
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrackingRun:
-    """How a path was followed: position (T, J) [rad] per period, the controller's steps between them (T - 1, none in
-    joint space), and what IV reports of it.
+def follow_joints(path: TimedPath, model: ArmModel, planner: PlannerConfig, control: ControlConfig) -> Float64:
+    """Follow in joint space: the path's velocity plus a pull towards its position, within the velocity limits.
 
-    has_arrived: the end effector is at the goal's pose; joint_length [rad], effector_length [m], effector_turn
-    [degrees]; least_clearance [m], less its margin, over the T postures; duration [s].
+    Returns the position (T, J) [rad] at every period.
     """
-
-    position: Float64
-    steps: tuple[ControlStep, ...]
-    has_arrived: bool
-    joint_length: float
-    effector_length: float
-    effector_turn: float
-    least_clearance: float
-    duration: float
-
-    @property
-    def is_success(self) -> bool:
-        """True where the goal was reached and no posture was in collision."""
-        return self.has_arrived and self.least_clearance > 0
-
-
-def follow_joints(
-    path: TimedPath, clearance: Clearance, frame: str, planner: PlannerConfig, control: ControlConfig
-) -> TrackingRun:
-    """Follow in joint space: the path's velocity plus a pull towards its position, within the velocity limits."""
-    model, period = clearance.model, control.period
+    period = control.period
     q, positions = path.waypoints[0], [path.waypoints[0]]
     clock = period * np.arange(int(np.ceil(path.duration / period)) + 1)
     for now, following in pairwise(path.at(clock)[0]):
         velocity = (following - now) / period + planner.follow_gain * (now - q)
         q = q + period * np.clip(velocity, -model.velocity_limit, model.velocity_limit)
         positions.append(q)
-    return _run(np.array(positions), (), path, clearance, frame, control)
+    return np.array(positions)
 
 
 def follow_with_controller(
     path: TimedPath,
-    clearance: Clearance,
+    model: ArmModel,
     field_at: FieldAt,
     frame: str,
     planner: PlannerConfig,
@@ -63,14 +40,15 @@ def follow_with_controller(
     *,
     stamp_ns: int = 0,
     scene_step_at: SceneStepAt | None = None,
-) -> TrackingRun:
+) -> tuple[Float64, Sequence[ControlStep]]:
     """Follow with QP-IK from a stamp [ns] on: its goal is the end effector's pose on the path, as it moves there, and
     the posture it leans to is the path's.
 
     The path's clock waits while the end effector is `wait_distance` behind. Ends at the goal, or when the clock has
-    stood still for `control.stall_time`. field_at and scene_step_at as in `closed_loop`.
+    stood still for `control.stall_time`. field_at and scene_step_at as in `closed_loop`. Returns the position (T, J)
+    [rad] at every period, and the T - 1 steps between them.
     """
-    model, period = clearance.model, control.period
+    period = control.period
     field = field_at(stamp_ns)
     controller = QpIkController(model, control, field, frame=frame)
     q, clock, waited, is_behind = path.waypoints[0], 0.0, 0.0, False
@@ -94,27 +72,4 @@ def follow_with_controller(
         is_behind = bool(np.linalg.norm(step.pose_error[:3]) >= planner.wait_distance)
         waited = waited + period if is_behind or clock >= path.duration else 0.0
         clock = clock if is_behind else min(clock + period, path.duration)
-    return _run(np.array(positions), tuple(steps), path, clearance, frame, control)
-
-
-def _run(
-    position: Float64,
-    steps: tuple[ControlStep, ...],
-    path: TimedPath,
-    clearance: Clearance,
-    frame: str,
-    control: ControlConfig,
-) -> TrackingRun:
-    model = clearance.model
-    error = pose_error(model.frame_pose(position[-1], frame), model.frame_pose(path.waypoints[-1], frame))
-    moved, turned = effector_length(model, position, frame)
-    return TrackingRun(
-        position=position,
-        steps=steps,
-        has_arrived=is_at_goal(error, control),
-        joint_length=joint_length(position),
-        effector_length=moved,
-        effector_turn=turned,
-        least_clearance=float(np.min(clearance.at(position))),
-        duration=control.period * (len(position) - 1),
-    )
+    return np.array(positions), steps

@@ -6,6 +6,8 @@ from functools import partial
 import numpy as np
 
 from splatctrl_cli.control.audit import BallDistance
+from splatctrl_cli.control.fallbacks import Rung
+from splatctrl_cli.control.replay import ReplayTrace
 from splatctrl_cli.kernels.chain import Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
 
@@ -165,3 +167,8 @@ def _unit(angle: float) -> Float64:
 
 def _turned(vector: Float64) -> Float64:
     return np.array([-vector[1], vector[0], 0.0])
+
+
+def num_on_rung(trace: ReplayTrace, rung: Rung) -> int:
+    """How many steps came about on a rung of the ladder."""
+    return sum(step.rung is rung for step in trace.steps)

@@ -10,10 +10,10 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.qp_rows import RowBuilder
-from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop, num_on_rung
+from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.control.terms import State
 from splatctrl_cli.records import Float64
-from tests.control.fakes import Balls, PlanarArm, far_away, scene_of
+from tests.control.fakes import Balls, PlanarArm, far_away, num_on_rung, scene_of
 
 CONFIG = ControlConfig(goal_position=0.002, goal_rotation=0.002, max_time=8.0)
 MARGIN = CONFIG.margin

@@ -11,13 +11,13 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.goals import Detour
-from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop, num_on_rung
+from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.path import timed
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
-from tests.control.fakes import Balls, PlanarArm, far_away
+from tests.control.fakes import Balls, PlanarArm, far_away, num_on_rung
 
 CONFIG = ControlConfig(goal_position=0.002, goal_rotation=0.002)
 NOTHING_NEAR = far_away()

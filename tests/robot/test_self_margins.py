@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import LEAST_OVERLAP
 from splatctrl_cli.control.fallbacks import Rung
-from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop, num_on_rung
+from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh
 from splatctrl_cli.planner.configuration_clearance import Clearance
@@ -31,7 +31,7 @@ from splatctrl_cli.robot.self_margins import (
     with_kept_margins,
 )
 from splatctrl_cli.robot.urdf import read_urdf
-from tests.control.fakes import Balls
+from tests.control.fakes import Balls, num_on_rung
 from tests.reference.mesh_gap import surface_distance
 from tests.robot.shapes import (
     CROSSED,

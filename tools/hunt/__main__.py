@@ -14,12 +14,21 @@ from pathlib import Path
 from splatctrl_cli.jobs.batches.graph import Node
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run
 from splatctrl_cli.jobs.batches.run import DONE, FAILED, Scheduler, local_executor
-from splatctrl_cli.jobs.progress import Lines
 from tools.hunt.table import border_of, merge_rows, read_rows, report
 from tools.hunt.trial import Row, family_of, run
 
 HERE = Path(__file__).parent
 TABLE, ENTRY = HERE / "campaigns.csv", "tools.hunt.__main__:one"
+
+
+class Lines:
+    """Prints on stderr."""
+
+    is_quiet = False
+
+    def log(self, line: str) -> None:
+        sys.stderr.write(line + "\n")
+        sys.stderr.flush()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -188,17 +188,17 @@ def _planned(
         if plan.path is None:
             continue
         if baseline == BIRRT:
-            run = follow_joints(plan.path, plan.clearance, task.frame, planner, control)
+            position, shaped = follow_joints(plan.path, plan.clearance.model, planner, control), None
         else:
-            run = follow_with_controller(
-                plan.path, plan.clearance, lambda stamp: scene.at(stamp).barrier, task.frame, planner, control,
+            position, steps = follow_with_controller(
+                plan.path, plan.clearance.model, lambda stamp: scene.at(stamp).barrier, task.frame, planner, control,
                 stamp_ns=task.stamp_ns, scene_step_at=scene.step_at,
             )  # fmt: skip
-        shaped = np.array([is_shaped(step) for step in run.steps], dtype=np.bool_)
+            shaped = np.array([is_shaped(step) for step in steps], dtype=np.bool_)
         motions[method_named(baseline)] = Motion(
-            stamp_ns=_stamps(task.stamp_ns, len(run.position), control.period),
-            position=run.position,
-            is_intervened=shaped if baseline == BIRRT_IK else None,
+            stamp_ns=_stamps(task.stamp_ns, len(position), control.period),
+            position=position,
+            is_intervened=shaped,
         )
     return plans, motions
 

@@ -297,8 +297,8 @@ def _planned(rig: Rig, scene: HasDistance, config: Config, *, approach: float = 
     plan = planned_path(rig.problem.model, scene, rig.task, config.planner, config.control, approach=approach)
     if plan.path is None:
         return Attempt(position=None, cause=BLOCKED.get(plan.outcome, judge.NO_PLAN), outcome=plan.outcome)
-    run = follow_joints(plan.path, plan.clearance, rig.task.frame, config.planner, config.control)
-    return Attempt(position=run.position, outcome=plan.outcome, margin=plan.margin)
+    position = follow_joints(plan.path, plan.clearance.model, config.planner, config.control)
+    return Attempt(position=position, outcome=plan.outcome, margin=plan.margin)
 
 
 def by_controller(num_detours: int) -> Drive:

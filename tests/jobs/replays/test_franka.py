@@ -11,7 +11,7 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.fallbacks import Rung
-from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop, num_on_rung
+from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.jobs.replays.inputs import MeasuredRobot, measured_robot
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.records import Float64
@@ -21,7 +21,7 @@ from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.truth import closest_of
-from tests.control.fakes import Balls
+from tests.control.fakes import Balls, num_on_rung
 
 CONFIG = ControlConfig(solver="daqp", max_time=8.0)
 LOGGED = [f"joint{k}" for k in range(1, 8)]
