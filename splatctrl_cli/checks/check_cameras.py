@@ -234,9 +234,6 @@ def _lens(found: Survey, topics: CameraTopics, options: SourceOptions) -> list[F
         fx, fy, cx, cy = given[:4]
         lens = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=image.width, height=image.height)
         return lens_findings(where, lens, "--intrinsics")
-    found_by: list[Finding] = []
-    for name in dict.fromkeys(name for name in (topics.info, topics.depth_info) if name):
-        calibration = found.topics[name].calibration
-        if calibration is not None and calibration.width:
-            found_by += lens_findings(where, intrinsics_of(calibration), name)
-    return found_by
+    names = dict.fromkeys(name for name in (topics.info, topics.depth_info) if name)
+    known = [(name, its) for name in names if (its := found.topics[name].calibration) is not None and its.width]
+    return [finding for name, its in known for finding in lens_findings(where, intrinsics_of(its), name)]

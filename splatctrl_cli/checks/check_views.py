@@ -223,10 +223,8 @@ def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
     """As many of each camera, spread over its frames."""
     cameras = sorted({frame.camera for frame in frames})
     each = max(2, min(8, limits.VIEWS // max(len(cameras), 1)))
-    chosen: list[RgbdFrame] = []
-    for camera in cameras:
-        chosen += spread([frame for frame in frames if frame.camera == camera], each)
-    return chosen
+    of_cameras = [[frame for frame in frames if frame.camera == camera] for camera in cameras]
+    return [frame for of_camera in of_cameras for frame in spread(of_camera, each)]
 
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:

@@ -143,12 +143,8 @@ def find_files(root: Path, pattern: str) -> list[tuple[str, Path]]:
     if "*" not in pattern:
         return [("", root / pattern)] if (root / pattern).is_file() else []
     expression = re.compile(".*".join(re.escape(part) for part in pattern.split("*")).replace(".*", "(.*)", 1))
-    found = []
-    for path in sorted(root.glob(pattern)):
-        match = expression.fullmatch(path.relative_to(root).as_posix())
-        if match is not None:
-            found.append((match[1], path))
-    return found
+    found = ((expression.fullmatch(path.relative_to(root).as_posix()), path) for path in sorted(root.glob(pattern)))
+    return [(match[1], path) for match, path in found if match is not None]
 
 
 def _pose(table: PosesTable | None, view: ListedView, lens: CameraTable, options: SourceOptions) -> Float64 | None:

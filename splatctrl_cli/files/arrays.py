@@ -170,17 +170,14 @@ class ArrayFile(ABC):
             said = ", ".join(f"{name} {length}" for name, length in zip(names, lengths, strict=True))
             raise InputError(f"{self.path}: expected arrays of one length, got {said}", remedy="check the file")
         parts = [self._flat(name, prod(shape[1:])) for name, (shape, _) in zip(names, headers, strict=True)]
-        file = RowFile((sum(prod(shape[1:]) for shape, _ in headers),))
-        for first, last in ranges(max(lengths, default=0)):
-            file.append(np.hstack([part.read(first, last) for part in parts]))
-        return Rows(file)
+        width = sum(prod(shape[1:]) for shape, _ in headers)
+        blocks = (np.hstack([part.read(*block) for part in parts]) for block in ranges(max(lengths, default=0)))
+        return Rows(RowFile((width,), blocks))
 
     def _flat(self, name: str, width: int) -> RowFile:
         """An array as (T, width); how many rows its blocks have is its own."""
-        file = RowFile((width,))
-        for block in self._blocks(name):
-            file.append(block.reshape(len(block), -1).astype(np.float64))
-        return file
+        blocks = (block.reshape(len(block), width).astype(np.float64) for block in self._blocks(name))
+        return RowFile((width,), blocks)
 
     def read(
         self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
@@ -197,10 +194,7 @@ class ArrayFile(ABC):
     def rows(self, name: str) -> Rows:
         """An array (T, ...), each row in its shape; T may be 0. Raises InputError where it holds no numbers."""
         shape, _ = self._checked(name, least=0)
-        file = RowFile(shape[1:])
-        for block in self._blocks(name):
-            file.append(block.astype(np.float64))
-        return Rows(file)
+        return Rows(RowFile(shape[1:], (block.astype(np.float64) for block in self._blocks(name))))
 
     def stamps(self, name: str, unit_ns: int, epoch_ns: int, *, least: int = 1) -> Stamps:
         """Stamps (T,) [ns] of an array of times in units of `unit_ns`, or of a type that says its unit."""

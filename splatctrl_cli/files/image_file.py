@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.unpacking import read_bytes
 from splatctrl_cli.records import Float32
 
 JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
@@ -155,10 +156,7 @@ def read_pfm(path: Path) -> Float32:
 
     Raises InputError for a missing file, another format, or a length other than the header's.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    content = read_bytes(path)
     header = re.match(rb"(PF|Pf)\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s", content[:128])
     if header is None:
         raise InputError(f"{path}: expected a PFM image, got another format")

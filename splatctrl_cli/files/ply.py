@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config.ranges import MAX_PLACE
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.files.unpacking import read_bytes
 from splatctrl_cli.records import Float64, PointCloud
 
 SCALARS = {
@@ -46,12 +47,8 @@ class PlyFile:
 
     def pairs(self) -> dict[str, str]:
         """The ``key: value`` comments; one without a colon is a key with an empty value."""
-        pairs = {}
-        for line in self.comments:
-            key, _, value = line.partition(":")
-            if key.strip():
-                pairs[key.strip()] = value.strip()
-        return pairs
+        parts = (line.partition(":") for line in self.comments)
+        return {key.strip(): value.strip() for key, _, value in parts if key.strip()}
 
     def column(self, name: str) -> Float64:
         """(N,) float64 values of one property; raises InputError where one is not finite, naming its index."""
@@ -113,10 +110,7 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
 
     Raises InputError for a file that is missing, no PLY, cut short or too long, compressed, or lacks a property.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    content = read_bytes(path)
     header = _parse_header(path, content)
     wanted = next((found for found in header.elements if found.name == element), None)
     if wanted is None:
@@ -267,11 +261,7 @@ def is_mesh(path: Path) -> bool:
     """Whether a file holds faces: any that is not a PLY, and a PLY whose header counts some."""
     if path.suffix.lower() != ".ply":
         return True
-    try:
-        with path.open("rb") as stream:
-            header = stream.read(65536).partition(b"end_header")[0]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    header = read_bytes(path, 65536).partition(b"end_header")[0]
     counts = [line.split() for line in header.splitlines() if line.startswith(b"element face")]
     return bool(counts) and counts[0][-1] != b"0"
 

@@ -3,7 +3,7 @@
 import os
 import tempfile
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -32,12 +32,15 @@ def ranges(num: int, size: int | None = None) -> Iterator[tuple[int, int]]:
 class RowFile:
     """Rows of one shape, added at the end; what is read is a copy, and nothing is mapped into memory."""
 
-    def __init__(self, shape: tuple[int, ...] = ()) -> None:
+    def __init__(self, shape: tuple[int, ...] = (), blocks: Iterable[Float64] = ()) -> None:
+        """shape: of a row; blocks: rows (T, ...) to begin with."""
         self.row_shape = shape
         self._row_bytes = 8 * int(np.prod(shape, dtype=np.int64))
         self._num = 0
         self._file = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
         weakref.finalize(self, self._file.close)
+        for block in blocks:
+            self.append(block)
 
     def __len__(self) -> int:
         return self._num
@@ -82,8 +85,7 @@ class Rows:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        row = self._file.row_shape if self._columns is None else (len(self._columns),)
-        return (len(self), *row)
+        return (len(self), *(self._file.row_shape if self._columns is None else (len(self._columns),)))
 
     def __getitem__(self, which: int | slice | NDArray[np.integer]) -> Float64:
         if isinstance(which, slice):
@@ -141,17 +143,11 @@ def blocks_of(table: Table) -> Iterator[Float64]:
 
 def absent(num: int, width: int) -> Rows:
     """(num, width) NaN."""
-    file = RowFile((width,))
-    for first, last in ranges(num):
-        file.append(np.full((last - first, width), np.nan))
-    return Rows(file)
+    return Rows(RowFile((width,), (np.full((last - first, width), np.nan) for first, last in ranges(num))))
 
 
 def scaled(rows: Rows, factor: float) -> Rows:
     """The rows times a factor."""
     if factor == 1.0:
         return rows
-    file = RowFile(rows.shape[1:])
-    for block in blocks_of(rows):
-        file.append(block * factor)
-    return Rows(file)
+    return Rows(RowFile(rows.shape[1:], (block * factor for block in blocks_of(rows))))

@@ -1,9 +1,14 @@
-"""Decompression that gives no more bytes than were announced, and never more than a fixed bound at once."""
+"""The bytes of a file; decompression that gives no more bytes than were announced, and never more than a fixed bound
+at once.
+"""
 
 import bz2
+from pathlib import Path
 
 import lz4.frame
 import zstandard
+
+from splatctrl_cli.errors import InputError
 
 PIECE = 1 << 20  # bytes that are read at a time
 MAX_BLOCK = 128 << 20  # bytes; of one chunk or record, as stored and as unpacked
@@ -12,6 +17,15 @@ MOST_RATIO = 1000  # times the file's size; colour and depth as recorded compres
 MAX_WINDOW = 1 << 27  # bytes a zstd frame may refer back to: what its own command line accepts
 _PLAIN = ("", "none")
 _FAILURES = (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, MemoryError)
+
+
+def read_bytes(path: Path, most: int = -1) -> bytes:
+    """The bytes of a file, or the first `most`. Raises InputError where it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(most)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 class BadBlockError(ValueError):

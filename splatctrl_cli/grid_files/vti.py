@@ -198,10 +198,8 @@ def describe_vti(path: Path, head: bytes) -> Summary | None:
     if FORMAT in _field_text(text):
         return summary_of(path, "ParaView image data", read_vti_head(path))
     facts: dict[str, object] = dict(_ATTRIBUTE.findall(image[1]))
-    rows = []
-    for attributes in re.findall(r"<DataArray\b([^>]*)>", text):
-        values = dict(_ATTRIBUTE.findall(attributes))
-        rows.append([values.get("Name", "-"), values.get("type", "-"), values.get("NumberOfComponents", "1")])
+    arrays = [dict(_ATTRIBUTE.findall(attributes)) for attributes in re.findall(r"<DataArray\b([^>]*)>", text)]
+    rows = [[a.get("Name", "-"), a.get("type", "-"), a.get("NumberOfComponents", "1")] for a in arrays]
     grid = Grid(name="arrays", header=("array", "type", "components"), rows=rows)
     return Summary(path=str(path), kind="ParaView image data", facts=facts, grids=(grid,))
 

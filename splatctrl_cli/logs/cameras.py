@@ -8,6 +8,7 @@ geometry_msgs/PoseStamped, PoseWithCovarianceStamped and TransformStamped.
 import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -185,12 +186,8 @@ def _is_of_file(topic: TopicSurvey) -> bool:
 
 def common_prefix(name: str, other: str) -> tuple[str, ...]:
     """The leading path parts that two topics share, their last parts left out."""
-    shared: list[str] = []
-    for a, b in zip(_parts(name)[:-1], _parts(other)[:-1], strict=False):
-        if a != b:
-            break
-        shared.append(a)
-    return tuple(shared)
+    pairs = zip(_parts(name)[:-1], _parts(other)[:-1], strict=False)
+    return tuple(a for a, _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def _fits(calibration: Calibration, image: ImageMessage) -> bool:

@@ -103,12 +103,9 @@ class StateColumns(Sequence[JointState]):
         if (factor == 1.0).all() and (offset == 0.0).all():
             return plain
 
-        file, shift = {name: RowFile((len(order),)) for name in OF_JOINTS}, {"position": offset}
-
         def moved(table: Table, name: str) -> Table:
-            for block in blocks_of(table):
-                file[name].append(block * factor + shift.get(name, 0.0))
-            return Rows(file[name])
+            shift = offset if name == "position" else 0.0
+            return Rows(RowFile((len(order),), (block * factor + shift for block in blocks_of(table))))
 
         tables = {name: getattr(plain, name) for name in OF_JOINTS}
         changed: dict[str, Any] = {name: moved(table, name) for name, table in tables.items() if table is not None}
@@ -160,9 +157,8 @@ class ColumnWriter:
         for name, shape in self._shapes.items() if states else ():
             values, nothing = [state[name] for state in states], np.full(shape, np.nan)
             if name not in self._files and any(value is not None for value in values):
-                self._files[name] = RowFile(shape)
-                for first, last in ranges(self._num):  # one that comes up late
-                    self._files[name].append(np.full((last - first, *shape), np.nan))
+                before = (np.full((last - first, *shape), np.nan) for first, last in ranges(self._num))
+                self._files[name] = RowFile(shape, before)  # one that comes up late
             if name in self._files:
                 self._files[name].append(np.array([nothing if value is None else value for value in values]))
         self._num += len(states)

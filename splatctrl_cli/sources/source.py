@@ -235,10 +235,8 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     field = _field_facts(path / "field.json") if "field.json" in names else {}
     kind = "MVSNet scan" if is_dtu else "scene folder" if "splats.ply" in names else "run folder"
     kind = "field folder" if field else kind
-    rows: list[list[object]] = []
-    for name in names_in(path)[:1000]:
-        file = path / name
-        rows.append([name + "/" if file.is_dir() else name, *files_below(file)])
+    entries = [path / name for name in names_in(path)[:1000]]
+    rows = [[file.name + "/" if file.is_dir() else file.name, *files_below(file)] for file in entries]
     count, size = files_below(path)
     facts: dict[str, object] = {"files": count, "bytes": size}
     if "splats.ply" in names:
@@ -284,10 +282,10 @@ def _field_facts(path: Path) -> dict[str, object]:
 
 def _describe_capture(path: Path) -> Summary:
     header = read_capture_header(path)
-    rows = []
-    for name, camera in header["cameras"].items():
-        size = f"{camera['width']}x{camera['height']}"
-        rows.append([name, camera["num_frames"], size, camera["fx"], camera["depth_scale"]])
+    rows = [
+        [name, camera["num_frames"], f"{camera['width']}x{camera['height']}", camera["fx"], camera["depth_scale"]]
+        for name, camera in header["cameras"].items()
+    ]
     loss: dict[str, Any] = header["loss"]
     facts: dict[str, object] = {
         "recorded_from": header["name"],

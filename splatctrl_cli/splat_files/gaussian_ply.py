@@ -10,6 +10,7 @@ alone it is of all three axes.
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ NAMES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *REST, "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
+VALUES = (*(name for name in NAMES if name not in {"nx", "ny", "nz"}), "label")  # what a Gaussian says
 SCALES = ("scale_0", "scale_1", "scale_2")
 REQUIRED = tuple(name for name in NAMES if name not in {"nx", "ny", "nz", "scale_1", "scale_2", *REST})
 REST_PER_DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}  # number of f_rest_* -> degree of the harmonics
@@ -54,21 +56,21 @@ def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str
     check_gaussians("Gaussians to write", gaussians)
     has_labels = bool((gaussians.labels != Label.OBJECT).any())
     dtype = np.dtype([*((name, "<f4") for name in NAMES), *([("label", "u1")] if has_labels else [])])
-    rows = np.zeros(len(gaussians), dtype=dtype)
-    num_coefficients = gaussians.harmonics.shape[1]
-    for axis, name in enumerate("xyz"):
-        rows[name] = gaussians.centers[:, axis]
-        rows[f"scale_{axis}"] = np.log(gaussians.scales[:, axis].astype(np.float64))
-    for channel in range(3):
-        rows[f"f_dc_{channel}"] = gaussians.harmonics[:, 0, channel]
-        for index in range(1, num_coefficients):
-            rows[f"f_rest_{15 * channel + index - 1}"] = gaussians.harmonics[:, index, channel]
-    rows["opacity"] = logit(gaussians.opacities)
-    for index in range(4):
-        rows[f"rot_{index}"] = gaussians.quats_wxyz[:, index]
-    if has_labels:
-        rows["label"] = gaussians.labels
-    write_table(path, rows, {**HEADER_COMMENTS, **comments})
+    write_table(path, rows_of(gaussians, dtype), {**HEADER_COMMENTS, **comments})
+
+
+def rows_of(gaussians: GaussianSet, dtype: "np.dtype[Any]") -> NDArray[Any]:
+    """The Gaussians (N,) as rows of the properties of `dtype`, 0 where a property is none of theirs."""
+    g = gaussians
+    rest = np.zeros((len(g), 3, 15), dtype=np.float32)
+    rest[:, :, : g.harmonics.shape[1] - 1] = g.harmonics[:, 1:].transpose(0, 2, 1)
+    colors = [*g.harmonics[:, 0].T, *rest.reshape(len(g), 45).T]
+    shapes = [logit(g.opacities), *np.log(g.scales.astype(np.float64)).T, *g.quats_wxyz.T]
+    rows = np.zeros(len(g), dtype=dtype)
+    for name, column in zip(VALUES, [*g.centers.T, *colors, *shapes, g.labels], strict=True):
+        if name in dtype.fields:
+            rows[name] = column
+    return rows
 
 
 def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
@@ -203,12 +205,9 @@ def _harmonics(ply: PlyFile) -> Float32:
     if num_rest not in REST_PER_DEGREE or not all(name in ply for name in names):
         expected = ", ".join(map(str, REST_PER_DEGREE))
         raise InputError(f"{ply.path}: f_rest_*: expected {expected} of them in a row from 0, got {num_rest}")
-    harmonics = np.zeros((len(ply), 1 + num_rest // 3, 3), dtype=np.float32)
-    for channel in range(3):
-        harmonics[:, 0, channel] = ply.column(f"f_dc_{channel}")
-        for index in range(num_rest // 3):
-            harmonics[:, 1 + index, channel] = ply.column(names[channel * (num_rest // 3) + index])
-    return harmonics
+    channels = [[f"f_dc_{channel}", *names[channel * num_rest // 3 :][: num_rest // 3]] for channel in range(3)]
+    values = [[ply.column(name).astype(np.float32) for name in channel] for channel in channels]
+    return np.ascontiguousarray(np.array(values).transpose(2, 1, 0))
 
 
 def _write_reference_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.unpacking import read_bytes
 from splatctrl_cli.records import Float32, GaussianSet, Label
 from splatctrl_cli.splat_files.gaussian_ply import check_gaussians
 from splatctrl_cli.splat_files.splat_format import SH_C0, SplatFormat, refuse, unit_quaternions
@@ -86,10 +87,7 @@ class GlbWriter:
 
 def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
     """The document and the buffer of a ``.glb`` file. Raises InputError for one not whole, or not version 2."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    content = read_bytes(path)
     if len(content) < 20 or struct.unpack_from("<I", content)[0] != MAGIC:
         raise InputError(f"{path}: no .glb file: expected it to start with 'glTF', got {content[:4]!r}")
     _, version, length, json_length, json_kind = struct.unpack_from("<IIIII", content)

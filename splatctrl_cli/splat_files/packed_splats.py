@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.unpacking import FREE_BYTES, BadBlockError, unpacked
+from splatctrl_cli.files.unpacking import FREE_BYTES, BadBlockError, read_bytes, unpacked
 from splatctrl_cli.records import Float32, Float64, GaussianSet, UInt8
 from splatctrl_cli.splat_files.gaussian_ply import check_gaussians
 from splatctrl_cli.splat_files.splat_format import (
@@ -63,10 +63,7 @@ def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str])
 
 def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """The Gaussians of a ``.splat`` file and no comments. Raises InputError for a file not whole, or no Gaussian."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    content = read_bytes(path)
     if len(content) % ROW.itemsize:
         raise InputError(f"{path}: expected a multiple of 32 bytes, one row per splat, got {len(content)}")
     rows = np.frombuffer(content, dtype=ROW)
@@ -144,10 +141,7 @@ def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 
     Raises InputError for a file that is not whole, of another version, or that holds what no Gaussian is.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    content = read_bytes(path)
     bits, (centers, opacities, colors, sigmas, quats, rest) = _columns(path, content)
     gaussians = GaussianSet(
         centers=_centers(centers, bits),

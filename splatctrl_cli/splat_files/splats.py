@@ -25,13 +25,13 @@ from splatctrl_cli.splat_files.gaussian_ply import (
     gaussians_of,
     labels_of,
     log_sigmas,
+    rows_of,
 )
 from splatctrl_cli.splat_files.splat_format import (
     SH_C0,
     Comments,
     SplatFormat,
     check_finite,
-    logit,
     refuse,
     sigma_of_log,
     sigmoid,
@@ -57,13 +57,11 @@ HEADER_COMMENTS = {
 
 def as_gaussians(splats: SplatSet) -> GaussianSet:
     """`splats` as Gaussians of one sigma and one colour; the density has no place there."""
-    quats = np.zeros((len(splats), 4), dtype=np.float32)
-    quats[:, 0] = 1.0
     coefficients = (splats.colors.astype(np.float64) - 0.5) / SH_C0
     return GaussianSet(
         centers=splats.centers,
         scales=np.repeat(splats.radii[:, None], 3, axis=1),
-        quats_wxyz=quats,
+        quats_wxyz=np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (len(splats), 1)),
         opacities=splats.opacities,
         harmonics=coefficients.astype(np.float32)[:, None, :],
         labels=splats.labels,
@@ -121,16 +119,7 @@ def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None
     Raises InputError for a value the format cannot hold, naming its index; UsageError for a comment of several lines.
     """
     check_splats("splats to write", splats)
-    rows = np.zeros(len(splats), dtype=DTYPE)
-    coefficients = (splats.colors.astype(np.float64) - 0.5) / SH_C0
-    log_radii = np.log(splats.radii.astype(np.float64))
-    for axis, name in enumerate("xyz"):
-        rows[name] = splats.centers[:, axis]
-        rows[f"f_dc_{axis}"] = coefficients[:, axis]
-        rows[f"scale_{axis}"] = log_radii
-    rows["opacity"] = logit(splats.opacities)
-    rows["rot_0"] = 1.0
-    rows["label"] = splats.labels
+    rows = rows_of(as_gaussians(splats), DTYPE)
     rows["density"] = splats.density
     write_table(path, rows, {**HEADER_COMMENTS, **comments})
 

@@ -165,11 +165,9 @@ def libfranka_track(table: CsvTable) -> RawTrack:
 
 def poses_of(rows: Table, read: Callable[[Float64], Float64 | None]) -> Rows:
     """(T, 4, 4) of rows (T, K) by a function of one row, NaN where that gives None."""
-    file, nothing = RowFile((4, 4)), np.full((4, 4), np.nan)
-    for block in blocks_of(rows):
-        poses = [read(row) for row in block]
-        file.append(np.array([nothing if T is None else T for T in poses]))
-    return Rows(file)
+    nothing = np.full((4, 4), np.nan)
+    blocks = (np.array([nothing if T is None else T for T in map(read, block)]) for block in blocks_of(rows))
+    return Rows(RowFile((4, 4), blocks))
 
 
 def _first(table: CsvTable, name: str, number: int) -> int | None:
