@@ -28,7 +28,8 @@ from splatctrl_cli.evaluate.field_accuracy import (
     median_radius,
 )
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
-from splatctrl_cli.geometry import back_project, face_normals, invert_transform, project, transform_points
+from splatctrl_cli.evaluate.views import measured_along
+from splatctrl_cli.geometry import back_project, face_normals, transform_points
 from splatctrl_cli.kernels.field import interpolate
 from splatctrl_cli.mesh_distance import TriangleMesh
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, RgbdFrame
@@ -380,13 +381,6 @@ def _seen_free(points_world: Float64, frames: Sequence[RgbdFrame]) -> Bool:
     is_free = np.zeros(len(points_world), dtype=np.bool_)
     for frame in frames:
         asked = np.flatnonzero(~is_free)
-        points_camera = transform_points(invert_transform(frame.T_world_camera), points_world[asked])
-        is_before = points_camera[:, 2] > 0
-        asked, points_camera = asked[is_before], points_camera[is_before]
-        pixels = np.floor(project(frame.intrinsics, points_camera) + 0.5)
-        height, width = frame.depth.shape
-        inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
-        u, v = pixels[inside].astype(np.int64).T
-        depth = frame.depth[v, u]
-        is_free[asked[inside]] = (depth > 0) & (points_camera[inside, 2] <= depth + fixed.FREE_TOLERANCE)
+        landing, own, measured = measured_along(points_world[asked], frame)
+        is_free[asked[landing]] = (measured > 0) & (own <= measured + fixed.FREE_TOLERANCE)
     return is_free

@@ -21,7 +21,7 @@ from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.held_out_depth import CLOUD_SCALES
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS
 from splatctrl_cli.evaluate.score import metric_scales
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, noted, verdict_of
 from splatctrl_cli.evaluate.views import View
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Bool, Float64
@@ -175,11 +175,6 @@ def counts_of(report: Mapping[str, Any]) -> dict[str, int]:
         figure = name.removeprefix(PREFIX)
         counts[name] = sum(view[figure] is not None for view in views) if figure in views[0] else num_views
     return counts
-
-
-def counted(number: float, noun: str) -> str:
-    """``1 view``, ``2 views``."""
-    return f"{number:.0f} {noun}{'' if number == 1 else 's'}"
 
 
 THUMBNAIL = (16, 12)  # pixels

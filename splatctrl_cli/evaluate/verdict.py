@@ -219,6 +219,11 @@ def brief(result: Any) -> str:
     return f"{type(result).__name__}({', '.join(shown)})"
 
 
+def counted(number: float, noun: str) -> str:
+    """``1 view``, ``2 views``."""
+    return f"{number:.0f} {noun}{'' if number == 1 else 's'}"
+
+
 def noted(criterion: str, sentence: str) -> Reason:
     """A `note` without a figure."""
     return note(criterion=criterion, sentence=sentence)

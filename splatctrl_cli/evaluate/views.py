@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
-from splatctrl_cli.records import Bool, Float64, RecordSource, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, Index, RecordSource, RgbdFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,15 +115,19 @@ def seen_pixels(frame: RgbdFrame, others: Sequence[RgbdFrame], tolerance: float 
 
 
 def _agrees(points_world: NDArray[np.floating], frame: RgbdFrame, tolerance: float) -> Bool:
+    agrees = np.zeros(len(points_world), dtype=np.bool_)
+    landing, own, measured = measured_along(points_world, frame)
+    agrees[landing] = (measured > 0) & (np.abs(measured - own) <= tolerance)
+    return agrees
+
+
+def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tuple[Index, Float64, Float32]:
+    """The points (K,) of Q that land on the frame's image, their own depth (K,) [m], and what was measured there."""
     points_camera = transform_points(invert_transform(frame.T_world_camera), points_world)
-    agrees = points_camera[:, 2] > 1e-6
-    candidates = np.flatnonzero(agrees)
-    pixels = np.floor(project(frame.intrinsics, points_camera[candidates]) + 0.5)
+    landing = np.flatnonzero(points_camera[:, 2] > 1e-6)
+    pixels = np.floor(project(frame.intrinsics, points_camera[landing]) + 0.5)
     height, width = frame.depth.shape
     inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
-    agrees[candidates[~inside]] = False
-    candidates = candidates[inside]
     u, v = pixels[inside].astype(np.int64).T
-    depth = frame.depth[v, u]
-    agrees[candidates] = (depth > 0) & (np.abs(depth - points_camera[candidates, 2]) <= tolerance)
-    return agrees
+    landing = landing[inside]
+    return landing, points_camera[landing, 2], frame.depth[v, u]

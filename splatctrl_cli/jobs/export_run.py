@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from splatctrl_cli.control.events import INTERVENTIONS, SHOWN
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.jobs.reports.run_folder import REPLAY, RunFolder, States, open_run
+from splatctrl_cli.jobs.reports.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, open_run
 from splatctrl_cli.jobs.reports.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
 from splatctrl_cli.scene_files.scene_folder import Snapshot, open_scene
 
@@ -24,28 +24,15 @@ Later = tuple[int, int, Callable[[FoxgloveLog], None]]  # stamp [ns], place amon
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportRunRequest:
-    """One export of `path`, the folder of a replay, a scene or a field, into the MCAP `out`, None for PATH.mcap.
-
-    roots: folders in which the scene and robot of a replay's command line are looked for.
-    """
-
-    path: Path
-    out: Path | None = None
-    roots: tuple[Path, ...] = ()
-    force: bool = False
+class ExportRunRequest(FolderRequest):
+    """One export of `path`, the folder of a replay, a scene or a field, into the MCAP `out`, None for PATH.mcap."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportRunResult:
+class ExportRunResult(WrittenFile):
     """The file, and how many messages each topic has."""
 
-    file: Path
-    bytes: int
     messages: dict[str, int]
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def export_run(request: ExportRunRequest) -> ExportRunResult:

@@ -4,9 +4,8 @@ page that only shows a scene, a field, splats or a replay in 3-D.
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from splatctrl_cli.errors import DAMAGE, InputError, SplatCtrlError
 from splatctrl_cli.files.output import output_path
@@ -16,8 +15,10 @@ from splatctrl_cli.jobs.reports.run_folder import (
     AS_EXPECTED,
     REPLAY,
     BatchFolder,
+    FolderRequest,
     Node,
     RunFolder,
+    WrittenFile,
     is_batch,
     open_batch,
     open_run,
@@ -41,16 +42,8 @@ MOST_PICTURES, PICTURE_WIDTH = 24, 560  # of recordings as expected: how many, h
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewRequest:
-    """A page on `path`, a run, scene or field folder, a grid or a file of splats, into `out`, None for PATH.html.
-
-    roots: folders in which the scene and robot of a replay's command line are looked for.
-    """
-
-    path: Path
-    out: Path | None = None
-    roots: tuple[Path, ...] = ()
-    force: bool = False
+class ViewRequest(FolderRequest):
+    """A page on `path`, a run, scene or field folder, a grid or a file of splats, into `out`, None for PATH.html."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,17 +59,12 @@ class WriteReportRequest(ViewRequest):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WriteReportResult:
+class WriteReportResult(WrittenFile):
     """The page: how many runs it tells of, how many of them in 3-D, and why others are not."""
 
-    file: Path
-    bytes: int
     num_runs: int
     num_scenes: int
     notes: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> WriteReportResult:
@@ -87,17 +75,21 @@ def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Wr
         page = _of_batch(request, open_batch(request.path), progress)
     else:
         page = _of_run(request, open_run(request.path))
-    out = request.out or beside(request.path)
-    with output_path(out, force=request.force, is_folder=False) as partial:
-        partial.write_text(rendered(page), encoding="utf-8")
-        size = partial.stat().st_size
+    file = _write(request, page)
     return WriteReportResult(
-        file=out,
-        bytes=size,
+        file=file,
+        bytes=file.stat().st_size,
         num_runs=len(page.runs),
         num_scenes=len(page.scenes),
         notes=tuple(f"{run.title or run.anchor}: {run.no_space}" for run in page.runs if run.no_space),
     )
+
+
+def _write(request: FolderRequest, page: Page) -> Path:
+    out = request.out or beside(request.path)
+    with output_path(out, force=request.force, is_folder=False) as partial:
+        partial.write_text(rendered(page), encoding="utf-8")
+    return out
 
 
 def beside(path: Path) -> Path:
@@ -308,17 +300,12 @@ def _log(batch: BatchFolder, node: Node) -> Table:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewResult:
+class ViewResult(WrittenFile):
     """The page, and what is to be seen: splats, states of the arm, cubes of space never seen."""
 
-    file: Path
-    bytes: int
     num_splats: int
     num_states: int
     num_unknown: int
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def view(request: ViewRequest) -> ViewResult:
@@ -327,13 +314,10 @@ def view(request: ViewRequest) -> ViewResult:
     name = request.path.absolute().name
     section = RunSection(anchor="scene", title="", state="", sentence="", space="scene")
     page = Page(title=name, state="", sentence="", runs=[section], scenes={"scene": packed(space)}, opens=True)
-    out = request.out or beside(request.path)
-    with output_path(out, force=request.force, is_folder=False) as partial:
-        partial.write_text(rendered(page), encoding="utf-8")
-        size = partial.stat().st_size
+    file = _write(request, page)
     return ViewResult(
-        file=out,
-        bytes=size,
+        file=file,
+        bytes=file.stat().st_size,
         num_splats=max((len(at.splats) for at in space.splats), default=0),
         num_states=0 if space.motion is None else len(space.motion.seconds),
         num_unknown=0 if space.unknown is None else len(space.unknown),

@@ -20,6 +20,7 @@ from splatctrl_cli.report.pictures import (
     drawn_figure,
     extent_of,
     save_figure,
+    set_grid,
 )
 from splatctrl_cli.voxels import VoxelState
 
@@ -139,9 +140,7 @@ def _draw_histogram(axes: Any, histogram: Sequence[int], bin_width: float) -> No
         xlim=(-bin_width, middles[-1] + bin_width),
     )
     axes.set_title("All cells by the length of their gradient", pad=12)
-    axes.grid(axis="y", color="#e4e4e4", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    set_grid(axes)
 
 
 @contextmanager

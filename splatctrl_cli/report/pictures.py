@@ -151,9 +151,7 @@ def _draw_comparison(figure: "mpl.figure.Figure", axes: Sequence[Any], row: Comp
     median = f"median {np.nanmedian(centimetres):.2f} cm" if both.any() else "no pixel has both depths"
     titles = (f"photo   {row.title}", f"render   {row.figures}", f"depth error [cm]   {median}, grey: no depth")
     for panel, text in zip((photo, render, error), titles, strict=True):
-        panel.set_title(text, fontsize=10, pad=5)
-        panel.set(xticks=[], yticks=[])
-        panel.spines[:].set_visible(False)
+        _finish(panel, text)
 
 
 def draw_distance(
@@ -305,6 +303,13 @@ def _outline(panels: Any, mask: NDArray[np.bool_]) -> None:
         return
     for panel in panels:
         panel.contour(mask.astype(float), levels=[0.5], colors=OUTLINE, linewidths=1.0)
+
+
+def set_grid(axes: Any, axis: str = "y") -> None:
+    """Draw pale lines behind everything along an axis, or "both", and no frame above and to the right."""
+    axes.grid(axis=axis, color="#e4e4e4", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _finish(panel: Any, text: str) -> None:

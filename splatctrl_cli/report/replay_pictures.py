@@ -14,7 +14,7 @@ import numpy as np
 
 from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.records import Float64, FloatRows
-from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, save_figure, span_of
+from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, save_figure, set_grid, span_of
 from splatctrl_cli.voxels import EvidenceClass
 
 Intervals = Sequence[tuple[float, float]]
@@ -303,9 +303,7 @@ def _draw_strip(axes: Any, above: Any, events: Mapping[str, Intervals], seconds:
 
 def _tidy(axes: Any, seconds: Float64) -> None:
     axes.set_xlim(span_of(seconds))
-    axes.grid(axis="y", color="#e4e4e4", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    set_grid(axes)
 
 
 def methods_picture(path: Path, clearance: Mapping[str, Float64], period: float, margin: float) -> None:

@@ -16,7 +16,7 @@ from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.geometry import back_project, face_normals, invert_transform, look_at, project, transform_points
 from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics
-from splatctrl_cli.report.pictures import CURVE_COLORS, INK, SPHERE_EDGE, drawn_figure, save_figure
+from splatctrl_cli.report.pictures import CURVE_COLORS, INK, SPHERE_EDGE, drawn_figure, save_figure, set_grid
 from splatctrl_cli.robot.coverage import areas, refined
 from splatctrl_cli.robot.surface import RobotSurface
 
@@ -140,9 +140,7 @@ def reliability_picture(path: Path, curves: Mapping[str, Reliability], title: st
         axes.set_title(title, pad=12)
         bars.set(xlabel="predicted probability", ylabel="points", xlim=(0, 1), yscale="log")
         for panel in (axes, bars):
-            panel.grid(color="#e4e4e4", linewidth=0.8)
-            panel.set_axisbelow(True)
-            panel.spines[["top", "right"]].set_visible(False)
+            set_grid(panel, "both")
         figure.legend(frameon=False, loc="outside lower center", ncols=2)
         save_figure(figure, path)
 

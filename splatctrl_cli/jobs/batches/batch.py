@@ -11,7 +11,7 @@ from typing import Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import DAMAGED, InputError, UsageError
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, damage_mark, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, damage_mark, verdict_of
 from splatctrl_cli.files.output import MARKERS, write_durably, write_json
 from splatctrl_cli.jobs.batches.graph import COMMANDS, CommandLine, Node, nodes_of, of_shard
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run, keys_of
@@ -76,7 +76,7 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
             ledger, command_line.entry, progress, workers=request.workers, dask=request.dask, again=request.again
         ) as scheduler,
     ):
-        progress.log(f"batch: {_counted(len(nodes), 'node')} into {out}")
+        progress.log(f"batch: {counted(len(nodes), 'node')} into {out}")
         try:
             runs = list(scheduler.run(nodes).values())
         except KeyboardInterrupt:
@@ -132,7 +132,7 @@ def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
     return verdict_of(
         "batch",
         [_reason(run) for run in runs],
-        scope=f"{_counted(len(runs), 'node')} of {_counted(num, 'recording')}",
+        scope=f"{counted(len(runs), 'node')} of {counted(num, 'recording')}",
         passed="as expected",
         notes=[f"damaged: {', '.join(damaged)}"] if damaged else [],
         is_damaged=bool(damaged),
@@ -142,10 +142,6 @@ def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
 def _is_damaged(run: Run) -> bool:
     """Whether damage is to be said of a run: it ended as expected, and damage was not what was expected."""
     return run.state == DONE and run.expect != f"exit {DAMAGED}" and bool(damage_mark(run.sentence, run.exit_code))
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}" + ("s" if number != 1 else "")
 
 
 def _reason(run: Run) -> Reason:

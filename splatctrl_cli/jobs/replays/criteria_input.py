@@ -63,10 +63,6 @@ def seconds_at(judged: Judged, index: int) -> float:
     return float(stamps[index] - stamps[0]) * 1e-9
 
 
-def counted(number: int, what: str) -> str:
-    return f"{number} {what}" + ("s" if number != 1 else "")
-
-
 def mm(metres: float) -> str:
     return f"{1e3 * metres:.1f} mm"
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
 from splatctrl_cli.control.events import Event, EventKind
-from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
+from splatctrl_cli.evaluate.verdict import Criterion, Reason, counted, failed, held, lacking
 from splatctrl_cli.jobs.replays.control_criteria import commanded, controller, goal, scene_hits
 from splatctrl_cli.jobs.replays.criteria_input import (
     BROKEN,
@@ -17,7 +17,6 @@ from splatctrl_cli.jobs.replays.criteria_input import (
     SLOW,
     UNKNOWN,
     Judged,
-    counted,
     events_of,
     least_of,
     mm,

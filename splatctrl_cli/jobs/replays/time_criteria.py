@@ -6,13 +6,12 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import CLOCKS_APART, SAME_MOMENT_NS
 from splatctrl_cli.control.events import EventKind
-from splatctrl_cli.evaluate.verdict import Reason, failed, held, lacking
+from splatctrl_cli.evaluate.verdict import Reason, counted, failed, held, lacking
 from splatctrl_cli.jobs.replays.criteria_input import (
     CONTACT,
     MARGIN,
     SLOW,
     Judged,
-    counted,
     events_of,
     mm,
     nearby,

@@ -5,7 +5,7 @@ of a batch: the last state of each of its jobs.
 import csv
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -129,6 +129,30 @@ class RunFolder:
         above = [Path(), *self.path.absolute().parents, *roots]
         found = [root / given for root in above if (root / given).exists()]
         return next((path for path in found if digest is None or sha256(path) == digest), None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderRequest:
+    """A file `out` made of `path`, None for a name like its own.
+
+    roots: folders in which the scene and robot of a replay's command line are looked for.
+    """
+
+    path: Path
+    out: Path | None = None
+    roots: tuple[Path, ...] = ()
+    force: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrittenFile:
+    """A file that was written, and its size."""
+
+    file: Path
+    bytes: int
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
 
 
 def open_run(path: Path) -> RunFolder:
