@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -102,7 +102,8 @@ def points_around(shape: Shape, num: int, lower: float, upper: float, *, seed: i
 def _of_mesh(path: Path) -> Shape:
     mesh = load_mesh(path)
     if path.parent.name != IN_METRES:
-        mesh = mesh.scaled_to(EXTENT)
+        lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        mesh = replace(mesh, vertices=(mesh.vertices - 0.5 * (lower + upper)) * (EXTENT / (upper - lower).max()))
     field = MeshDistance(mesh)
     part = Part(
         samples=lambda spacing, seed: sample_mesh(mesh, spacing, seed=seed),

@@ -35,12 +35,6 @@ class TriangleMesh:
         """(F, 3, 3): the three corners of each face."""
         return self.vertices[self.faces]
 
-    def scaled_to(self, extent: float) -> "TriangleMesh":
-        """The mesh about the middle of its box, with `extent` [m] as the longest side of that box."""
-        lower, upper = self.vertices.min(axis=0), self.vertices.max(axis=0)
-        vertices = (self.vertices - 0.5 * (lower + upper)) * (extent / float((upper - lower).max()))
-        return TriangleMesh(vertices=vertices, faces=self.faces, is_closed=self.is_closed)
-
 
 def load_mesh(path: Path) -> TriangleMesh:
     """The mesh in a file that trimesh reads (OBJ, STL, PLY, OFF, GLB, COLLADA), all its parts as one.
@@ -148,7 +142,7 @@ class _Normals:
         self._of_vertex = np.zeros_like(mesh.vertices)
         for k in range(3):
             u, v = corners[:, NEXT[k]] - corners[:, k], corners[:, OPPOSITE[k]] - corners[:, k]
-            angle = np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), _dot(u, v))
+            angle = np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("pa,pa->p", u, v))
             np.add.at(self._of_vertex, faces[:, k], angle[:, None] * self.of_face)
         ends = np.sort(np.stack([faces, faces[:, NEXT]], axis=2).reshape(-1, 2), axis=1)
         _, edge = np.unique(ends, axis=0, return_inverse=True)
@@ -166,7 +160,3 @@ class _Normals:
             at_vertex = np.flatnonzero((num_zero == 2) & (shares[:, k] != 0))
             normal[at_vertex] = self._of_vertex[self._faces[face[at_vertex], k]]
         return normal
-
-
-def _dot(a: Float64, b: Float64) -> Float64:
-    return np.asarray(np.einsum("pa,pa->p", a, b))

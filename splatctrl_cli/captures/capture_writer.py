@@ -98,12 +98,8 @@ class Journal:
 
     def _cut(self) -> None:
         """Leave out a last line that was not finished."""
-        size = 0
         with self._path.open("rb") as stream:
-            for line in stream:
-                if not line.endswith(b"\n"):
-                    break
-                size += len(line)
+            size = sum(len(line) for line in stream if line.endswith(b"\n"))
         with self._path.open("r+b") as stream:
             stream.truncate(size)
 
@@ -241,10 +237,8 @@ def _write_index(
     sums = Checksums()
     for entry in journal.entries():
         for digest, name in entry.sums:
-            if name.startswith("valid/"):  # not in the order of frames, which share that of their lens
-                sums.add_other(digest, name)
-            else:
-                sums.add(digest, name)
+            is_of_lens = name.startswith("valid/")  # not in the order of frames, which share it
+            (sums.add_other if is_of_lens else sums.add)(digest, name)
     for name in [*names, "capture.json"]:
         sums.add_other(sha256(folder / name), name)
     sums.write(folder / "SHA256SUMS")
@@ -284,11 +278,8 @@ def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, s
 
 def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera: Mapping[str, Any]) -> Entry:
     """Write the images of a frame whose row is without their names."""
-    sums: list[tuple[str, str]] = []
     stem, unit = f"{camera['num_frames'] - 1:06d}", float(camera["depth_scale"])
-    color = stored.color_file
-    if color is None:
-        color = encoded(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
+    color = stored.color_file or encoded(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
     color_name = f"color/{stored.camera}/{stem}.{'png' if is_png(color) else 'jpg'}"
     kind, depth = _depth_file(stored, unit)
     depth_name = f"depth/{stored.camera}/{stem}.{kind}"
@@ -305,7 +296,7 @@ def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
-        sums.append((hashlib.sha256(data).hexdigest(), name))
+    sums = [(hashlib.sha256(data).hexdigest(), name) for name, data in files.items()]
     return Entry(row=row | named, sums=sums, provenance=_provenance(stored, color_name, depth_name))
 
 

@@ -232,10 +232,8 @@ class Bag1Log:
         compression = record.fields.get("compression", b"").decode("latin-1")
         size = number(record.fields, "size")
         try:
-            if record.is_cut:
-                content = unpacked_start(record.body, compression, size)
-            else:
-                content = budget.unpacked(record.body, compression, size)
+            unpack = unpacked_start if record.is_cut else budget.unpacked
+            content = unpack(record.body, compression, size)
             for kind, fields, body in records_in(content):
                 yield from self._read(kind, fields, body, record.offset, damage, names)
         except (BadBlockError, ValueError) as error:

@@ -125,7 +125,9 @@ def _object(value: Any) -> Any:
     return [_object(item) for item in value] if isinstance(value, list) else value
 
 
-def _header(message: Any, frame_id: str) -> Any:
+def _header(message: Any, frame_id: str | None = None) -> Any:
+    """frame_id: of a message that has no field of that name."""
+    frame_id = str(getattr(message, "frame_id", "")) if frame_id is None else frame_id
     time = getattr(message, "timestamp", None)
     seconds = _either(time, "sec", "seconds")
     nanoseconds = _either(time, "nsec", "nanos", "nanosec")
@@ -137,22 +139,18 @@ def _either(message: Any, *names: str) -> Any:
     return next((getattr(message, name) for name in names if hasattr(message, name)), 0)
 
 
-def _frame(message: Any) -> str:
-    return str(getattr(message, "frame_id", ""))
-
-
 def _data(message: Any) -> Any:
     value = message.data
     return np.frombuffer(base64.b64decode(value, validate=True) if isinstance(value, str) else value, dtype=np.uint8)
 
 
 def _compressed_image(message: Any) -> Any:
-    return SimpleNamespace(header=_header(message, _frame(message)), format=message.format, data=_data(message))
+    return SimpleNamespace(header=_header(message), format=message.format, data=_data(message))
 
 
 def _raw_image(message: Any) -> Any:
     return SimpleNamespace(
-        header=_header(message, _frame(message)),
+        header=_header(message),
         width=int(message.width),
         height=int(message.height),
         encoding=str(message.encoding),
@@ -164,7 +162,7 @@ def _raw_image(message: Any) -> Any:
 
 def _calibration(message: Any) -> Any:
     return SimpleNamespace(
-        header=_header(message, _frame(message)),
+        header=_header(message),
         width=int(message.width),
         height=int(message.height),
         distortion_model=str(_either(message, "distortion_model") or ""),
@@ -196,7 +194,7 @@ def _transform(message: Any) -> Any:
 def _joint_states(message: Any) -> Any:
     """Without velocities: one that is not set cannot be told from zero."""
     return SimpleNamespace(
-        header=_header(message, ""),
+        header=_header(message),
         name=[str(joint.name) for joint in message.joints],
         position=np.array([float(_either(joint, "position")) for joint in message.joints]),
         velocity=np.zeros(0),

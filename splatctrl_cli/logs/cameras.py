@@ -52,8 +52,7 @@ def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
 
 def _unlike(topic: TopicSurvey) -> str:
     """The word in the names of a topic or its frame that says that its images are neither depth nor colour."""
-    image, parts = topic.first_image, _parts(topic.topic.name)
-    assert image is not None
+    image, parts = topic.image, _parts(topic.topic.name)
     if image.kind == "depth":
         word = word_of(parts) or word_of((image.frame_id,))
         return word if is_other(word) else ""
@@ -145,9 +144,7 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
 
 def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info: str) -> bool:
     """Whether depth pixels already lie on colour pixels: of one size, frame (or a name says so), K and distortion."""
-    color_image, depth_image = survey.topics[color].first_image, survey.topics[depth].first_image
-    if color_image is None or depth_image is None:
-        return False
+    color_image, depth_image = survey.topics[color].image, survey.topics[depth].image
     if (color_image.width, color_image.height) != (depth_image.width, depth_image.height):
         return False
     T_color_depth = survey.realsense.T_between(color, depth)
@@ -174,9 +171,7 @@ def _same_distortion(one: Calibration, two: Calibration) -> bool:
 
 def frame_of(survey: Survey, color: str, depth: str) -> str:
     """The frame of a colour topic's images; a video file names none: that of its depth, which is aligned to it."""
-    image = survey.topics[depth if _is_of_file(survey.topics[color]) else color].first_image
-    assert image is not None
-    return image.frame_id
+    return survey.topics[depth if _is_of_file(survey.topics[color]) else color].image.frame_id
 
 
 def _is_of_file(topic: TopicSurvey) -> bool:
@@ -200,10 +195,9 @@ def _says_registered(topic: str) -> bool:
 
 
 def _color_rank(topic: TopicSurvey) -> tuple[bool, bool, bool, bool, str]:
-    image, name = topic.first_image, topic.topic.name
-    is_gray = image is not None and image.is_gray
+    name = topic.topic.name
     is_infrared = any(part.startswith(("infra", "ir")) for part in _parts(name))
-    return (is_gray, is_infrared, "rect" not in name, topic.topic.type_name == COMPRESSED_IMAGE, name)
+    return (topic.image.is_gray, is_infrared, "rect" not in name, topic.topic.type_name == COMPRESSED_IMAGE, name)
 
 
 def _parts(name: str) -> tuple[str, ...]:
@@ -289,8 +283,7 @@ def _named_unlike(survey: Survey) -> str:
     """The topics whose names say that they are neither depth nor colour, and why; begins with a semicolon."""
     found = []
     for topic in image_topics(survey, "unlike"):
-        image, name = topic.first_image, topic.topic.name
-        assert image is not None
+        image, name = topic.image, topic.topic.name
         is_jpeg = image.compressed is not None and image.compressed.startswith(JPEG)
         lossy = (
             "depth in a JPEG: JPEG loses depth: record PNG" if is_jpeg else f"{image.encoding} that is named depth"
@@ -353,7 +346,7 @@ def join_pose_topics(
     or whose parent is the world frame asked for. only_first: the first pose alone, enough to see what joins what.
     Raises InputError where a topic cannot place its camera, and where several odometries could.
     """
-    frames = {camera.name: _frame(survey, camera) for camera in cameras}
+    frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
     asked = {name: given for name, given in options.camera_pose_topics.items() if name in frames}
     children = {
         given.topic: _child_of(log, survey, name, given, frames[name]) for name, given in asked.items()
@@ -365,11 +358,6 @@ def join_pose_topics(
 def pose_topics(survey: Survey) -> list[str]:
     """The topics that hold poses."""
     return [topic.topic.name for topic in survey.of_type(*POSE_TYPES)]
-
-
-def _frame(survey: Survey, camera: CameraTopics) -> str:
-    image = survey.topics[camera.color].first_image
-    return "" if image is None else image.frame_id
 
 
 def _child_of(log: RawLog, survey: Survey, camera: str, given: PoseTopic, frame: str) -> str:

@@ -272,8 +272,7 @@ class _Builder:
                 remedy=f"record its camera_info, name it with --camera; CameraInfo topics there: {listed(there)};"
                 f" or give --intrinsics {self._topics.name}=FX,FY,CX,CY",
             )
-        image = self._survey.topics[image_topic].first_image
-        assert image is not None
+        image = self._survey.topics[image_topic].image
         size, expected = (image.width, image.height), (calibration.width, calibration.height)
         if expected == (0, 0) and not calibration.cut:
             expected = size
@@ -306,8 +305,7 @@ class _Builder:
 
     def _given(self, intrinsics: tuple[float, ...], image_topic: str) -> Calibration:
         """What --intrinsics says, for images of the size that they are."""
-        image = self._survey.topics[image_topic].first_image
-        assert image is not None
+        image = self._survey.topics[image_topic].image
         fx, fy, cx, cy, *distortion = intrinsics
         return Calibration(
             width=image.width,
@@ -323,8 +321,7 @@ class _Builder:
     def _check_depth(self) -> None:
         """Raise InputError where the depth topic holds something else, or several could be it."""
         topics = self._topics
-        image = self._survey.topics[topics.depth].first_image
-        assert image is not None
+        image = self._survey.topics[topics.depth].image
         if image.kind != "depth":
             raise InputError(
                 f"{self._where}: topic {topics.depth}: expected depth images, got {image.encoding}",
@@ -382,8 +379,7 @@ class _Builder:
     def _registration(self, color: Intrinsics) -> DepthToColor:
         """How raw depth reaches the colour camera. Raises InputError where K or the transform is not known."""
         topics, tf, color_frame = self._topics, self._survey.tf, self._frame_id
-        depth_image = self._survey.topics[topics.depth].first_image
-        assert depth_image is not None
+        depth_image = self._survey.topics[topics.depth].image
         size = f"{depth_image.encoding} {depth_image.width}x{depth_image.height}"
         what = f"{self._where}: depth {size} of {topics.depth} is not registered to colour of {topics.color}"
         remedy = "record depth aligned to colour"

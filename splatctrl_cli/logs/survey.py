@@ -172,6 +172,12 @@ class TopicSurvey:
     calibration: Calibration | None = None
     joints: JointLog = field(default_factory=JointLog)
 
+    @property
+    def image(self) -> ImageMessage:
+        """The first image, of a topic that is known to have one."""
+        assert self.first_image is not None
+        return self.first_image
+
 
 @dataclass(kw_only=True)
 class Survey:
@@ -389,7 +395,7 @@ class RobotDescription:
 def robot_descriptions(log: RawLog) -> list[RobotDescription]:
     """Those of a log, each text once; of a topic the first message. The topics that have them are read, no others."""
     topics = log.topics()
-    own = {t.name for t in topics if t.type_name == STRING and _last(t.name) == NAME}
+    own = {t.name for t in topics if t.type_name == STRING and t.name.rpartition("/")[2] == NAME}
     wanted = own or {t.name for t in topics if t.type_name == EVENT}
     if not topics:  # no index
         wanted = {f"/{NAME}", EVENTS}
@@ -415,7 +421,3 @@ def _parameters(event: Any) -> Iterator[tuple[str, str]]:
     for parameter in (*event.new_parameters, *event.changed_parameters):
         if parameter.name == NAME and parameter.value.type == _TEXT:
             yield str(event.node), str(parameter.value.string_value)
-
-
-def _last(topic: str) -> str:
-    return topic.rpartition("/")[2]

@@ -11,7 +11,6 @@ at a corner agree to a tolerance. Triangles (F, 3, 3), centers (S, 3), radii (S,
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -20,7 +19,7 @@ from splatctrl_cli.config.fixed import COVERED_EDGE, DEFICIT_GAP
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import face_normals, invert_transform, transform_points
 from splatctrl_cli.records import Bool, Float64, SphereSet
-from splatctrl_cli.robot.link_meshes import Solid, SolidDistance, read_solids
+from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 from splatctrl_cli.robot.urdf import UrdfFile
 
 PAIRS_PER_CHUNK = 1_000_000  # of corners and spheres
@@ -107,21 +106,14 @@ class CoverageReport:
         return max(link.protrusion for link in self.links)
 
 
-def coverage_deficit(
-    urdf: UrdfFile, spheres: SphereSet, *, folders: Sequence[Path] = (), resolution: float = COVERED_EDGE
-) -> CoverageReport:
-    """How `spheres` (links by the URDF's names) cover the collision surface of each link of `urdf`.
-
-    A link's surface may lie in spheres of any link that fixed joints join to it. folders: see `read_solids`. Raises
-    InputError for a mesh that is missing, no collision geometry, or a sphere on a link that is not there.
-    """
-    return coverage_of_solids(urdf, read_solids(urdf, folders), spheres, resolution=resolution)
-
-
 def coverage_of_solids(
     urdf: UrdfFile, solids: Mapping[str, Sequence[Solid]], spheres: SphereSet, *, resolution: float = COVERED_EDGE
 ) -> CoverageReport:
-    """As `coverage_deficit`, of collision geometry that is already read."""
+    """How `spheres` (links by the URDF's names) cover the collision surface of each link of `urdf`, its `solids`.
+
+    A link's surface may lie in spheres of any link that fixed joints join to it. Raises InputError for a sphere on a
+    link that is not there.
+    """
     bodies = urdf.rigid_bodies()
     unknown = [link for link in spheres.links if link not in bodies]
     if unknown:
@@ -235,13 +227,16 @@ def _of_link(
     resolution: float,
 ) -> LinkCoverage:
     area = sum(float(areas(part.surface.corners).sum()) for part in parts)
-    deficits, shares = [], []
-    for part in parts if len(radii) else ():
-        deficit = _of_part(part, centers, radii)
-        deficits.append(deficit)
-        is_covered = deficit.proven <= 0
-        corners = part.surface.corners[:0] if is_covered else part.surface.corners
-        shares.append(uncovered_area(corners, centers, radii - part.slack, resolution=resolution))
+    deficits = [_of_part(part, centers, radii) for part in parts if len(radii)]
+    shares = [
+        uncovered_area(
+            part.surface.corners[: 0 if deficit.proven <= 0 else None],
+            centers,
+            radii - part.slack,
+            resolution=resolution,
+        )
+        for part, deficit in zip(parts, deficits, strict=False)
+    ]
     uncovered = tuple(float(sum(column)) for column in zip(*shares, strict=True)) if shares else (area,) * 3
     sticking = SolidDistance(parts)(centers[own]) + radii[own] if own.any() else np.zeros(1)
     worst = int(np.argmax(sticking))

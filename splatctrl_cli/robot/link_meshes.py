@@ -190,8 +190,7 @@ def _is_closed(faces: Index) -> bool:
     """Whether every edge has one face on either side, which run through it in opposite directions."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     forth = np.unique(edges, axis=0)
-    back = np.unique(edges[:, ::-1], axis=0)
-    return len(forth) == len(edges) and np.array_equal(forth, back)
+    return len(forth) == len(edges) and np.array_equal(forth, np.unique(edges[:, ::-1], axis=0))
 
 
 def _hull(vertices: Float64) -> TriangleMesh | None:
@@ -201,8 +200,7 @@ def _hull(vertices: Float64) -> TriangleMesh | None:
     except QhullError:
         return None
     faces = hull.simplices.astype(np.int64)
-    corners = vertices[faces]
-    normal = face_normals(corners)
+    normal = face_normals(vertices[faces])
     is_inward = np.einsum("fa,fa->f", normal, hull.equations[:, :3]) < 0
     faces[is_inward] = faces[is_inward][:, ::-1]
     return TriangleMesh(vertices=vertices, faces=faces, is_closed=True)

@@ -172,10 +172,6 @@ class RobotModel:
             self._surface = RobotSurface.of(self.urdf, self.sphere_set, self._packages)
         return self._surface
 
-    def with_pieces(self, pieces: Sequence[tuple[str, Float64]]) -> "RobotModel":
-        """The same robot, to whose surface triangles (F, 3, 3) [m] in the frames of links belong as well."""
-        return self._changed(_surface=self.surface.joined(pieces))
-
     def with_self_model(self, found: SelfModel) -> "RobotModel":
         """The same robot with the parts that a self-model has always; `surface_at` has what it holds for a time."""
         return self._changed(_surface=self.surface.joined(found.pieces()), self_model=found, _surfaces={})
@@ -385,18 +381,14 @@ class RobotModel:
         return np.asarray(q, dtype=np.float64)
 
     def _configuration(self, q: Float64) -> Float64:
-        q = self._checked(q)
         if not self._is_wrapped.any():
             return q
         columns = [[np.cos(x), np.sin(x)] if w else [x] for x, w in zip(q, self._is_wrapped, strict=True)]
         return np.concatenate(columns)
 
-    def _jacobians(self, q: Float64) -> None:
-        pinocchio.computeJointJacobians(self._model, self._data, self._configuration(q))
-
     def _as_chain(self) -> Chain:
         placement = np.array([self.T_world_base, *(p.homogeneous for p in list(self._model.jointPlacements)[1:])])
-        self._jacobians(self.middle)
+        pinocchio.computeJointJacobians(self._model, self._data, self._configuration(self.middle))
         kind, axis = [REVOLUTE], [np.array([0.0, 0.0, 1.0])]
         for body in range(1, self.num_joints + 1):
             local = pinocchio.getJointJacobian(self._model, self._data, body, pinocchio.ReferenceFrame.LOCAL)
@@ -415,12 +407,12 @@ class RobotModel:
         )
 
     def _joint_offsets(self) -> tuple[Index, Float64]:
-        joints, offsets = [], []
-        for link, center in zip(self.sphere_set.links, self.sphere_set.centers, strict=True):
-            frame = self._model.frames[self._frame(link)]
-            joints.append(frame.parentJoint)
-            offsets.append(frame.placement.rotation @ center + frame.placement.translation)
-        return np.array(joints, dtype=np.int64), np.array(offsets, dtype=np.float64)
+        frames = [self._model.frames[self._frame(link)] for link in self.sphere_set.links]
+        offsets = [
+            frame.placement.rotation @ center + frame.placement.translation
+            for frame, center in zip(frames, self.sphere_set.centers, strict=True)
+        ]
+        return np.array([f.parentJoint for f in frames], dtype=np.int64), np.array(offsets, dtype=np.float64)
 
     def _moved(self) -> Bool:
         """Structural: a sphere on the base, or centred on the only axes that carry it, never moves."""

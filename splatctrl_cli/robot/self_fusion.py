@@ -271,8 +271,7 @@ def _is_on_other_link(
     """Cells (N,) that lie nearer to a link against which they do not move by `STEP`; T_world_link (K, L, 4, 4)."""
     found = np.zeros(len(cells), bool)
     for other in range(len(surface.links)):
-        between = np.linalg.inv(poses[:, other]) @ poses[:, number]
-        places = _moved(between, cells)
+        places = _moved(np.linalg.inv(poses[:, other]) @ poses[:, number], cells)
         if other != number and len(cells):
             is_still = _span(places, seen) < STEP
             at = places[seen.argmax(axis=0), np.arange(len(cells))]

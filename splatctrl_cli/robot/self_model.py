@@ -88,17 +88,13 @@ class SelfModel:
         """Those that the robot has at a stamp [ns], and not always."""
         return [(part.link, part.triangles) for part in self.held if part.start_ns <= stamp_ns < part.end_ns]
 
-    def pieces_at(self, stamp_ns: int) -> list[tuple[str, Float64]]:
-        """`pieces` and `held_at` of a stamp [ns]."""
-        return self.pieces() + self.held_at(stamp_ns)
-
     @property
     def parts(self) -> list[LearnedLink]:
         """What stands out at any time."""
         return [part for part in self.learned if len(part.triangles)]
 
     def changes(self) -> list[int]:
-        """Stamps [ns], in order, from each of which on `pieces_at` may differ."""
+        """Stamps [ns], in order, from each of which on `held_at` may differ."""
         return sorted({stamp for part in self.held for stamp in (part.start_ns, part.end_ns)} - set(ALWAYS))
 
     def arrays(self) -> dict[str, NDArray[Any]]:

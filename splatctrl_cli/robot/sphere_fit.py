@@ -192,8 +192,7 @@ class _Link:
             for ball in range(len(centers)):
                 mine = owner == ball
                 if mine.any():
-                    needed = self._cost[:, mine].max(axis=1)
-                    moved[ball] = self._candidates[int(np.argmin(needed))]
+                    moved[ball] = self._candidates[int(np.argmin(self._cost[:, mine].max(axis=1)))]
             if self._assigned(moved)[1] >= worst:
                 break
             centers = moved

@@ -123,7 +123,12 @@ class RobotSurface:
     def with_boxes(self, boxes: Sequence[tuple[str, Box]]) -> "RobotSurface":
         """The same with boxes around what the robot carries, each fixed to a link, in its frame."""
         shapes = [
-            Shape(link=link, kind="box", size=tuple(box.upper - box.lower), T_link_shape=_shifted(box))
+            Shape(
+                link=link,
+                kind="box",
+                size=tuple(box.upper - box.lower),
+                T_link_shape=pose_at((box.lower + box.upper) / 2),
+            )
             for link, box in boxes
         ]
         return replace(
@@ -314,7 +319,3 @@ def _sizes(shape: Shape) -> tuple[float, float, float]:
 
 def _ball(link: str, center: Float64, radius: float) -> Shape:
     return Shape(link=link, kind="sphere", size=(float(radius),), T_link_shape=pose_at(center))
-
-
-def _shifted(box: Box) -> Float64:
-    return pose_at((box.lower + box.upper) / 2)

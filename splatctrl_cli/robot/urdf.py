@@ -96,13 +96,17 @@ class UrdfFile:
         Links joined by fixed joints are one body, led by the link nearest to the root. `movable`: the joints that
         move (default: all that are not fixed); a joint that is locked elsewhere than at 0 does not belong here.
         """
-        by_child = {joint.child: joint for joint in self.joints}
+        still = {
+            joint.child: joint
+            for joint in self.joints
+            if (joint.kind == "fixed" if movable is None else joint.name not in movable)
+        }
         bodies: dict[str, tuple[str, Float64]] = {}
         for link in self.links:
             leader, T = link, np.eye(4)
-            while leader in by_child and not _moves(by_child[leader], movable):
-                T = by_child[leader].T_parent_child @ T
-                leader = by_child[leader].parent
+            while leader in still:
+                T = still[leader].T_parent_child @ T
+                leader = still[leader].parent
             bodies[link] = (leader, T)
         return bodies
 
@@ -152,10 +156,6 @@ class UrdfFile:
             if joint.mimic is not None and joint.mimic[0] in locked and joint.kind != "fixed"
         }
         return {**followers, **locked}
-
-
-def _moves(joint: Joint, movable: Collection[str] | None) -> bool:
-    return joint.kind != "fixed" if movable is None else joint.name in movable
 
 
 def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
@@ -234,7 +234,6 @@ def _parse(path: Path, text: str) -> tuple[str, Any]:
 
 
 def _check_tree(path: Path, links: tuple[str, ...], joints: list[Any]) -> None:
-    children = set()
     for joint in joints:
         name = _attribute(path, joint, "name")
         for role in ("parent", "child"):
@@ -242,8 +241,7 @@ def _check_tree(path: Path, links: tuple[str, ...], joints: list[Any]) -> None:
             link = None if element is None else element.get("link")
             if link not in links:
                 raise InputError(f"{path}: joint '{name}': {role} link {link!r} does not exist")
-            if role == "child":
-                children.add(link)
+    children = {joint.find("child").get("link") for joint in joints}
     roots = [link for link in links if link not in children]
     if len(roots) != 1:
         got = ", ".join(roots) or "none (the joints form a loop)"

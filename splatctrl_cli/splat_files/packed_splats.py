@@ -268,8 +268,7 @@ def _fraction_bits(centers: Float32) -> int:
 def _centers(table: UInt8, bits: int) -> Float32:
     wide = np.zeros((len(table), 3, 4), dtype=np.uint8)
     wide[:, :, 1:] = table.reshape(-1, 3, 3)  # in the upper bytes: the shift back keeps the sign
-    fixed = wide.view("<i4")[:, :, 0] >> 8
-    return np.ldexp(fixed.astype(np.float64), -bits).astype(np.float32)
+    return np.ldexp((wide.view("<i4")[:, :, 0] >> 8).astype(np.float64), -bits).astype(np.float32)
 
 
 def _harmonics(colors: UInt8, rest: UInt8) -> Float32:

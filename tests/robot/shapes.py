@@ -1,19 +1,20 @@
 """Small URDFs and meshes for the tests of collision geometry; and arms with a known answer."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 import trimesh
 
+from splatctrl_cli.config.fixed import COVERED_EDGE
 from splatctrl_cli.records import Float64, SphereSet
-from splatctrl_cli.robot.coverage import coverage_of_solids
+from splatctrl_cli.robot.coverage import CoverageReport, coverage_of_solids
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import SelfSurfaces
 from splatctrl_cli.robot.self_model import LearnedLink, SelfModel
-from splatctrl_cli.robot.urdf import read_urdf
+from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 BOX = '<box size="0.3 0.2 0.1"/>'
 ROD = '<cylinder radius="0.05" length="0.4"/>'
@@ -33,6 +34,13 @@ def written(folder: Path, text: str, name: str = "robot.urdf") -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     return path
+
+
+def coverage_deficit(
+    urdf: UrdfFile, spheres: SphereSet, *, folders: Sequence[Path] = (), resolution: float = COVERED_EDGE
+) -> CoverageReport:
+    """How spheres cover the collision geometry of a URDF, read from its folders."""
+    return coverage_of_solids(urdf, read_solids(urdf, folders), spheres, resolution=resolution)
 
 
 def held_part(link: str, triangles: Float64, start_ns: int, end_ns: int) -> SelfModel:

@@ -10,10 +10,10 @@ from splatctrl_cli.config.fixed import DEFICIT_GAP
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import look_at, transform_points
 from splatctrl_cli.records import SphereSet
-from splatctrl_cli.robot.coverage import areas, coverage_deficit, largest_deficit, refined, uncovered_area
+from splatctrl_cli.robot.coverage import areas, largest_deficit, refined, uncovered_area
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf
-from tests.robot.shapes import BALL, BOX, arm_of, written
+from tests.robot.shapes import BALL, BOX, arm_of, coverage_deficit, written
 
 CUBE = trimesh.creation.box(extents=(0.2, 0.2, 0.2)).triangles
 

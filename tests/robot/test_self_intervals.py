@@ -79,8 +79,8 @@ def test_a_bracket_is_robot_always_beside_a_box_that_is_held_for_a_time() -> Non
     (_, bracket), (part,) = found.pieces()[0], found.held
     assert bracket[..., 2].min() > 0.03 and part.triangles[..., 0].min() > 0.37
     assert found.changes() == [part.start_ns, part.end_ns]
-    counts = [len(found.pieces_at(stamp)) for stamp in (0, part.start_ns, part.end_ns - 1, part.end_ns)]
-    assert counts == [1, 2, 2, 1]
+    counts = [len(found.held_at(stamp)) for stamp in (0, part.start_ns, part.end_ns - 1, part.end_ns)]
+    assert (len(found.pieces()), counts) == (1, [0, 1, 1, 0])
 
 
 def test_what_stands_beside_the_arm_while_it_stays_is_not_taken() -> None:

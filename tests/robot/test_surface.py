@@ -12,8 +12,9 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
 from splatctrl_cli.records import Box, Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_model import ALWAYS
 from tests.reference.triangles import distance_to_triangles
-from tests.robot.shapes import arm_of, l_shape, written
+from tests.robot.shapes import arm_of, held_part, l_shape, written
 
 BALL = '<sphere radius="0.02"/>'
 CAPSULE = '<capsule radius="0.1" length="0.4"/>'
@@ -185,8 +186,8 @@ def test_what_a_link_with_triangles_carries_or_has_of_boxes_counts_as_well(tmp_p
     assert bare == pytest.approx(0.5, abs=1e-6)
     box = Box(lower=np.array([-0.05, -0.05, -0.4]), upper=np.array([0.05, 0.05, -0.3]))
     assert model.carrying([("tip", box)]).surface_gaps(q, *scene)["tip"][0] == pytest.approx(0.1, abs=1e-6)
-    part = [("tip", np.asarray(trimesh.creation.box(bounds=[box.lower, box.upper]).triangles))]
-    assert model.with_pieces(part).surface_gaps(q, *scene)["tip"][0] == pytest.approx(0.1, abs=1e-6)
+    part = held_part("tip", np.asarray(trimesh.creation.box(bounds=[box.lower, box.upper]).triangles), *ALWAYS)
+    assert model.with_self_model(part).surface_gaps(q, *scene)["tip"][0] == pytest.approx(0.1, abs=1e-6)
     capsules = RobotModel.from_urdf(written(tmp_path / "solid", arm_of(BALL, '<box size="0.4 0.4 0.4"/>')), SPHERES)
-    both = capsules.with_pieces([("tip", l_shape().triangles + np.array([0.0, 0.0, 1.0]))])
+    both = capsules.with_self_model(held_part("tip", l_shape().triangles + np.array([0.0, 0.0, 1.0]), *ALWAYS))
     assert both.surface_gaps(q, *scene)["tip"][0] == pytest.approx(0.55 - 0.2 - 0.05, abs=1e-6)

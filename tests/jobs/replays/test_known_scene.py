@@ -17,6 +17,7 @@ from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene, fiel
 from splatctrl_cli.jobs.replays.state_pass import ReplayRecord
 from splatctrl_cli.jobs.studies.problems import simulated_arm
 from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.self_model import ALWAYS
 from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.voxels import SWEPT, EvidenceClass, VoxelState
 from tests.cli.replay_desk import SECOND
@@ -85,7 +86,8 @@ def test_what_spheres_leave_uncovered_is_not_taken_from_a_surface_that_is_measur
     """A ball 30 cm before the hand of an arm that triangles draw, whose spheres leave 5 cm uncovered."""
     arm, q = simulated_arm(), np.array([[0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785]])
     link = arm.sphere_set.links[-1]
-    drawn = arm.with_pieces([(link, np.asarray(trimesh.creation.icosphere(radius=0.02).triangles))])
+    ball_at_hand = np.asarray(trimesh.creation.icosphere(radius=0.02).triangles)
+    drawn = arm.with_self_model(held_part(link, ball_at_hand, *ALWAYS))
     model = drawn._changed(sphere_deficit=np.where(np.array(arm.sphere_set.links) == link, 0.05, 0.0))
     center = model.sphere_centers(q[0])[-1] + [0.0, 0.0, -0.3]
     ball = SphereField(center[None], np.array([0.01]))
@@ -112,7 +114,7 @@ def test_a_thing_that_the_hand_holds_for_a_time_counts_while_it_is_held() -> Non
     hand = arm.sphere_centers(q)[-1]
     place = np.linalg.inv(arm.frame_pose(q, link)) @ [*hand - [0.0, 0.0, 0.1], 1.0]
     ball = trimesh.creation.icosphere(radius=0.02)
-    base = arm.with_pieces([(link, np.asarray(ball.triangles))])
+    base = arm.with_self_model(held_part(link, np.asarray(ball.triangles), *ALWAYS))
     model = base.with_self_model(held_part(link, ball.triangles + place[:3], SECOND // 4, 55 * SECOND // 100))
     center = (hand - [0.0, 0.0, 0.3])[None]
     scene = BallDistance(of_points=away, centers=center, radii=np.array([0.01]))

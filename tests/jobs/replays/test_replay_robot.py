@@ -21,13 +21,13 @@ from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs import state_columns
 from splatctrl_cli.records import Float64, JointState, SphereSet
 from splatctrl_cli.robot import self_margins
-from splatctrl_cli.robot.coverage import coverage_deficit, refined
+from splatctrl_cli.robot.coverage import refined
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import spheres_yaml
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, scene_of, splats_of, write_field, write_scene
 from tests.control.fakes import Balls
-from tests.robot.shapes import arm_of, l_shape, written
+from tests.robot.shapes import arm_of, coverage_deficit, l_shape, written
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
