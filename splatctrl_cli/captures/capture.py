@@ -15,7 +15,7 @@ from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.logs.messages import metres
-from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB, SourceOptions
+from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB, SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.logs.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.logs.stored_frame import (
     AGAIN,
@@ -58,9 +58,7 @@ class CaptureSource:
         self.joint_names = tuple(header["joint_names"])
         self._cameras: dict[str, dict[str, Any]] = header["cameras"]
         self.cameras = tuple(self._cameras) if options.cameras is None else options.cameras
-        for name in self.cameras:
-            if name not in self._cameras:
-                raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(self._cameras)}")
+        refuse_unknown_cameras(path, self.cameras, self._cameras)
         self._sums = FileSums(path)
         self._rows = FrameRows(path / "frames.csv", self.cameras)
         self._damaged: list[str] = []  # of the last pass

@@ -140,9 +140,7 @@ class FrameRows(Sequence[Mapping[str, str]]):
                 if self._names[: len(COLUMNS)] != COLUMNS or self._names[len(COLUMNS) :] not in _FURTHER:
                     raise InputError(f"{file}: expected columns {', '.join(COLUMNS)}", remedy=AGAIN)
                 for offset, values in rows:
-                    row = self._row(values)
-                    _check(row)
-                    if row["camera"] in cameras:
+                    if self._row(values)["camera"] in cameras:
                         self._offsets.append(offset)
         except (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError) as error:
             raise InputError(f"{file}: cannot be read: {error}", remedy=AGAIN) from None
@@ -155,18 +153,16 @@ class FrameRows(Sequence[Mapping[str, str]]):
         try:
             with self._file.open("rb") as stream:
                 _, values = next(_rows(stream, self._offsets[number]), (0, []))
-            row = self._row(values)
-            _check(row)
+            return self._row(values)
         except (UnicodeDecodeError, csv.Error, ValueError, TypeError):
             raise InputError(f"{self._file}: changed while it was read", remedy="try again") from None
-        return row
 
     def _row(self, values: Sequence[str]) -> Mapping[str, str]:
-        return dict(zip(self._names, values, strict=True))
+        return _checked(dict(zip(self._names, values, strict=True)))
 
 
-def _check(row: Mapping[str, str]) -> None:
-    """Raise ValueError for what is no frame."""
+def _checked(row: Mapping[str, str]) -> Mapping[str, str]:
+    """The row itself. Raises ValueError for what is no frame."""
     int(row["stamp_ns"])
     for key in COLUMNS[4:11]:
         float(row[key])
@@ -174,6 +170,7 @@ def _check(row: Mapping[str, str]) -> None:
         path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts:
             raise ValueError(f"{name} lies outside the capture")
+    return row
 
 
 def _rows(stream: BinaryIO, offset: int) -> Iterator[tuple[int, list[str]]]:

@@ -86,8 +86,8 @@ class ImageWatch:
         if self.kept.is_next():
             stride = stride_of(height)
             small = cv2.resize(color, (-(-width // stride), -(-height // stride)), interpolation=cv2.INTER_AREA)
-            small = np.asarray(small, dtype=np.uint8)
-            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, color=small))
+            kept = np.asarray(small, dtype=np.uint8)
+            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, color=kept))
 
     def add_depth(self, stamp_ns: int, depth: Float32, encoding: str, num_invalid: int = 0) -> None:
         """A depth image (H, W) [m], 0 = none."""
@@ -121,8 +121,7 @@ class ImageWatch:
             self.constants = Counter({float(value * factor): num for value, num in self.constants.items()})
             self.medians.change(lambda median: float(median * factor))
             self.kept.change(lambda kept: kept if kept.depth is None else replace(kept, depth=kept.depth * factor))
-            changed = [t if t.depth is None else replace(t, depth=t.depth * factor) for t in self.thumbnails]
-            self.thumbnails = changed
+            self.thumbnails = [t if t.depth is None else replace(t, depth=t.depth * factor) for t in self.thumbnails]
 
     @property
     def is_float(self) -> bool:
@@ -296,15 +295,15 @@ def _other(
     camera: str, edges: dict[str, list[tuple[Float64, Float64]]], own: float
 ) -> tuple[str, float, float] | None:
     """The camera whose depth fits this one's colour clearly, its own score, and the other's."""
-    scores = {}
-    for name, its in edges.items():
-        pairs = list(zip(edges[camera], its, strict=False))
-        if name != camera and all(a[0].shape == b[1].shape for a, b in pairs):
-            scores[name] = _at_zero(np.mean([_correlation(a[0], b[1]) for a, b in pairs], axis=0))
+    pairs = {name: list(zip(edges[camera], its, strict=False)) for name, its in edges.items() if name != camera}
+    scores = {
+        name: _at_zero(np.mean([_correlation(a[0], b[1]) for a, b in its], axis=0))
+        for name, its in pairs.items()
+        if all(a[0].shape == b[1].shape for a, b in its)
+    }
     best = max(scores, key=lambda name: scores[name], default=None)
-    if best is None or scores[best] < max(limits.EDGE_CLEAR, 2 * own):
-        return None
-    return best, own, scores[best]
+    is_clear = best is not None and scores[best] >= max(limits.EDGE_CLEAR, 2 * own)
+    return (best, own, scores[best]) if best is not None and is_clear else None
 
 
 def _spectra(frame: RgbdFrame) -> tuple[Float64, Float64]:

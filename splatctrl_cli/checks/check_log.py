@@ -19,12 +19,11 @@ from splatctrl_cli.checks.check_times import (
 from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, note, warning
 from splatctrl_cli.checks.log_pass import LogWatch, checked_camera, image_motion, ready
 from splatctrl_cli.containers.raw_log import RawLog
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.cameras import image_topics
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
 from splatctrl_cli.logs.messages import COLOR_CONVERSIONS, DEPTH_ENCODINGS
 from splatctrl_cli.logs.rig import camera_topics, check_mask_topics, missing
-from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
+from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.logs.state_messages import STATE_TYPES
 from splatctrl_cli.logs.survey import Survey, survey
 from splatctrl_cli.robot.model import RobotModel
@@ -103,9 +102,7 @@ def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraT
     names = tuple(camera.name for camera in cameras)
     if not names:
         return ()
-    for name in (*(options.cameras or ()), *options.camera_poses, *options.intrinsics):
-        if name not in names:
-            raise InputError(f"{log.path}: no camera {name!r}", remedy=f"use one of: {', '.join(names)}")
+    refuse_unknown_cameras(log.path, (*(options.cameras or ()), *options.camera_poses, *options.intrinsics), names)
     check_mask_topics(log.path, found, options.human_topics, names)
     return tuple(c for c in cameras if options.cameras is None or c.name in options.cameras)
 

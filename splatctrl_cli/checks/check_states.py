@@ -196,10 +196,11 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
 
 def _positions(states: Sequence[JointState]) -> Iterator[Float64]:
     """(T, J), a block at a time."""
-    if isinstance(states, StateColumns):
-        yield from blocks_of(states.position)
-    else:
-        yield np.array([state.position for state in states])
+    return (
+        blocks_of(states.position)
+        if isinstance(states, StateColumns)
+        else iter([np.array([state.position for state in states])])
+    )
 
 
 def _posed(states: Sequence[JointState]) -> Index:

@@ -348,8 +348,7 @@ def _descended(
             return None
         values, vectors = np.linalg.eigh(H / total)
         inverse = np.where(values > limits.MOVE_FLAT, 1 / np.maximum(values, limits.MOVE_FLAT), 0.0)
-        step = -vectors @ (inverse * (vectors.T @ (g / total)))
-        T = T @ transform_of(step)
+        T = T @ transform_of(-vectors @ (inverse * (vectors.T @ (g / total))))
     return T
 
 

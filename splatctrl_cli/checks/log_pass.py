@@ -247,8 +247,7 @@ def image_motion(watch: LogWatch, cameras: Sequence[CheckedCamera]) -> ImageMoti
 
 def _thumbnails(watch: LogWatch, camera: Camera, checked: CheckedCamera) -> list[RgbdFrame]:
     """Colour beside depth only where both are of one view."""
-    is_registered = camera.depth_to_color is None
-    colors = watch.images[checked.topics.color].thumbnails if is_registered else []
+    colors = watch.images[checked.topics.color].thumbnails if camera.depth_to_color is None else []
     gray = {thumbnail.stamp_ns: thumbnail.color for thumbnail in colors}
     at, frames = sorted(gray), []
     poses = {frame.stamp_ns: frame.T_world_camera for frame in checked.frames}

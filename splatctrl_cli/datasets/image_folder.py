@@ -21,7 +21,7 @@ from splatctrl_cli.files.image_file import decode_file, read_pfm
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.logs.messages import measured, metres, num_invalid
 from splatctrl_cli.logs.registration import DepthToColor, Undistortion, undistortion_of
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.logs.state_columns import NO_STATES
 from splatctrl_cli.logs.stored_frame import StoredFrame, check_depth, decoded, human_mask, is_kept, is_png
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, UInt8, by_stamp
@@ -62,14 +62,12 @@ class ImageFolderSource:
         self._lenses: dict[str, _Lens] = {}
         self.guess = "" if self.has_clock else self._in_metres()
         """In which unit lengths look to be, in words; empty where they may be metres."""
-        _check_names(path, {view.lens.name for view in self._views}, options)
+        lenses = sorted({view.lens.name for view in self._views})
+        refuse_unknown_cameras(path, (*options.camera_poses, *options.intrinsics), lenses)
         names = tuple(sorted({view.camera for view in self._views}))
-        if options.cameras is not None:
-            for name in options.cameras:
-                if name not in names:
-                    raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(names)}")
-            self._views = [view for view in self._views if view.camera in options.cameras]
         self.cameras = names if options.cameras is None else options.cameras
+        refuse_unknown_cameras(path, self.cameras, names)
+        self._views = [view for view in self._views if view.camera in self.cameras]
 
     @property
     def has_depth(self) -> bool:
@@ -294,12 +292,6 @@ def _undistortion(camera: CameraTable) -> Undistortion | None:
     return undistortion_of(camera.intrinsics, camera.distortion_model, np.array(camera.distortion, np.float64))
 
 
-def _check_names(path: Path, lenses: set[str], options: SourceOptions) -> None:
-    for name in (*options.camera_poses, *options.intrinsics):
-        if name not in lenses:
-            raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(sorted(lenses))}")
-
-
 def _float_pixels(path: ImageFile) -> NDArray[np.float32] | None:
     if path.suffix == ".npy":
         try:
@@ -344,9 +336,7 @@ class RigFolderSource:
             name = description.camera.name
             pose = {name: options.camera_poses[name]} if name in options.camera_poses else {}
             by_name[name] = ImageFolderSource(path, replace(options, cameras=None, camera_poses=pose), description)
-        for name in (*(options.cameras or ()), *options.camera_poses):
-            if name not in by_name:
-                raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(by_name)}")
+        refuse_unknown_cameras(path, (*(options.cameras or ()), *options.camera_poses), by_name)
         self.cameras = options.cameras or tuple(by_name)
         self._parts = [by_name[name] for name in self.cameras]
 

@@ -176,8 +176,7 @@ def _lens(folder: Path, series: Series | None, image: ImageFile) -> CameraTable:
 
 def marker_to_camera(T_ground_truth: Float64) -> Float64:
     """T_world_camera (4, 4) of a pose in Bonn's groundtruth.txt."""
-    T_world_camera: Float64 = _BONN_T_ROS.T @ T_ground_truth @ _BONN_T_ROS @ rigid(_BONN_T_M, "Bonn's T_m")
-    return T_world_camera
+    return np.asarray(_BONN_T_ROS.T @ T_ground_truth @ _BONN_T_ROS @ rigid(_BONN_T_M, "Bonn's T_m"))
 
 
 def is_icl(folder: Path) -> bool:

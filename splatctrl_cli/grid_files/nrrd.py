@@ -11,6 +11,7 @@ from pathlib import Path
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.summary import Summary
+from splatctrl_cli.files.unpacking import read_bytes
 from splatctrl_cli.grid_files.grid_format import (
     CHANNELS,
     GridFormat,
@@ -64,8 +65,7 @@ def read_nrrd_head(path: Path) -> tuple[dict[str, str], dict[str, str]]:
 
     Raises InputError for a file of another kind, or whose header does not end.
     """
-    with path.open("rb") as stream:
-        text = stream.read(1 << 20)  # bytes in which the header must end
+    text = read_bytes(path, 1 << 20)  # in which the header must end
     head, end, _ = text.partition(b"\n\n")
     lines = head.decode("utf-8", errors="replace").replace("\r\n", "\n").split("\n")
     if not lines[0].startswith("NRRD000") or not end:

@@ -173,10 +173,8 @@ def write_moveit(path: Path, grid: DistanceGrid) -> None:
 
 def is_occupied(grid: DistanceGrid, layers: slice) -> Bool:
     """(L, Y, Z) which cells of these layers of x are written as occupied."""
-    if "bound" in grid.channels:
-        reached = np.asarray(grid.channels["bound"][layers]) <= np.float32(0.0)
-    else:
-        reached = np.asarray(grid.channels["hard"][layers]) <= np.float32(REACH * grid.voxel + ROUNDING)
+    name, most = ("bound", 0.0) if "bound" in grid.channels else ("hard", REACH * grid.voxel + ROUNDING)
+    reached = np.asarray(grid.channels[name][layers]) <= np.float32(most)
     is_clear: NDArray[np.bool_] = np.asarray(grid.channels["sdf"][layers]) > np.float32(0.0)  # False for NaN
     return reached | ~is_clear
 

@@ -415,5 +415,4 @@ def _numbers(data: bytes) -> NDArray[np.int64]:
     place = np.arange(ends[-1] + 1) - np.repeat(starts, ends - starts + 1)
     if place.max() > 10:  # a number of more than 33 bits
         raise ValueError("RVL: a number of more than 33 bits")
-    result: NDArray[np.int64] = np.add.reduceat((nibbles[: ends[-1] + 1] & 7) << (3 * place), starts)
-    return result
+    return np.asarray(np.add.reduceat((nibbles[: ends[-1] + 1] & 7) << (3 * place), starts), dtype=np.int64)

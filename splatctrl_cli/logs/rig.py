@@ -33,7 +33,7 @@ from splatctrl_cli.logs.registration import (
     lens_model,
     undistortion_of,
 )
-from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
+from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.logs.survey import Calibration, Survey
 from splatctrl_cli.records import Bool, Float64, Intrinsics
 
@@ -74,9 +74,8 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
         raise no_camera(log, survey)
     known = {camera.name: camera for camera in found}
     names = tuple(known) if options.cameras is None else options.cameras
-    for name in (*names, *options.camera_poses, *options.camera_pose_topics, *options.intrinsics):
-        if name not in known:
-            raise InputError(f"{log.path}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")
+    asked = (*names, *options.camera_poses, *options.camera_pose_topics, *options.intrinsics)
+    refuse_unknown_cameras(log.path, asked, known)
     join_pose_topics(log, survey, options, [known[name] for name in names])
     check_mask_topics(log.path, survey, options.human_topics, tuple(known))
     try:

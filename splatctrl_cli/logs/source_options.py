@@ -1,6 +1,6 @@
 """How a source is to be read."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -81,3 +81,10 @@ class SourceOptions:
 def still_note(camera: str) -> str:
     """What a report says of a camera whose pose a person gave."""
     return f"camera {camera}: stands still where --camera-pose puts it, not where the recording may say"
+
+
+def refuse_unknown_cameras(where: Path, asked: Iterable[str], known: Collection[str]) -> None:
+    """Raise InputError where a camera that was asked for is not among those of a recording."""
+    for name in asked:
+        if name not in known:
+            raise InputError(f"{where}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")

@@ -129,8 +129,7 @@ def _slopes(seconds: Float64, position: Float64) -> Float64:
     starts = np.clip(np.arange(len(seconds)) - size // 2, 0, len(seconds) - size)
     since = sliding_window_view(seconds, size)[starts] - seconds[:, None]  # (T, size)
     scale = np.ptp(since, axis=1, keepdims=True)
-    degree = min(2, size - 1)
-    design = (since / scale)[..., None] ** np.arange(degree + 1)  # (T, size, degree + 1)
+    design = (since / scale)[..., None] ** np.arange(min(size, 3))  # (T, size, coefficients of the parabola)
     weights = np.linalg.pinv(design)[:, 1, :] / scale  # of the slope at the state itself
     windows = sliding_window_view(position, size, axis=0)[starts]  # (T, J, size)
     return np.asarray(np.einsum("ts,tjs->tj", weights, windows))

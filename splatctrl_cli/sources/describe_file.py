@@ -11,7 +11,6 @@ from xml.etree.ElementTree import ParseError
 import numpy as np
 import yaml
 from defusedxml import ElementTree
-from defusedxml.common import DefusedXmlException
 
 from splatctrl_cli.containers.log_formats import SUFFIXES
 from splatctrl_cli.errors import InputError
@@ -94,19 +93,21 @@ def _is_short(shape: tuple[int, ...], dtype: np.dtype[Any]) -> bool:
     return shape == () if dtype.kind in "US" else dtype.kind in "fiub" and prod(shape) <= _LIST_LIMIT
 
 
-def _npy(path: Path, _head: bytes) -> Summary:
+def _parsed(path: Path, parse: Callable[[], Any], what: str) -> Any:
+    """What `parse` gives. Raises InputError for a file that is not `what`."""
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise InputError(f"{path}: not a readable .npy: {error}", remedy="the file is damaged") from None
+        return parse()
+    except (ValueError, EOFError, ParseError, yaml.YAMLError) as error:  # ValueError: what defusedxml forbids, too
+        raise InputError(f"{path}: not {what}: {error}", remedy="the file is damaged") from None
+
+
+def _npy(path: Path, _head: bytes) -> Summary:
+    array = _parsed(path, lambda: np.load(path, mmap_mode="r", allow_pickle=False), "a readable .npy")
     return Summary(path=str(path), kind="array", facts={"shape": list(array.shape), "dtype": str(array.dtype)})
 
 
 def _urdf(path: Path, _head: bytes) -> Summary:
-    try:
-        robot = ElementTree.fromstring(path.read_bytes())
-    except (ParseError, DefusedXmlException) as error:
-        raise InputError(f"{path}: not readable XML: {error}", remedy="the file is damaged") from None
+    robot = _parsed(path, lambda: ElementTree.fromstring(path.read_bytes()), "readable XML")
     if robot.tag != "robot":
         raise InputError(f"{path}: expected <robot>, got <{robot.tag}>", remedy="expected a URDF")
     joints, links = robot.findall("joint"), robot.findall("link")
@@ -132,10 +133,7 @@ def _urdf(path: Path, _head: bytes) -> Summary:
 
 
 def _json(path: Path, _head: bytes) -> Summary:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not JSON: {error}", remedy="the file is damaged") from None
+    content = _parsed(path, lambda: json.loads(path.read_text(encoding="utf-8")), "JSON")
     if not isinstance(content, dict):
         return Summary(
             path=str(path), kind="JSON", facts={"entries": len(content) if isinstance(content, list) else 1}
@@ -158,10 +156,7 @@ def _rows(path: Path, _head: bytes) -> Summary:
 
 
 def _yaml(path: Path, _head: bytes) -> Summary:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not YAML: {error}", remedy="the file is damaged") from None
+    content = _parsed(path, lambda: yaml.safe_load(path.read_text(encoding="utf-8")), "YAML")
     spheres = _find(content, "collision_spheres")
     if isinstance(spheres, dict):
         rows = [[link, len(items)] for link, items in spheres.items() if isinstance(items, list)]

@@ -68,7 +68,7 @@ def rows_of(gaussians: GaussianSet, dtype: "np.dtype[Any]") -> NDArray[Any]:
     shapes = [logit(g.opacities), *np.log(g.scales.astype(np.float64)).T, *g.quats_wxyz.T]
     rows = np.zeros(len(g), dtype=dtype)
     for name, column in zip(VALUES, [*g.centers.T, *colors, *shapes, g.labels], strict=True):
-        if name in dtype.fields:
+        if name in (dtype.names or ()):
             rows[name] = column
     return rows
 
