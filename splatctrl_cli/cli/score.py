@@ -9,7 +9,8 @@ from splatctrl_cli.cli.common import Console, shown, table
 from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.score_report import PREFIX, counted
+from splatctrl_cli.evaluate.score_report import PREFIX
+from splatctrl_cli.evaluate.verdict import counted
 from splatctrl_cli.jobs import device
 from splatctrl_cli.jobs.scores.fit import EACH, METHODS, FitRequest, score_fits
 from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score

@@ -183,17 +183,13 @@ def audited(
     )
 
 
-def observed_lookup(seen: Channel, origin: Float64, voxel: float) -> Observed:
+def observed_at(seen: Channel, origin: Float64, voxel: float, points: Float64) -> Channel:
     """What the voxel nearest to each point says; 0 (never seen) outside. seen (X, Y, Z); origin (3,), voxel [m]."""
-
-    def observed(points: Float64) -> Channel:
-        cell = np.floor((points - origin) / voxel + 0.5).astype(np.int64)
-        is_inside = np.all((cell >= 0) & (cell < seen.shape), axis=1)
-        found = np.zeros(len(points), dtype=np.uint8)
-        found[is_inside] = seen[tuple(cell[is_inside].T)]
-        return found
-
-    return observed
+    cell = np.floor((points - origin) / voxel + 0.5).astype(np.int64)
+    is_inside = np.all((cell >= 0) & (cell < seen.shape), axis=1)
+    found = np.zeros(len(points), dtype=np.uint8)
+    found[is_inside] = seen[tuple(cell[is_inside].T)]
+    return found
 
 
 def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]]:

@@ -145,10 +145,6 @@ class DaqpSolver:
 SOLVERS: Mapping[str, Callable[[], QpSolver]] = {"clarabel": ClarabelSolver, "daqp": DaqpSolver}
 
 
-def solver_named(name: str) -> QpSolver:
-    return SOLVERS[name]()
-
-
 def is_finite(program: QuadraticProgram) -> bool:
     return all(bool(np.isfinite(a).all()) for a in (program.H, program.c, program.G, program.h))
 

@@ -14,7 +14,7 @@ from splatctrl_cli.control.fallbacks import Choice, Rung, descend, held
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.preconditions import check_coverage, check_model, checked_posture
-from splatctrl_cli.control.qp import QpSolver, solver_named, unsolved
+from splatctrl_cli.control.qp import SOLVERS, QpSolver, unsolved
 from splatctrl_cli.control.qp_rows import PRINTED, RowBuilder, Rows, solve_printed
 from splatctrl_cli.control.terms import BarrierTerm, Cost, CostTerm, ReachGoal, RowKind, State, standard_costs, summed
 from splatctrl_cli.records import Bool, DistanceField, Float64
@@ -130,7 +130,7 @@ class QpIkController:
         check_model(model)
         check_coverage(model, config)
         self._model, self._config, self._frame = model, config, frame
-        self._solver: QpSolver = solver_named(config.solver) if solver is None else solver
+        self._solver: QpSolver = SOLVERS[config.solver]() if solver is None else solver
         self._limits = JointLimits.of(model, config)
         further = [term for term in terms if isinstance(term, BarrierTerm)]
         self._builder = RowBuilder(model, config, field, self._limits.acceleration, further)

@@ -5,6 +5,7 @@ import math
 import operator
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
@@ -56,8 +57,8 @@ def gate_reasons(
         value, count = metrics[name], counts.get(name, 0)
         is_there = value is not None and math.isfinite(value)
         is_known = is_there and count > 0
-        holds = value is not None and is_known and bool(_COMPARISONS[comparison](value, bound))
-        when = None if holds or first_time is None else first_time(name, _holding(comparison, bound))
+        holds = value is not None and is_known and _holds(comparison, bound, value)
+        when = None if holds or first_time is None else first_time(name, partial(_holds, comparison, bound))
         shown = f"{value:.6g}" if is_known else "unknown, as it rests on nothing" if is_there else "unknown"
         reasons.append(
             Reason(
@@ -74,11 +75,8 @@ def gate_reasons(
     return reasons
 
 
-def _holding(comparison: str, bound: float) -> Callable[[float], bool]:
-    def holds(value: float) -> bool:
-        return bool(_COMPARISONS[comparison](value, bound))
-
-    return holds
+def _holds(comparison: str, bound: float, value: float) -> bool:
+    return bool(_COMPARISONS[comparison](value, bound))
 
 
 def gate(text: str) -> str:

@@ -19,6 +19,7 @@ from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.jobs.check import posed_robot
+from splatctrl_cli.jobs.logged_robot import RobotOptions
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
@@ -30,24 +31,19 @@ BASE = "the robot's base"
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateRequest:
+class CalibrateRequest(RobotOptions):
     """Calibrate the cameras of a recording, `paths` of which are several only where they are logs of one session.
 
     out: the TOML file (None: calibration.toml here). urdf: a robot whose joint states are recorded, from whose
-    surface the cameras are placed; its spheres, base, locked joints and packages as `replay` takes them. hold: the
-    camera that stays where it is recorded where there is no robot (None: the first). board: what places the cameras
-    to begin with, where the recorded poses are far off. allow_unobserved: write what
-    could be found where not all could.
+    surface the cameras are placed. hold: the camera that stays where it is recorded where there is no robot (None:
+    the first). board: what places the cameras to begin with, where the recorded poses are far off. allow_unobserved:
+    write what could be found where not all could.
     """
 
     paths: tuple[Path, ...]
     out: Path | None = None
     options: SourceOptions = field(default_factory=SourceOptions)
     urdf: Path | None = None
-    spheres: Path | None = None
-    packages: tuple[Path, ...] = ()
-    base: tuple[float, ...] | None = None
-    locked: Mapping[str, float] = field(default_factory=dict)
     hold: str | None = None
     board: Board | None = None
     allow_unobserved: bool = False

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import CARD_LEAST_WORK
 from splatctrl_cli.errors import DeviceFault, DeviceFull, UsageError
 from splatctrl_cli.jobs.progress import Progress
@@ -20,6 +21,16 @@ AUTO, CPU, CUDA = "auto", "cpu", "cuda"
 EXTRA = ("cuda.core", "cuda.bindings")
 TO_CPU = "give --device cpu"
 INSTALL = "pip install 'splatctrl-cli[cuda]'"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """How a job runs. force: replace the output; threads: 0 for one per core; device: as of --device."""
+
+    config: Config = field(default_factory=Config)
+    force: bool = False
+    threads: int = 0
+    device: str = "auto"
 
 
 @dataclass(frozen=True, kw_only=True)

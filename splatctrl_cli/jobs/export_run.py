@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +42,11 @@ def export_run(request: ExportRunRequest) -> ExportRunResult:
     parts = sorted(_parts(run, request.roots), key=lambda part: part[:2])
     name = request.path.absolute()
     out = request.out or name.with_name(f"{name.name}.mcap")
-    with output_path(out, force=request.force, is_folder=False) as partial:
-        with foxglove_log(partial) as log:
+    with output_path(out, force=request.force, is_folder=False) as written:
+        with foxglove_log(written) as log:
             for _, _, write in parts:
                 write(log)
-        return ExportRunResult(file=out, bytes=partial.stat().st_size, messages=dict(log.counts))
+        return ExportRunResult(file=out, bytes=written.stat().st_size, messages=dict(log.counts))
 
 
 def _parts(run: RunFolder, roots: tuple[Path, ...]) -> Iterator[Later]:
@@ -54,7 +55,7 @@ def _parts(run: RunFolder, roots: tuple[Path, ...]) -> Iterator[Later]:
             raise InputError(f"{run.path}: no steps.csv", remedy="replay again")
         yield from _replay_parts(run, run.states, roots)
     elif (run.path / "field.npz").is_file():
-        yield _field_part(run.parts.checked(run.path / "field.npz"), 0)
+        yield 0, 0, partial(_field, 0, run.parts.checked(run.path / "field.npz"))
     elif (run.path / "splats.ply").is_file():
         snapshots = open_scene(run.path).snapshots
         yield from _known_parts([(snapshot.stamp_ns, snapshot) for snapshot in snapshots])
@@ -69,7 +70,7 @@ def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> It
         known = sets_known(run, states, scene_of(run, roots))
         yield from _known_parts([(start + round(1e9 * time_s), snapshot) for time_s, snapshot in known])
     elif (place := run.place_of(grid, roots)) is not None:
-        yield _field_part(place / "field.npz" if place.is_dir() else place, start)
+        yield start, 0, partial(_field, start, place / "field.npz" if place.is_dir() else place)
     robot = robot_of(run, states, roots)
     for link, body in robot_bodies(robot).items():
         yield start, 1, _mesh(start, link, body.vertices, body.faces)
@@ -90,40 +91,28 @@ def _known_parts(known: Sequence[tuple[int, Snapshot]]) -> Iterator[Later]:
     """The splats of every snapshot from a stamp [ns] on, and of a few of them, evenly, what is known of space."""
     few = {known[i][0] for i in spread([1e-9 * (stamp - known[0][0]) for stamp, _ in known], math.inf)}
     for stamp, snapshot in known:
-        yield stamp, 0, _cloud(stamp, snapshot)
+        yield stamp, 0, partial(_cloud, stamp, snapshot)
         if stamp in few:
-            yield stamp, 0, _space(stamp, snapshot)
+            yield stamp, 0, partial(_space, stamp, snapshot)
 
 
-def _cloud(stamp: int, snapshot: Snapshot) -> Callable[[FoxgloveLog], None]:
-    def write(log: FoxgloveLog) -> None:
-        splats = snapshot.splats()
-        x, y, z = splats.centers.T
-        shades = np.rint(255 * np.clip(np.column_stack([splats.colors, splats.opacities]), 0.0, 1.0))
-        colors = dict(zip(("red", "green", "blue", "alpha"), shades.astype(np.uint8).T, strict=True))
-        log.add_cloud(
-            CLOUD, stamp, {"x": x, "y": y, "z": z, "radius": splats.radii, "label": splats.labels, **colors}
-        )
-
-    return write
+def _cloud(stamp: int, snapshot: Snapshot, log: FoxgloveLog) -> None:
+    splats = snapshot.splats()
+    x, y, z = splats.centers.T
+    shades = np.rint(255 * np.clip(np.column_stack([splats.colors, splats.opacities]), 0.0, 1.0))
+    colors = dict(zip(("red", "green", "blue", "alpha"), shades.astype(np.uint8).T, strict=True))
+    log.add_cloud(CLOUD, stamp, {"x": x, "y": y, "z": z, "radius": splats.radii, "label": splats.labels, **colors})
 
 
-def _space(stamp: int, snapshot: Snapshot) -> Callable[[FoxgloveLog], None]:
-    def write(log: FoxgloveLog) -> None:
-        grid = snapshot.occupancy()
-        if grid is not None:
-            values = grid.states(FREE_BELOW, OCCUPIED_ABOVE)
-            log.add_voxels(SPACE, stamp, "state", values, grid.origin, grid.voxel)
-
-    return write
+def _space(stamp: int, snapshot: Snapshot, log: FoxgloveLog) -> None:
+    grid = snapshot.occupancy()
+    if grid is not None:
+        log.add_voxels(SPACE, stamp, "state", grid.states(FREE_BELOW, OCCUPIED_ABOVE), grid.origin, grid.voxel)
 
 
-def _field_part(path: Path, stamp: int) -> Later:
-    def field(log: FoxgloveLog) -> None:
-        grid = read_npz(path)
-        log.add_voxels(DISTANCE, stamp, "distance", np.asarray(grid.channels["sdf"]), grid.origin, grid.voxel)
-
-    return stamp, 0, field
+def _field(stamp: int, path: Path, log: FoxgloveLog) -> None:
+    grid = read_npz(path)
+    log.add_voxels(DISTANCE, stamp, "distance", np.asarray(grid.channels["sdf"]), grid.origin, grid.voxel)
 
 
 def _mesh(stamp: int, link: str, vertices: Any, faces: Any) -> Callable[[FoxgloveLog], None]:

@@ -1,7 +1,8 @@
 """Recorded inputs into capture folders, and capture folders into one MCAP and back."""
 
+import functools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -108,7 +109,7 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
                 source,
                 topics=topics,
                 robot=robots[0].text if len(robots) == 1 else "",
-                progress=_counted(progress),
+                progress=functools.partial(_log_hundredth, progress),
                 identity=identity,
             )
         if summary.num_resumed:
@@ -132,7 +133,7 @@ def pack(request: PackRequest, progress: Progress = SILENT) -> PackResult:
         raise InputError(f"{source}: no such folder", remedy="expected what `splatctrl ingest` writes")
     out = request.out or Path(source.resolve().name.removesuffix(".capture") + ".mcap")
     with output_path(out, force=request.force, is_folder=False) as partial:
-        num_frames = pack_capture(source, partial, _counted(progress))
+        num_frames = pack_capture(source, partial, functools.partial(_log_hundredth, progress))
         return PackResult(out=out, num_frames=num_frames, bytes=partial.stat().st_size)
 
 
@@ -146,14 +147,9 @@ def unpack(request: PackRequest) -> PackResult:
         return PackResult(out=out, num_frames=unpack_capture(source, partial))
 
 
-def _counted(progress: Progress) -> Callable[[int], None]:
-    """Says every hundredth frame."""
-
-    def count(num_frames: int) -> None:
-        if num_frames % 100 == 0:
-            progress.log(f"{num_frames} frames")
-
-    return count
+def _log_hundredth(progress: Progress, num_frames: int) -> None:
+    if num_frames % 100 == 0:
+        progress.log(f"{num_frames} frames")
 
 
 def _identity(options: SourceOptions, inputs: Mapping[str, str]) -> dict[str, Any]:

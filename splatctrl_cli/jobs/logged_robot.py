@@ -1,6 +1,7 @@
 """Which robot a job works with: that of --urdf, else the one that the log describes itself."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from splatctrl_cli.errors import InputError
@@ -20,6 +21,20 @@ from splatctrl_cli.states.state_source import StateSource
 NO_SELF_MODEL = Path("none")  # as --self-model: neither learned nor taken from the scene
 LARGEST_SELF_MODEL = 2**30  # bytes
 TAKE = "leave --urdf out to take the log's own, or correct the file"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotOptions:
+    """How a robot's URDF is read.
+
+    spheres: that cover it, None for those of the URDF; packages: folders of its meshes; base: pose of its root in
+    world, x, y, z, qx, qy, qz, qw; locked: values [rad or m] of joints that no log moves.
+    """
+
+    spheres: Path | None = None
+    packages: tuple[Path, ...] = ()
+    base: tuple[float, ...] | None = None
+    locked: Mapping[str, float] = field(default_factory=dict)
 
 
 def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:

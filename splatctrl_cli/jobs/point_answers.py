@@ -1,13 +1,14 @@
 """What a baked field and a scene answer about points, a block at a time."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import MARCH_STEPS
-from splatctrl_cli.control.audit import observed_lookup
+from splatctrl_cli.control.audit import observed_at
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.field.clustered_splats import Spheres
 from splatctrl_cli.field.distance import SphereField, field_over, march
@@ -88,7 +89,7 @@ class SceneAnswers:
         self._observed = None
         if known is not None:
             states = known.states(limits.free_below, limits.occupied_above)
-            self._observed = observed_lookup(states, known.origin, known.voxel)
+            self._observed = partial(observed_at, states, known.origin, known.voxel)
         self._reach = float(np.abs(splats.centers - self._spheres.points.anchor).max())
 
     def at(self, points: Float64) -> Answers:
@@ -140,7 +141,7 @@ class GridAnswers:
                 raise InputError(
                     f"{where}: {name}: expected 0 to {most}, got {values.max()}", remedy="bake the field again"
                 )
-            self._cells[name] = observed_lookup(values, grid.origin, grid.voxel)
+            self._cells[name] = partial(observed_at, values, grid.origin, grid.voxel)
 
     def at(self, points: Float64) -> Answers:
         """What the grid holds at points (Q, 3) [m], world; nothing outside the box of the cell centres."""

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from dataclasses import field as made_by
 from io import TextIOWrapper
 from pathlib import Path
 from typing import TextIO
@@ -20,7 +19,7 @@ from splatctrl_cli.files.output import Parts, Stopwatch, output_path
 from splatctrl_cli.files.ply import point_blocks
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.bakes.request import BakeSource, read_bake_source, source_of_grid
-from splatctrl_cli.jobs.device import CUDA, TO_CPU, Device, chosen, named
+from splatctrl_cli.jobs.device import CUDA, TO_CPU, Device, RunOptions, chosen, named
 from splatctrl_cli.jobs.point_answers import TITLES, Answers, GridAnswers, SceneAnswers, rows_of
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
 from splatctrl_cli.kernels.cuda.memory import DeviceError
@@ -39,7 +38,7 @@ OF_GRID = {  # settings of the field by the name that a grid's header gives them
 
 
 @dataclass(frozen=True, kw_only=True)
-class QueryRequest:
+class QueryRequest(RunOptions):
     """One table of points to ask `source`, a field folder, a ``field.npz``, a scene folder or a file of splats.
 
     points: a CSV file with columns x, y, z [m], world, or an open text. out: the CSV of the answers, None for the
@@ -52,12 +51,8 @@ class QueryRequest:
     points: Path | TextIO
     out: Path | None = None
     scene: Path | None = None
-    config: Config = made_by(default_factory=Config)
     at: float | None = None
     labels: frozenset[Label] = DEFAULT_LABELS
-    force: bool = False
-    threads: int = 0
-    device: str = "auto"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,5 @@
 """The job of `robot learn`: it chooses frame sets in which the arm has moved, and fuses what they show of it."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from splatctrl_cli.files.arrays import savez
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.calibrate import depth_frame, frames_nearest, stamps_by_camera
+from splatctrl_cli.jobs.logged_robot import RobotOptions
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstructions.reconstruction import training_cameras
 from splatctrl_cli.logs.source_options import SourceOptions
@@ -26,19 +26,16 @@ MOST_MOMENTS = 2000  # of a recording, among which those are chosen that are rea
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnRequest:
-    """Learn the self-model of the robot `urdf` from `log` into the file `out`; spheres, packages, base and locked as
-    `replay` takes them. reach [m]: how far outside of a link's visual surface its parts are looked for.
+class LearnRequest(RobotOptions):
+    """Learn the self-model of the robot `urdf` from `log` into the file `out`.
+
+    reach [m]: how far outside of a link's visual surface its parts are looked for.
     """
 
     log: Path
     urdf: Path
     out: Path = Path("self.npz")
     options: SourceOptions = field(default_factory=SourceOptions)
-    spheres: Path | None = None
-    packages: tuple[Path, ...] = ()
-    base: tuple[float, ...] | None = None
-    locked: Mapping[str, float] = field(default_factory=dict)
     reach: float = REACH
     force: bool = False
 

@@ -97,8 +97,7 @@ def clearance_picture(
         )
         if bottom < 0:
             axes.axhline(0.0, color=KIND_COLORS["in-collision"], linewidth=1.0)
-        axes.set(ylabel="clearance [cm]")
-        axes.set_ylim(bottom=bottom)
+        axes.set(ylabel="clearance [cm]", ylim=(bottom, None))
         axes.set_title(title, pad=30)
         axes.legend(
             frameon=False, loc="lower left", bbox_to_anchor=(-0.01, 0.99), ncols=4, fontsize=10, borderaxespad=0.2
@@ -181,8 +180,8 @@ def open_loop_picture(
             peak = _curve(above, seconds, column(difference, j), color=color, width=1.5, style=style, label=joint)
             largest = max(largest, peak)
         above.set_title("Commanded less logged joint velocity; shaded: a row shapes the command", pad=10)
-        above.set_ylabel("difference [rad/s]")
-        above.set_ylim(-max(1.1 * largest, SMALLEST), max(1.1 * largest, SMALLEST))
+        most = max(1.1 * largest, SMALLEST)
+        above.set(ylabel="difference [rad/s]", ylim=(-most, most))
         above.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
         room = np.asarray(margin)
         low = envelope(seconds, room)

@@ -1,11 +1,12 @@
 """The audit of logged states against known distances."""
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import pytest
 
-from splatctrl_cli.control.audit import DistanceFunction, audit, observed_lookup
+from splatctrl_cli.control.audit import DistanceFunction, audit, observed_at
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import DistanceField, Float64, JointState
 from tests.control.fakes import Balls, PlanarArm, Plane, far_away
@@ -92,6 +93,6 @@ def test_states_that_cannot_be_audited_are_refused(states: list[JointState], wor
 
 def test_a_point_takes_the_word_of_its_nearest_voxel() -> None:
     seen = np.arange(8, dtype=np.uint8).reshape(2, 2, 2)
-    observed = observed_lookup(seen, np.array([1.0, 1, 1]), 0.1)
+    observed = partial(observed_at, seen, np.array([1.0, 1, 1]), 0.1)
     points = np.array([[1.0, 1, 1], [1.04, 1.06, 1.0], [1.1, 1.1, 1.149], [1.1, 1.1, 1.151], [0.9, 1, 1]])
     assert observed(points).tolist() == [0, 2, 7, 0, 0]

@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.barriers import can_bind
 from splatctrl_cli.control.fallbacks import Rung, assemble, assemble_hard, descend
-from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QuadraticProgram, residuals, solver_named
+from splatctrl_cli.control.qp import SOLVERS, ClarabelSolver, DaqpSolver, QuadraticProgram, residuals
 from splatctrl_cli.control.terms import Barrier, Cost, eliminated_weight, reach_cost, stray_cost
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Float64
@@ -147,7 +147,7 @@ def test_two_solvers_agree_on_random_steps() -> None:
 @pytest.mark.parametrize("name", ["clarabel", "daqp"])
 def test_a_program_without_a_point_is_not_solved(name: str) -> None:
     nowhere = QuadraticProgram(H=np.eye(2), c=np.zeros(2), G=np.array([[1.0, 0], [-1, 0]]), h=np.array([-1.0, -1.0]))
-    solution = solver_named(name).solve(nowhere)
+    solution = SOLVERS[name]().solve(nowhere)
     assert not solution.is_solved
     assert "nfeasible" in solution.status
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli import __version__
-from splatctrl_cli.config import Config, FieldConfig
+from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import CARD_LEAST_BAKE, CARD_SPLATS
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field.distance import KERNEL_OF
@@ -17,7 +17,7 @@ from splatctrl_cli.field.grid_cells import GridLayout, bounding_box, check_room
 from splatctrl_cli.field.obstacles import DEFAULT_LABELS, field_splats
 from splatctrl_cli.files.output import Parts, sha256
 from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.jobs.device import CUDA, TO_CPU, Device, chosen
+from splatctrl_cli.jobs.device import CUDA, TO_CPU, Device, RunOptions, chosen
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
@@ -29,7 +29,7 @@ NOT_COMPARED = ("voxel", "padding", "max_loss")  # voxel is compared with the gr
 
 
 @dataclass(frozen=True, kw_only=True)
-class BakeRequest:
+class BakeRequest(RunOptions):
     """One bake of `scene`, a folder that reconstruct wrote or a file of splats, into the folder `out`.
 
     at: the scene as known that long after its start [s], None for its end. labels: of the splats in the field. The
@@ -43,7 +43,6 @@ class BakeRequest:
 
     scene: Path
     out: Path
-    config: Config = field(default_factory=Config)
     at: float | None = None
     labels: frozenset[Label] = DEFAULT_LABELS
     box: Box | None = None
@@ -62,10 +61,7 @@ class BakeRequest:
     previous_scene: Path | None = None
     resume: bool = False
     require: tuple[str, ...] = ()
-    force: bool = False
     seed: int = 0
-    threads: int = 0
-    device: str = "auto"
 
     @property
     def label_names(self) -> list[str]:

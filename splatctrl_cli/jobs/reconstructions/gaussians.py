@@ -1,7 +1,7 @@
 """3D Gaussian splatting on views of a scene that stands still: the baseline beside `reconstruct`."""
 
+import functools
 import json
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -59,7 +59,7 @@ def reconstruct_gaussians(request: ReconstructRequest, progress: Progress = SILE
             fitter = GaussianFitter(config, workspace, frames, seed=request.seed, threads=request.threads)
             progress.log(f"{len(fitter.arrays)} Gaussians seeded, extent of the scene {fitter.extent:.3f} m")
             wait = Wait(progress, f"fits {len(frames)} views", "iterations", config.gaussians.iterations).announce()
-            fitter.fit(_audit(partial / "audit.jsonl", rows, wait))
+            fitter.fit(functools.partial(_audit, partial / "audit.jsonl", rows, wait))
             if len(rows) == 1:
                 progress.log(
                     f"warning: no Gaussian was added or removed: gaussians.iterations = {config.gaussians.iterations}"
@@ -114,18 +114,14 @@ def _frames(source: RecordSource) -> list[RgbdFrame]:
     return frames
 
 
-def _audit(path: Path, rows: list[GaussianAuditRow], wait: Wait) -> Callable[[GaussianAuditRow], None]:
-    """Keeps every row, writes it to `path`, and says how far it is."""
-
-    def audit(row: GaussianAuditRow) -> None:
-        rows.append(row)
-        with path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(asdict(row)) + "\n")
-        quality = "nothing of the workspace in view" if row.psnr is None else f"{row.psnr:.1f} dB"
-        full = f", {row.unmet} more had no room (gaussians.max_gaussians)" if row.unmet else ""
-        wait.at(row.iteration, f", {row.gaussians} Gaussians, {quality}{full}", is_told=True)
-
-    return audit
+def _audit(path: Path, rows: list[GaussianAuditRow], wait: Wait, row: GaussianAuditRow) -> None:
+    """Keep the row, write it to `path`, and say how far it is."""
+    rows.append(row)
+    with path.open("a", encoding="utf-8") as stream:
+        stream.write(json.dumps(asdict(row)) + "\n")
+    quality = "nothing of the workspace in view" if row.psnr is None else f"{row.psnr:.1f} dB"
+    full = f", {row.unmet} more had no room (gaussians.max_gaussians)" if row.unmet else ""
+    wait.at(row.iteration, f", {row.gaussians} Gaussians, {quality}{full}", is_told=True)
 
 
 def _views(frames: list[RgbdFrame]) -> dict[str, object]:

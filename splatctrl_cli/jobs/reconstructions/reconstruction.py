@@ -10,12 +10,12 @@ from typing import Any
 
 from tqdm import tqdm
 
-from splatctrl_cli.config import Config, SceneConfig
+from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.config.fixed import MOST_GROWTH, PLAUSIBLE_DEPTH
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.files.ply import read_points
-from splatctrl_cli.jobs.device import CPU, Device, FitDevice
+from splatctrl_cli.jobs.device import CPU, Device, FitDevice, RunOptions
 from splatctrl_cli.jobs.open_recording import CameraAgreement, guessed_unit
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
 from splatctrl_cli.jobs.reconstructions.correct_views import Corrections
@@ -55,7 +55,7 @@ def no_frame(source: RecordSource, cameras: Sequence[str]) -> InputError:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructRequest:
+class ReconstructRequest(RunOptions):
     """One reconstruction of `source` into the folder `out`.
 
     urdf, spheres: the robot, whose splats are told apart and whose reach is the workspace unless `box` is given;
@@ -68,7 +68,6 @@ class ReconstructRequest:
 
     source: RecordSource
     out: Path
-    config: Config = field(default_factory=Config)
     recording: Path | None = None
     urdf: Path | None = None
     spheres: Path | None = None
@@ -78,10 +77,8 @@ class ReconstructRequest:
     declare: Path | None = None
     allow_disagreement: bool = False
     corrections: Corrections = field(default_factory=Corrections)
-    force: bool = False
     resume: bool = False
     seed: int = 0
-    threads: int = 0
     device: str = CPU
     require: Sequence[str] = ()
     options: Mapping[str, object] = field(default_factory=dict)

@@ -4,7 +4,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import NEXT_SCENE_NS
-from splatctrl_cli.control.audit import BallDistance, DistanceFunction, Observed, observed_lookup
+from splatctrl_cli.control.audit import BallDistance, DistanceFunction, Observed, observed_at
 from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.control.scene_field import SceneStep, guarded
@@ -143,7 +143,7 @@ def from_grid(path: Path) -> KnownScene:
     grid = read_npz(Parts.beside(file).checked(file))
     barrier = GridField(grid)
     states = grid.channels.get("observed")
-    observed = None if states is None else observed_lookup(states.astype("uint8"), grid.origin, grid.voxel)
+    observed = None if states is None else partial(observed_at, states.astype("uint8"), grid.origin, grid.voxel)
     seen = None if observed is None else _seen_in_grid(observed, grid)
     fields = KnownFields(
         barrier=barrier,
@@ -234,7 +234,7 @@ def _seen_in_grid(observed: Observed, grid: DistanceGrid) -> Seen:
 def known_space(occupancy: OccupancyGrid) -> Observed:
     """What a camera saw or the robot was in, of an occupancy grid."""
     known = (occupancy.num_updates > 0) | ((occupancy.entity & SWEPT) > 0)
-    return observed_lookup(known.astype("uint8"), occupancy.origin, occupancy.voxel)
+    return partial(observed_at, known.astype("uint8"), occupancy.origin, occupancy.voxel)
 
 
 def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: Balls | None = None) -> KnownFields:

@@ -81,16 +81,18 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
     events = events_of(replay, kind, source)
     worst = min(events, key=lambda event: event.worst)
     states = sum(event.num_states for event in events)
-    reason = failed(
-        sentence=f"{worst.worst_name} is {mm(abs(least))} {'deep in the scene' if least < 0 else 'from the scene'}, "
-        f"margin {mm(replay.margin)}, {states} states in {counted(len(events), 'interval')}, worst",
-        value=least,
-        threshold=replay.margin,
-        unit="m",
-        count=judged.num_states,
-        label=CONTACT if least < 0 else MARGIN,
+    yield _at_worst(
+        worst,
+        failed(
+            sentence=f"{worst.worst_name} is {mm(abs(least))} {'deep in' if least < 0 else 'from'} the scene, "
+            f"margin {mm(replay.margin)}, {states} states in {counted(len(events), 'interval')}, worst",
+            value=least,
+            threshold=replay.margin,
+            unit="m",
+            count=judged.num_states,
+            label=CONTACT if least < 0 else MARGIN,
+        ),
     )
-    yield _at_worst(worst, reason)
 
 
 def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
@@ -102,16 +104,18 @@ def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
         yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
         return
     worst = min(events_of(replay, EventKind.BELOW_MARGIN, "exact"), key=lambda event: event.worst)
-    reason = lacking(
-        sentence=f"{worst.worst_name} is {mm(least)} from space that is occupied and has no splat (the splats are "
-        f"{mm(represented)} away), margin {mm(replay.margin)}",
-        value=least,
-        threshold=replay.margin,
-        unit="m",
-        remedy="the map is starved: raise --max-splats",
-        count=judged.num_states,
+    yield _at_worst(
+        worst,
+        lacking(
+            sentence=f"{worst.worst_name} is {mm(least)} from space that is occupied and has no splat (the splats "
+            f"are {mm(represented)} away), margin {mm(replay.margin)}",
+            value=least,
+            threshold=replay.margin,
+            unit="m",
+            remedy="the map is starved: raise --max-splats",
+            count=judged.num_states,
+        ),
     )
-    yield _at_worst(worst, reason)
 
 
 def _at_worst(event: Event, reason: Reason) -> Reason:
@@ -141,16 +145,18 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
         yield _beside_fixture(judged) or _brought_together(judged) or apart
         return
     worst = min(events, key=lambda event: event.worst)
-    reason = failed(
-        sentence=f"{worst.worst_name} are {mm(-worst.worst)} deep in each other",
-        value=worst.worst,
-        threshold=0.0,
-        unit="m",
-        remedy="pairs that may touch are named by --srdf",
-        count=judged.num_states,
-        label=CONTACT,
+    yield _at_worst(
+        worst,
+        failed(
+            sentence=f"{worst.worst_name} are {mm(-worst.worst)} deep in each other",
+            value=worst.worst,
+            threshold=0.0,
+            unit="m",
+            remedy="pairs that may touch are named by --srdf",
+            count=judged.num_states,
+            label=CONTACT,
+        ),
     )
-    yield _at_worst(worst, reason)
 
 
 def _beside_fixture(judged: Judged) -> Reason | None:
@@ -232,16 +238,18 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
         return
     if least < -tolerance:
         worst = min(events_of(judged.replay, EventKind.OUTSIDE_LIMITS), key=lambda event: event.worst)
-        reason = failed(
-            sentence=f"{worst.worst_name} is {-least:.4f} rad or m outside its limits",
-            value=least,
-            threshold=0.0,
-            unit="rad",
-            remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
-            count=judged.num_states,
-            label=LIMITS,
+        yield _at_worst(
+            worst,
+            failed(
+                sentence=f"{worst.worst_name} is {-least:.4f} rad or m outside its limits",
+                value=least,
+                threshold=0.0,
+                unit="rad",
+                remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
+                count=judged.num_states,
+                label=LIMITS,
+            ),
         )
-        yield _at_worst(worst, reason)
     else:
         yield held(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.num_states)
 
@@ -265,15 +273,17 @@ def _share_of_limit(judged: Judged, column: str, kind: EventKind) -> Iterator[Re
     most = float(np.max(values)) if len(values) else 0.0
     if most > LIMIT_EXCEEDED:
         worst = max(events_of(judged.replay, kind), key=lambda event: event.worst)
-        reason = failed(
-            sentence=f"{worst.worst_name} reaches {most:.2f} times its limit",
-            value=most,
-            threshold=1.0,
-            remedy="check the stamps and units of the states, and the URDF's limits",
-            count=judged.num_states,
-            label=LIMITS,
+        yield _at_worst(
+            worst,
+            failed(
+                sentence=f"{worst.worst_name} reaches {most:.2f} times its limit",
+                value=most,
+                threshold=1.0,
+                remedy="check the stamps and units of the states, and the URDF's limits",
+                count=judged.num_states,
+                label=LIMITS,
+            ),
         )
-        yield _at_worst(worst, reason)
     elif len(judged.replay.model.joint_names) and (kind is EventKind.TOO_FAST or most > 0):
         yield held(f"at most {most:.2f} of the limit", most, 1.0, "", judged.num_states)
 

@@ -1,14 +1,14 @@
 """What a replay is asked for, and what it reads of it."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import field as made_by
 from pathlib import Path
 
-from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.outside import STEP_LIMIT
+from splatctrl_cli.jobs.device import RunOptions
+from splatctrl_cli.jobs.logged_robot import RobotOptions
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.jobs.replays.provenance import Mismatch
 from splatctrl_cli.logs.source_options import SourceOptions
@@ -25,37 +25,29 @@ JUDGE, OCCUPIED = "judge", "occupied"  # space that no camera saw free: judged b
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayRequest:
+class ReplayRequest(RobotOptions, RunOptions):
     """One replay: the options of ``splatctrl replay``, by their names.
 
     log: a log or capture with joint states, read as `options` say. urdf: the robot, None for the one that the log
     describes itself. One of `scene` (a reconstruction), `field` (a baked grid) and `lockstep` (reconstruct the log on
-    the way, on `device`) says what is known of the scene. base: pose of the URDF's root in world, x, y, z, qx, qy,
-    qz, qw; locked: values [rad or m] of joints that no log moves. Times in
-    seconds; start_time may be FIRST_MAP. evidence: a camera, or every how many frame sets, that did not train the
-    scene and bounds its error; with require_evidence no verdict passes without, with require_proof none where space
-    about the arm was assumed to be free; unseen: `JUDGE` or `OCCUPIED`. controller: a user's own class,
-    ``module:Class``, or controller_command: a program (docs/controllers.md). report_only: the verdict alone does
-    not set the exit code.
+    the way, on `device`) says what is known of the scene. Times in seconds; start_time may be FIRST_MAP. evidence: a
+    camera, or every how many frame sets, that did not train the scene and bounds its error; with require_evidence no
+    verdict passes without, with require_proof none where space about the arm was assumed to be free; unseen: `JUDGE`
+    or `OCCUPIED`. controller: a user's own class, ``module:Class``, or controller_command: a program
+    (docs/controllers.md). report_only: the verdict alone does not set the exit code.
     """
 
     log: Path
     out: Path
     urdf: Path | None = None
-    config: Config = made_by(default_factory=Config)
     options: SourceOptions = made_by(default_factory=SourceOptions)
     scene: Path | None = None
     field: Path | None = None
     lockstep: bool = False
-    device: str = "auto"
     latency: float = 0.0
     allow_disagreement: bool = False
     max_pose_jump: float = POSE_JUMP
-    spheres: Path | None = None
     self_model: Path | None = None
-    base: tuple[float, ...] | None = None
-    locked: Mapping[str, float] = made_by(default_factory=dict)
-    packages: tuple[Path, ...] = ()
     srdf: Path | None = None
     mode: str = "audit"
     frame: str | None = None
@@ -88,9 +80,7 @@ class ReplayRequest:
     declare: Path | None = None
     require: tuple[str, ...] = ()
     report_only: bool = False
-    force: bool = False
     seed: int = 0
-    threads: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.scores.score import ScoreRequest, score
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
-from splatctrl_cli.jobs.studies.problems import ProblemRequest, named
+from splatctrl_cli.jobs.studies.problems import FittedRow, ProblemRequest, named
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.simulate.recording import RecordingOptions
 
@@ -63,18 +63,13 @@ TOLERATED = 0.005  # [m] below the margin that is no false green
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measured:
+class Measured(FittedRow):
     """A recording without a mechanism; what does not apply is None. psnr [dB], depth [m], in_front: of held-out
     pixels that a training view saw; fit_s [s]. audit, loop: labels of the verdicts by the map alone, on the recorded
     motion and on that which the controller drives; with the least clearance [m] of each, true_clearance and
     loop_clearance. margin [m].
     """
 
-    environment: str
-    number: int
-    method: str
-    error: str = ""
-    psnr: float | None = None
     depth: float | None = None
     in_front: float | None = None
     splats: int | None = None

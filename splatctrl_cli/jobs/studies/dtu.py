@@ -19,7 +19,7 @@ from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.scores import fit
 from splatctrl_cli.jobs.scores.score import ScoreRequest, score
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
-from splatctrl_cli.jobs.studies.problems import ProblemRequest, named
+from splatctrl_cli.jobs.studies.problems import FittedRow, ProblemRequest, named
 from splatctrl_cli.simulate.recording import RecordingOptions
 
 GIVEN, SIMULATED = "dtu", "simulated"  # scans of a tree, and the scan that `simulate` makes, fitted by several seeds
@@ -33,16 +33,11 @@ NAMES = {**{name: f"ours, {count:,} splats" for name, count in BUDGETS.items()},
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit:
+class Fit(FittedRow):
     """A method on a scan: held-out views by the protocol's figure (over the mask where there is one), psnr [dB], and
     over seen pixels; depth [m], the median error there; None where it has no value.
     """
 
-    environment: str
-    number: int
-    method: str
-    error: str = ""
-    psnr: float | None = None
     psnr_seen: float | None = None
     ssim: float | None = None
     depth: float | None = None

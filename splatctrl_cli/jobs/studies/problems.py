@@ -66,6 +66,17 @@ class ProblemRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FittedRow:
+    """Which problem and method a row of a study of fits is of, why it failed, and its held-out views' psnr [dB]."""
+
+    environment: str
+    number: int
+    method: str
+    error: str = ""
+    psnr: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Problem:
     """From a posture to another (J,) [rad] among things, world frame; number: the seed of a drawn one."""
 

@@ -6,6 +6,7 @@ then its place is empty, and the cube is part of the arm. T states, J joints.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -37,9 +38,9 @@ from splatctrl_cli.simulate.primitives import Primitive
 QP_IK, BIRRT, QP_IK_ALONE = "qp-ik", "birrt", "qp-ik-alone"
 DETOURS = 3
 DRIVES: Mapping[str, Drive] = {
-    QP_IK: by_controller(DETOURS),
+    QP_IK: partial(by_controller, DETOURS),
     BIRRT: by_planner,
-    QP_IK_ALONE: by_controller(0),
+    QP_IK_ALONE: partial(by_controller, 0),
 }
 METHODS = tuple(DRIVES)
 RUNS = 2  # of each method in each scene, with other noise, errors of the cameras' poses, and samples of the planner

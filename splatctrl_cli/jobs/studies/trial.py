@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -301,20 +301,16 @@ def _planned(rig: Rig, scene: HasDistance, config: Config, *, approach: float = 
     return Attempt(position=position, outcome=plan.outcome, margin=plan.margin)
 
 
-def by_controller(num_detours: int) -> Drive:
+def by_controller(num_detours: int, rig: Rig, known: Map) -> Attempt:
     """QP-IK from the start to the goal, with so many ways out that are planned where it stalls."""
-
-    def drive(rig: Rig, known: Map) -> Attempt:
-        config, model, task = rig.config, rig.problem.model, rig.task
-        control = replace(config.control, max_detours=num_detours, solver="daqp")
-        assert known.barrier is not None
-        barrier = known.barrier()
-        detour = _way_out(rig, known) if num_detours else None
-        trace = closed_loop(model, control, task, lambda stamp: barrier, plan_detour=detour)
-        cause = "" if trace.outcome is Outcome.GOAL_REACHED else judge.STALLED
-        return Attempt(position=np.asarray(trace.position), cause=cause, outcome=trace.outcome, margin=control.margin)
-
-    return drive
+    config, model, task = rig.config, rig.problem.model, rig.task
+    control = replace(config.control, max_detours=num_detours, solver="daqp")
+    assert known.barrier is not None
+    barrier = known.barrier()
+    detour = _way_out(rig, known) if num_detours else None
+    trace = closed_loop(model, control, task, lambda stamp: barrier, plan_detour=detour)
+    cause = "" if trace.outcome is Outcome.GOAL_REACHED else judge.STALLED
+    return Attempt(position=np.asarray(trace.position), cause=cause, outcome=trace.outcome, margin=control.margin)
 
 
 def _way_out(rig: Rig, known: Map) -> PlanDetour:
@@ -347,8 +343,8 @@ MAKERS: Mapping[str, tuple[Callable[[Rig], Map], Drive]] = {  # how a method's m
     OURS: (lambda rig: rig.splats, by_planner),
     TSDF: (lambda rig: tsdf_map(rig.problem, rig.views, rig.config), by_planner),
     TRUTH: (lambda rig: Map(scene=rig.problem.solids), by_planner),
-    QP_IK: (lambda rig: rig.splats, by_controller(0)),
-    QP_IK_DETOURS: (lambda rig: rig.splats, by_controller(DETOURS)),
+    QP_IK: (lambda rig: rig.splats, partial(by_controller, 0)),
+    QP_IK_DETOURS: (lambda rig: rig.splats, partial(by_controller, DETOURS)),
     PAPER: (_printed, as_printed),
     GAUSSIANS: (lambda rig: gaussian_map(rig.problem, rig.views, rig.config, rig.threads), by_planner),
     OCCUPANCY: (lambda rig: occupancy_map(rig.fitted, rig.config, rig.threads), by_planner),
