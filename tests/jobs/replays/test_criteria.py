@@ -56,6 +56,7 @@ def judged(**replay: Any) -> Any:
         inputs=SimpleNamespace(source=SimpleNamespace(loss=SimpleNamespace(conflicting_states=0), has_clock=True)),
         metrics={"unknown_share": 0.0, "num_scene_hits": 0},
         num_states=NUM,
+        past_end_s=0.0,
     )
 
 
