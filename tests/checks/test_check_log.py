@@ -257,7 +257,7 @@ FAULTS = [
     Fault(code="joints-velocity", change=edited(JOINTS, _no_velocity)),
     Fault(code="joints-still", severity=NOTE, change=edited(JOINTS, _still), where=JOINTS, beside=True),
     Fault(code="damaged", change=edited(JOINTS, _with(position=np.zeros(0))), value=30,
-          what="a JointState with 2 names, 0 positions and 2 velocities (30 times)"),
+          what="a JointState with 2 names and 0 positions (30 times)"),
     Fault(code="missing", severity=ERROR, recipe=LogRecipe(has_depth=False),
           what="no depth topic; colour topics there: " + COLOR, remedy=NO_DEPTH),
 ]  # fmt: skip

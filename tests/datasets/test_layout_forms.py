@@ -357,7 +357,7 @@ def test_a_stamp_that_is_no_time_is_none(text: str) -> None:
     assert stamp_of_text(text) is None
 
 
-@pytest.mark.parametrize("word", ["nan", "inf", "1e200"])
+@pytest.mark.parametrize("word", ["inf", "1e200"])
 def test_a_pose_of_tum_that_is_none_is_named_by_its_line(tmp_path: Path, word: str) -> None:
     folder = make_tum(tmp_path / "fr3_x")
     lines = (folder / "groundtruth.txt").read_text().splitlines()
