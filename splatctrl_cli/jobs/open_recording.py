@@ -4,7 +4,6 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
-from typing import cast
 
 from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.checks.check_views import are_far, check_views, rescaled
@@ -22,6 +21,7 @@ from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements, largest_jump
 from splatctrl_cli.scene.time_steps import TimeStep
+from splatctrl_cli.sources.calibrated import LOGGED
 from splatctrl_cli.sources.source import open_source
 
 
@@ -202,9 +202,9 @@ class CameraAgreement:
                 console.log(f"warning: {self._name}: {finding.what}")
 
     def _units(self) -> set[float | None]:
-        """Metres per count of depth, of each camera; those of a DTU scan are floats."""
+        """Metres per count of depth, of each camera; None for sources that do not tell."""
         units = dict[str, float | None]()
-        for frame in () if isinstance(self._source, DtuSource) else cast(FrameSource, self._source).stored():
+        for frame in self._source.stored() if isinstance(self._source, LOGGED | ImageFolderSource) else ():
             if isinstance(frame, StoredFrame):
                 units.setdefault(frame.camera, frame.depth_unit)
             if len(units) == len(self._source.cameras):

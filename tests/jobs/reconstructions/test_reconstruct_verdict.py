@@ -10,10 +10,10 @@ import pytest
 from splatctrl_cli.config import Config, OccupancyConfig
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
-from splatctrl_cli.jobs.open_recording import CameraAgreement
+from splatctrl_cli.jobs.open_recording import CameraAgreement, RecordingRequest, open_to_train
 from splatctrl_cli.jobs.progress import SILENT
 from splatctrl_cli.jobs.reconstructions.verdict import GATED, Reconstructed, longest_blind, reconstruct_verdict
-from splatctrl_cli.records import LossReport, RgbdFrame
+from splatctrl_cli.records import LossReport, RecordSource, RgbdFrame
 from splatctrl_cli.scene.time_steps import AuditRow, TimeStep
 from tests.calibration.scan import views_of
 
@@ -167,22 +167,28 @@ def views(sample_data: Path) -> list[RgbdFrame]:
     return views_of(sample_data)
 
 
-def check(views: list[RgbdFrame], factor: float, *, is_allowed: bool = False, is_still: bool = True) -> None:
+@pytest.fixture(scope="module")
+def scan(sample_data: Path) -> RecordSource:
+    """What the views are of."""
+    return open_to_train(RecordingRequest(path=sample_data / "dtu", is_dtu=True))
+
+
+def check(scan: RecordSource, views: list[RgbdFrame], factor: float, *, is_allowed: bool = False) -> None:
     scaled = tuple(replace(view, depth=view.depth * np.float32(factor)) for view in views)
-    made = CameraAgreement("scene", is_allowed=is_allowed, is_still=is_still)
+    made = CameraAgreement(scan, is_allowed=is_allowed, is_still=True)
     made.check(TimeStep(frames=scaled, position=None), OccupancyConfig(max_range=100.0), SILENT)
 
 
-def test_views_at_their_own_scale_pass(views: list[RgbdFrame]) -> None:
-    check(views, 1.0)
+def test_views_at_their_own_scale_pass(scan: RecordSource, views: list[RgbdFrame]) -> None:
+    check(scan, views, 1.0)
 
 
 @pytest.mark.parametrize("factor", [10.0, 0.1])
 def test_depths_ten_times_too_far_or_near_are_refused_with_the_option_to_give(
-    views: list[RgbdFrame], factor: float
+    scan: RecordSource, views: list[RgbdFrame], factor: float
 ) -> None:
     with pytest.raises(InputError) as refused:
-        check(views, factor)
+        check(scan, views, factor)
     assert "--depth-scale" in (refused.value.remedy or "")
     assert "--allow-disagreement" in (refused.value.remedy or "")
-    check(views, factor, is_allowed=True)
+    check(scan, views, factor, is_allowed=True)
