@@ -89,8 +89,7 @@ def _view(
     """A frame; its own values stand before those of the file."""
     name, said = str(entry["file_path"]), {**content, **entry}
     color = _image(path.parent / _of_any_system(name))
-    depth = next((str(entry[key]) for key in _DEPTHS if entry.get(key)), None)
-    scale = next((said[key] for key in _SCALES if key in said), None)
+    depth, scale = _only(entry, _DEPTHS, path), _only(said, _SCALES, path)
     mask = entry.get("mask_path")
     try:
         applied = float(content.get("applied_scale", 1.0))
@@ -102,12 +101,21 @@ def _view(
     return ListedView(
         name=name,
         color=color,
-        depth=None if depth is None else path.parent / _of_any_system(depth),
+        depth=None if depth is None else path.parent / _of_any_system(str(depth)),
         matrix=matrix,
         camera=description.camera or lenses.named(_camera(said, color, path), str(path)),
         depth_scale=unit,
         valid=None if not mask else path.parent / _of_any_system(str(mask)),
     )
+
+
+def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
+    """The value under one of the keys, None without any. Raises InputError where two of them differ."""
+    found = {key: said[key] for key in keys if said.get(key)}
+    if len(set(found.values())) > 1:
+        both = " and ".join(f"{key} = {value}" for key, value in found.items())
+        raise InputError(f"{path}: {both} differ", remedy="leave one of them out")
+    return next(iter(found.values()), None)
 
 
 def _of_any_system(name: str) -> str:

@@ -250,6 +250,11 @@ CASES: tuple[Case, ...] = (
         examine=folder_refused("camera_model is OPENCV", "is_fisheye is True"),
     ),
     Case(
+        name="two-units-of-depth-in-transforms",
+        make=write_transforms(depth_unit_scale_factor=0.001, integer_depth_scale=0.0002),
+        examine=folder_refused("depth_unit_scale_factor = 0.001 and integer_depth_scale = 0.0002 differ"),
+    ),
+    Case(
         name="a-pinhole-with-coefficients", make=write_transforms(camera_model="PINHOLE", k1=-0.2),
         examine=folder_refused("camera_model PINHOLE", "k1"),
     ),
