@@ -92,7 +92,7 @@ def test_a_path_that_leaves_known_space_is_not_evaluated(desk: Desk, capsys: pyt
     field = write_field(desk.folder / "field", BALL, seen=seen, voxel=0.04, unknown="nan")
     known = ("--field", str(field), "-q", "--max-unknown", "1")
     assert desk.replay(*known, is_judged=True) == 5
-    assert "the path leaves known space: at 11 of 11 states a sphere is" in capsys.readouterr().err
+    assert "the path leaves known space: at 11 of 11 states a sphere is" in capsys.readouterr().out
     assert desk.metrics()["num_without_distance"] == 11
     assert {row["clearance_barrier"] for row in desk.rows()} == {""}
     assert desk.replay(*known, "--mode", "closed-loop", out="driven") == 5
@@ -102,7 +102,7 @@ def test_a_path_that_leaves_known_space_is_not_evaluated(desk: Desk, capsys: pyt
 def test_unknown_space_is_said_after_the_outputs_are_written(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)), is_seen=False)
     assert desk.replay("--scene", str(scene), "-q", is_judged=True) == 5
-    said = capsys.readouterr().err
+    said = capsys.readouterr().out
     assert "100 % of the space within the margin of the arm was never seen by a camera" in said
     verdict = json.loads((desk.folder / "out" / "summary.json").read_text())["verdict"]
     reasons = [reason["sentence"] for reason in verdict["reasons"]]

@@ -111,7 +111,7 @@ def test_joints_in_degrees_are_refused_in_one_line(
 ) -> None:
     assert replayed(desk, scene, write_mcap(desk.folder / "x.mcap", states_of(np.degrees(moving()), JOINTS))) == 4
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "would fit as degrees; convert them" in line
+    assert "would fit as degrees; record radians (REP 103)" in line
 
 
 def test_a_posture_outside_the_limits_is_an_event_with_its_joint(desk: Desk, scene: str) -> None:
