@@ -81,7 +81,7 @@ def calibration_findings(found: Survey, cameras: Sequence[CameraTopics], changed
 
 
 def _distortion(name: str, calibration: Calibration, topic: str, lens: ImageLens) -> list[Finding]:
-    """What is done about the distortion of a topic's images."""
+    """Say how `ingest` treats the distortion of a topic's images."""
     d, model = calibration.distortion, lens_model(calibration.distortion_model)
     if not is_distorted(model, d):
         return []

@@ -70,8 +70,9 @@ class Evidence:
 def judged(
     evidence: Evidence, found: Sequence[Finding], model: RobotModel | None, *, only_errors: bool = False
 ) -> CheckReport:
-    """With what was found on the way, and what the frames and states say of each other; `only_errors`: what can stop
-    a command, which is a fifth of the work.
+    """Add to the findings what frames and states say of each other.
+
+    only_errors: leave out checks that give notes and warnings alone, four fifths of the work.
     """
     findings = [*found, *alignment_findings(evidence.frames)]
     frames, is_still = usable_frames(evidence.frames, findings), evidence.start_ns is None

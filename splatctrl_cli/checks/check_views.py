@@ -64,7 +64,8 @@ def check_views(
     is_sure: bool = True,
     only_errors: bool = False,
 ) -> ViewsCheck:
-    """Compare views from different places, of one moment or a still scene; `only_errors` leaves poses to others.
+    """Compare views from different places, of one moment or a still scene; `only_errors` skips wrong poses, which are
+    warnings.
 
     used: metres per count of each camera's depth, None where it is stored as floats. is_sure: False where something
     speaks for another unit: then views must meet.

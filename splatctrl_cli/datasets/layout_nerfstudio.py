@@ -88,7 +88,7 @@ def _view(
 ) -> ListedView:
     """A frame; its own values stand before those of the file."""
     name, said = str(entry["file_path"]), {**content, **entry}
-    color = _image(path.parent / _of_any_system(name))
+    color = _image(path.parent / _with_slashes(name))
     depth, scale = _only(entry, _DEPTHS, path), _only(said, _SCALES, path)
     mask = entry.get("mask_path")
     try:
@@ -101,11 +101,11 @@ def _view(
     return ListedView(
         name=name,
         color=color,
-        depth=None if depth is None else path.parent / _of_any_system(str(depth)),
+        depth=None if depth is None else path.parent / _with_slashes(str(depth)),
         matrix=matrix,
         camera=description.camera or lenses.named(_camera(said, color, path), str(path)),
         depth_scale=unit,
-        valid=None if not mask else path.parent / _of_any_system(str(mask)),
+        valid=None if not mask else path.parent / _with_slashes(str(mask)),
     )
 
 
@@ -118,8 +118,8 @@ def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
     return next(iter(found.values()), None)
 
 
-def _of_any_system(name: str) -> str:
-    """A path as Windows may have written it."""
+def _with_slashes(name: str) -> str:
+    """The path with slashes, where Windows wrote backslashes."""
     return name.replace("\\", "/")
 
 

@@ -71,8 +71,8 @@ def check(request: CheckRequest) -> CheckResult:
 
 
 def refuse_errors(path: Path, options: SourceOptions, command: str, allowed: Collection[str] = ()) -> None:
-    """Raise InputError where `check` finds an error that keeps this command from a recording; `allowed`: codes of
-    errors that somebody takes upon himself.
+    """Raise InputError where `check` finds an error that stops this command; `allowed`: codes of errors that the user
+    accepts.
     """
     report = _report(CheckRequest(paths=(path,), options=options), None, only_errors=True)
     errors = [f for f in report.refusing(Need(command=command, lacks=())) if f.code not in allowed]

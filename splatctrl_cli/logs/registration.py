@@ -220,11 +220,11 @@ _SAME_MODELS = {  # lower case, letters and digits alone: what others call them
     **dict.fromkeys(("kannalabrandt", "kannalabrandt4"), "equidistant"),
 }
 _PINHOLES = ("", "none", "pinhole", "perspective", "rectilinear", "inversebrownconrady", "modifiedbrownconrady")
-"""Further models that bend nothing where all coefficients are zero."""
+"""Further models that are pinholes where all coefficients are zero."""
 
 
 def lens_model(name: str) -> str:
-    """Which of `DISTORTION_MODELS` a driver's name stands for; the name itself where it is none of them."""
+    """Translate a driver's name into one of `DISTORTION_MODELS`; other names come back unchanged."""
     return _SAME_MODELS.get(_letters(name), name)
 
 
@@ -367,7 +367,7 @@ def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
 
 
 def undistortion_of(lens: Intrinsics, model: str, coefficients: Float64) -> Undistortion | None:
-    """What removes a lens's distortion, None for a pinhole. Raises InputError for a lens that cannot be.
+    """Build what removes a lens's distortion, None for a pinhole. Raises InputError for an impossible lens.
 
     The result has the lens's focal lengths. Of an equidistant lens they are shortened, so that the result shows what
     lies on the image's axes, but nothing beyond `WIDEST_RAY`: that would leave the middle few pixels.

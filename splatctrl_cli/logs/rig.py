@@ -170,11 +170,11 @@ class ImageLens(StrEnum):
 
 
 def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> ImageLens:
-    """Which of the two decides where a name says rectified and a CameraInfo has a distortion.
+    """Decide whether images are rectified, where their topic's name says so and their CameraInfo has a distortion.
 
     A CameraInfo may describe the rectified images beside the raw ones (image_proc): by a P that is not K, or a topic
     of raw images in the same folder. RealSense's ``image_rect_raw`` is as the lens sees it. Depth is computed in
-    rectified images. Nothing else tells.
+    rectified images. Otherwise the two contradict each other.
     """
     says_rectified = not _RECTIFIED.isdisjoint(re.split("[/_]", image_topic.lower()))
     if not is_distorted(calibration.distortion_model, calibration.distortion):

@@ -207,7 +207,7 @@ def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | 
 
 
 def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
-    """How far apart [rad or m] two streams have their shared joints at the same times (median); 0 if never both."""
+    """Median distance [rad or m] of two streams' shared joints at the same times; 0 where they do not overlap."""
     stamps, its = base.states.stamp_ns, other.states.stamp_ns
     at, at_other = np.argsort(stamps, kind="stable"), np.argsort(its, kind="stable")
     its = its[at_other]
@@ -223,7 +223,7 @@ def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
 
 
 def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
-    """States that jump away from both neighbours, which are near each other, faster than any joint can turn back."""
+    """Count states that lie far from both neighbours, which are close together: no joint turns back so fast."""
     position = stream.states.columns().get("position")
     columns = [stream.names.index(name) for name in names]
     if position is None or not columns:
@@ -241,7 +241,7 @@ def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
 
 
 def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
-    """Streams whose unknown joints are under the names of `wanted` that are missing, if only a prefix differs."""
+    """Rename a stream's unknown joints to the robot's missing ones, where only a prefix differs."""
     found = dict.fromkeys(name for stream in streams for name in stream.names)
     unknown, missing = [n for n in found if n not in wanted], [name for name in wanted if name not in found]
     names = with_prefix(unknown, missing)
@@ -253,7 +253,7 @@ def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) ->
 
 
 def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
-    """Names of a log -> those of a robot that a prefix on one side keeps apart; empty unless one prefix fits best."""
+    """Map a log's joint names to the robot's by a prefix that either has; empty unless one prefix fits best."""
     by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
     for name in dict.fromkeys(found):
         for meant in wanted:

@@ -185,7 +185,7 @@ def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
 
 
 def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
-    """States in order whose positions run on where a joint was counted from the other end (pi to -pi, 2 pi to 0)."""
+    """Remove steps of a whole turn between states, as from pi to -pi. The states are in time order."""
     position, file = raw.position, RowFile(raw.position.shape[1:])
     turns: Float64 = np.zeros(position.shape[1])
     is_close = np.diff(raw.stamp_ns) * 1e-9 <= fixed.STATES_BRIDGED

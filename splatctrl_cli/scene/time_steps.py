@@ -35,11 +35,10 @@ class TimeStep:
             frame.stamp_ns: self.position + 1e-9 * (frame.stamp_ns - last_ns) * self.velocity for frame in self.frames
         }
 
-    def within(self, farthest: float) -> "TimeStep":
-        """The same step without depth beyond `farthest` [m]; with 0, as colour cameras would have seen it."""
-        depths = (np.where(frame.depth > farthest, np.float32(0.0), frame.depth) for frame in self.frames)
-        frames = (replace(frame, depth=depth) for frame, depth in zip(self.frames, depths, strict=True))
-        return replace(self, frames=tuple(frames))
+    def without_depth(self) -> "TimeStep":
+        """The same step as colour cameras would have seen it."""
+        frames = tuple(replace(frame, depth=np.zeros_like(frame.depth)) for frame in self.frames)
+        return replace(self, frames=frames)
 
     @property
     def stamp_ns(self) -> int:

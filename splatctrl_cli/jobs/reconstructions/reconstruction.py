@@ -11,7 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.config.fixed import MOST_GROWTH, PLAUSIBLE_DEPTH
+from splatctrl_cli.config.fixed import MOST_GROWTH
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.files.ply import read_points
@@ -174,8 +174,6 @@ class Reconstruction:
         the workspace is.
         """
         index, self.num_read = self.num_read, self.num_read + 1
-        if self.robot is not None:  # no camera of a robot measures farther: such depth is a driver's word for none
-            step = step.within(max(PLAUSIBLE_DEPTH[1], self.config.occupancy.max_range))
         if self.fitter is None and not step.has_depth and self._needs_depth():
             console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
             self._early = self._early or step
@@ -353,7 +351,7 @@ class Reconstruction:
         """Those of the source, from its beginning."""
         records, has_clock = self.source.records(), self.source.has_clock
         steps = time_steps(records, self.cameras, has_clock=has_clock, observe=self._see, repeats=self.repeats)
-        return steps if self.cloud is None else (step.within(0.0) for step in steps)
+        return steps if self.cloud is None else (step.without_depth() for step in steps)
 
     def _see(self, record: Record) -> None:
         if isinstance(record, RgbdFrame):
