@@ -261,19 +261,17 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
         if (its := [frame for frame in frames if frame.camera == camera and frame.color.any()])
     }
     found: list[Finding] = []
+    others: dict[str, tuple[str, float, float]] = {}
     for camera, spectra in edges.items():
         surface = np.mean([_correlation(color, depth) for color, depth in spectra], axis=0)
-        where = f"camera {camera}"
         dv, du, peak, runner_up = _peak(surface)
         width = surface.shape[1]
         if max(peak, 0.0) >= limits.EDGE_CLEAR and peak >= limits.EDGE_AHEAD * runner_up:
-            if max(abs(du), abs(dv)) > limits.EDGE_SHIFT * width:
-                found.append(_shifted(where, du, dv, width, peak))
-            continue
-        other = _other(camera, edges, _at_zero(surface))
-        if other is not None:
-            found.append(_exchanged(where, *other))
-    return found
+            if max(abs(du), abs(dv)) > max(limits.EDGE_SHIFT * width, limits.EDGE_AROUND):
+                found.append(_shifted(f"camera {camera}", du, dv, width, peak))
+        elif (other := _other(camera, edges, _at_zero(surface))) is not None:
+            others[camera] = other
+    return found + [_exchanged(camera, other, is_mutual=other[0] in others) for camera, other in others.items()]
 
 
 def _shifted(where: str, du: int, dv: int, width: int, peak: float) -> Finding:
@@ -284,11 +282,13 @@ def _shifted(where: str, du: int, dv: int, width: int, peak: float) -> Finding:
     return error("alignment", where, text, remedy, value=max(abs(du), abs(dv)), unit="px")
 
 
-def _exchanged(where: str, other: str, own: float, peak: float) -> Finding:
-    text = (
-        f"its colour edges meet the depth edges of camera {other} (correlation {peak:.2f}), not its own ({own:.2f})"
-    )
-    return error("alignment", where, text, "exchange the depth topics, with --camera NAME=COLOR,DEPTH", value=own)
+def _exchanged(camera: str, other: tuple[str, float, float], *, is_mutual: bool) -> Finding:
+    """An error only where the other camera's colour fits a foreign depth as well: an exchange has two sides."""
+    name, own, peak = other
+    text = f"its colour edges meet the depth edges of camera {name} (correlation {peak:.2f}), not its own ({own:.2f})"
+    severity = error if is_mutual else warning
+    remedy = "exchange the depth topics, with --camera NAME=COLOR,DEPTH"
+    return severity("alignment", f"camera {camera}", text, remedy, value=own)
 
 
 def _other(

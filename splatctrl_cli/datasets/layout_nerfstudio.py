@@ -111,7 +111,7 @@ def _view(
 
 def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
     """The value under one of the keys, None without any. Raises InputError where two of them differ."""
-    found = {key: said[key] for key in keys if said.get(key)}
+    found = {key: said[key] for key in keys if said.get(key) not in (None, "")}
     if len(set(found.values())) > 1:
         both = " and ".join(f"{key} = {value}" for key, value in found.items())
         raise InputError(f"{path}: {both} differ", remedy="leave one of them out")

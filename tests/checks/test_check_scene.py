@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -165,6 +166,30 @@ def test_depth_of_another_camera_is_named(table: Table) -> None:
     found = alignment_findings(frames)
     assert [finding.where for finding in found] == ["camera cam0", "camera cam1"]
     assert "meet the depth edges of camera cam1" in found[0].what
+
+
+def test_a_foreign_depth_on_one_side_alone_is_a_warning(table: Table) -> None:
+    zero, one, two = ([f for f in table.frames if f.camera == camera] for camera in ("cam0", "cam1", "cam2"))
+    frames = [replace(a, depth=c.depth) for a, c in zip(zero, two, strict=True)]
+    frames += [replace(b, depth=a.depth) for a, b in zip(zero, one, strict=True)]
+    (finding,) = alignment_findings(frames)
+    assert (finding.where, finding.severity) == ("camera cam0", Severity.WARNING)
+
+
+def test_a_shift_within_the_smear_of_edges_is_none_in_small_images(table: Table) -> None:
+    """3 px are 1.9 % of an image 160 px wide, over the share that counts."""
+    small = [
+        replace(f, depth=f.depth[::2, ::2], color=cv2.resize(f.color, (160, 120), interpolation=cv2.INTER_AREA))
+        for f in table.frames
+        if f.camera == "cam0"
+    ]
+
+    def found(shift: int) -> list[float | None]:
+        return [
+            each.value for each in alignment_findings([replace(f, depth=np.roll(f.depth, shift, 1)) for f in small])
+        ]
+
+    assert (found(3), found(6)) == ([], [6])
 
 
 @pytest.mark.parametrize("late_s", [0.08, -0.08])

@@ -209,7 +209,7 @@ def test_each_frame_of_the_wrist_is_where_the_hand_was(
 def test_check_has_the_frames_of_the_wrist_there_too(
     wrist: SetUp, wrist_log: Path, wrist_result: CalibrateResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(check_log, "judged", lambda evidence, *_: evidence)
+    monkeypatch.setattr(check_log, "judged", lambda evidence, *_, **__: evidence)
     evidence: Any = check_log.check_log(open_raw_log(wrist_log), SourceOptions(calibration=wrist_result.out))
     frames = [frame for frame in evidence.frames if frame.camera == WRIST]
     assert frames
