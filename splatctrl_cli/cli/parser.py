@@ -17,6 +17,7 @@ T = TypeVar("T", int, float)
 
 MAX_SECONDS = 1e8  # [s] of a recording: three years
 MOST_WIDTH = 100  # columns of help
+GONE: dict[str, str] = {}  # commands and options that left the command line, and what takes their place
 
 
 class Parser(argparse.ArgumentParser):
@@ -54,7 +55,9 @@ class Parser(argparse.ArgumentParser):
         unknown = re.match(r"unrecognized arguments: (-[^\s=]*)", message)
         choice = re.match(r"argument (\S+): invalid choice: '([^']*)'", message)
         lacking = re.match(r"argument (?:\S+/)?(--[^\s/]+): expected (?:one|at least one) argument", message)
-        near = ""
+        near, gone = "", GONE.get(choice[2] if choice else f"{self.prog} {unknown[1]}" if unknown else "")
+        if gone is not None:
+            return f"run {gone} instead"
         if unknown:
             near = _nearest(unknown[1], self._known())
         elif choice:
