@@ -1,4 +1,4 @@
-"""Small valid folders for `benchmarks.fuzz`: dataset layouts, scans, scenes, packed captures."""
+"""Small valid folders for `benchmarks.fuzz`: dataset layouts, scans, scenes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -10,7 +10,6 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin
 
 from benchmarks.fuzz_folders import Commands, layout_folders, lpips_weights, scans, scene_folder
-from splatctrl_cli.captures.capture_pack import pack_capture
 from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.raw_log import Damage
@@ -50,7 +49,7 @@ def make_samples(folder: Path, commands: tuple[str, ...]) -> list[Sample]:
         _file("mcap-plain", plain_log(log, folder / "plain.mcap"), as_log),
         _file("bag", as_ros1_bag(log, folder / "log.bag"), as_log),
         _folder("db3", as_ros2_folder(log, folder / "bag", StoragePlugin.SQLITE3), as_log),
-        _folder("capture", capture_of(log, folder / "c.capture"), (*as_log, ("capture", "pack", "IN", "-o", "OUT"))),
+        _folder("capture", capture_of(log, folder / "c.capture"), as_log),
         _images(folder / "images", as_log),
         _table(folder / "table"),
     ]
@@ -61,7 +60,6 @@ def make_samples(folder: Path, commands: tuple[str, ...]) -> list[Sample]:
     scan = ("--dtu", str(folder / "idr"), "--holdout", "2", "--threads", "1")
     score = ("score", str(scene), *scan, "--allow-other-recording")
     made.append(_file("lpips", lpips_weights(folder / "lpips.npz"), ((*score, "--lpips", "IN"),)))
-    made.append(_file("packed", _packed(folder), (("info", "IN"), ("capture", "unpack", "IN", "-o", "OUT"))))
     splats = (("info", "IN"), ("export", "IN", "-o", "OUT.ply"))
     made += [_file(p.suffix[1:], p, splats) for p in _splats(folder)]
     made += [_file(p.suffix[1:], p, (("info", "IN"),)) for p in _grids(folder / "field")]
@@ -104,11 +102,6 @@ def capture_of(log: Path, path: Path) -> Path:
     path.mkdir()
     write_capture(path, open_source(log))
     return path
-
-
-def _packed(folder: Path) -> Path:
-    pack_capture(folder / "c.capture", folder / "packed.mcap")
-    return folder / "packed.mcap"
 
 
 def _images(folder: Path, commands: Commands) -> Sample:

@@ -58,14 +58,12 @@ def tasks(folder: Path) -> list[Task]:
     bake = ("sdf-bake", str(folder / "splats.ply"), "--set", "field.max_loss=1", "--no-report", "--voxel", "0.1")
     fine = (*bake[:-1], "0.06", "--threads", "1")
     fit = ("reconstruct", str(SAMPLE / "log.mcap"), "--cameras", "cam0,cam1,cam2", *ROBOT)
-    pack = ("capture", "pack", str(folder / "log.capture"))
     return [
         Task(name="ingest", arguments=("ingest", str(SAMPLE / "log.mcap")), out="log.capture", resumes=True),
         Task(name="export", arguments=("export", str(folder / "a.ply"), "--isotropic"), out="splats.ply"),
         Task(name="sdf-bake", arguments=bake, out="field"),
         Task(name="sdf-bake, fine", arguments=fine, out="fine", resumes=True),
         Task(name="replay", arguments=audit, out="replay"),
-        Task(name="capture pack", arguments=pack, out="packed.mcap"),
         Task(name="reconstruct", arguments=fit, out="scene", resumes=True, again=9, threads=("1", "2", "4")),
     ]
 

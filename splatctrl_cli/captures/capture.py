@@ -106,10 +106,6 @@ class CaptureSource:
         """A frame by its number among those of `cameras`, without reading others; None where it is damaged."""
         return self._stored_frame(self._rows[number])
 
-    def row(self, number: int) -> Mapping[str, str]:
-        """What frames.csv says of a frame, by its number."""
-        return self._rows[number]
-
     def _stored_frames(self) -> Iterator[StoredFrame]:
         for row in self._rows:
             stored = self._stored_frame(row)

@@ -347,20 +347,4 @@ COMMANDS = {
         judges=True,
         options=_DEMO,
     ),
-    "capture": Command(
-        summary="pack a capture into one MCAP that viewers open, and unpack it",
-        examples=("capture pack out/x.capture -o x.mcap", "capture unpack x.mcap -o back.capture"),
-        actions={
-            "pack": Command(
-                summary="write a capture as one MCAP",
-                run="recordings:run_pack",
-                options=recording_options.CAPTURE_PACK,
-            ),
-            "unpack": Command(
-                summary="write the capture that `pack` made an MCAP of",
-                run="recordings:run_unpack",
-                options=recording_options.CAPTURE_UNPACK,
-            ),
-        },
-    ),
 }

@@ -17,7 +17,9 @@ T = TypeVar("T", int, float)
 
 MAX_SECONDS = 1e8  # [s] of a recording: three years
 MOST_WIDTH = 100  # columns of help
-GONE: dict[str, str] = {}  # commands and options that left the command line, and what takes their place
+GONE = {  # commands and options that left the command line, and what takes their place
+    "capture": "`tar -cf X.tar X.capture` for one file, `splatctrl export REPLAY --mcap` for a viewer",
+}
 
 
 class Parser(argparse.ArgumentParser):

@@ -114,5 +114,3 @@ CALIBRATE = (
     ),
     *OF_FOLDERS,
 )
-CAPTURE_PACK = (option("CAPTURE", "capture folder", Path), *output("MCAP file", default="CAPTURE.mcap"))
-CAPTURE_UNPACK = (option("PACKED", "MCAP file", Path), *output("capture folder", default="PACKED.capture"))

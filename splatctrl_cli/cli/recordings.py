@@ -1,11 +1,11 @@
-"""``splatctrl ingest`` and ``capture``: recordings taken in, packed and unpacked."""
+"""``splatctrl ingest``: recordings written as captures."""
 
 import argparse
 from dataclasses import asdict
 
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of, source_options
-from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, PackRequest, ingest, pack, unpack
+from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
 
 
 def run_ingest(args: argparse.Namespace) -> int:
@@ -22,17 +22,3 @@ def show_ingested(console: Console, result: IngestResult) -> int:
     lines += [f"note: {note}" for note in lost["notes"]]
     lines += [f"joint states: {result.summary.num_joint_states}", f"wrote {result.capture}"]
     return console.result({"capture": str(result.capture), **result.metrics}, lines, code=result.exit_code)
-
-
-def run_pack(args: argparse.Namespace) -> int:
-    console = Console(args)
-    result = pack(request_of(PackRequest, args, source=args.capture), console)
-    found = {"mcap": str(result.out), "frames": result.num_frames, "bytes": result.bytes}
-    return console.result(found, [f"frames: {result.num_frames}", f"wrote {result.out}"])
-
-
-def run_unpack(args: argparse.Namespace) -> int:
-    """Write the capture that an MCAP was made of, and return the exit code."""
-    result = unpack(request_of(PackRequest, args, source=args.packed))
-    found = {"capture": str(result.out), "frames": result.num_frames}
-    return Console(args).result(found, [f"frames: {result.num_frames}", f"wrote {result.out}"])

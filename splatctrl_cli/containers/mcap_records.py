@@ -156,13 +156,6 @@ class Statistics(NamedTuple):
     channel_message_counts: Counts
 
 
-class Metadata(NamedTuple):
-    """Named texts."""
-
-    name: Text
-    metadata: Texts
-
-
 class DataEnd(NamedTuple):
     """End of the data section; its checksum, of which 0 means not computed."""
 
@@ -176,7 +169,6 @@ _KINDS: dict[int, type[Any]] = {  # by opcode
     CHUNK: Chunk,
     CHUNK_INDEX: ChunkIndex,
     STATISTICS: Statistics,
-    0x0C: Metadata,
     DATA_END: DataEnd,
 }
 _READERS = {  # of the fields in their order, as their types say

@@ -1,6 +1,5 @@
-"""Recorded inputs into capture folders, and capture folders into one MCAP and back."""
+"""Recorded inputs into capture folders."""
 
-import functools
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -9,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.captures.capture_pack import pack_capture, unpack_capture
 from splatctrl_cli.captures.capture_writer import JOURNAL, CaptureSummary, read_identity, write_capture
 from splatctrl_cli.datasets.image_folder import HOLDOUT
-from splatctrl_cli.errors import DAMAGED, InputError, UsageError
+from splatctrl_cli.errors import DAMAGED, UsageError
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstructions.resume import check_same_run, told_how_to_go_on
@@ -53,24 +51,6 @@ class IngestResult:
         return DAMAGED if self.summary.loss.damaged else 0
 
 
-@dataclass(frozen=True, kw_only=True)
-class PackRequest:
-    """Pack the capture folder `source` into one MCAP, or unpack such a file; out: None for a name like its own."""
-
-    source: Path
-    out: Path | None = None
-    force: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class PackResult:
-    """What was written; bytes: the size of a file, None of a folder."""
-
-    out: Path
-    num_frames: int
-    bytes: int | None = None
-
-
 def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
     """Write the capture, or go on with one that was interrupted, to the same bytes.
 
@@ -109,7 +89,7 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
                 source,
                 topics=topics,
                 robot=robots[0].text if len(robots) == 1 else "",
-                progress=functools.partial(_log_hundredth, progress),
+                progress=lambda num: progress.log(f"{num} frames") if num % 100 == 0 else None,
                 identity=identity,
             )
         if summary.num_resumed:
@@ -124,32 +104,6 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
             stopwatch=stopwatch,
         )
     return result
-
-
-def pack(request: PackRequest, progress: Progress = SILENT) -> PackResult:
-    """Write a capture folder as one MCAP. Raises InputError for what is none."""
-    source = request.source
-    if not source.is_dir():
-        raise InputError(f"{source}: no such folder", remedy="expected what `splatctrl ingest` writes")
-    out = request.out or Path(source.resolve().name.removesuffix(".capture") + ".mcap")
-    with output_path(out, force=request.force, is_folder=False) as partial:
-        num_frames = pack_capture(source, partial, functools.partial(_log_hundredth, progress))
-        return PackResult(out=out, num_frames=num_frames, bytes=partial.stat().st_size)
-
-
-def unpack(request: PackRequest) -> PackResult:
-    """Write the capture folder that an MCAP was made of. Raises InputError for what is none."""
-    source = request.source
-    if not source.is_file():
-        raise InputError(f"{source}: no such file", remedy="expected what `splatctrl capture pack` writes")
-    out = request.out or Path(source.stem + ".capture")
-    with output_path(out, force=request.force, is_folder=True) as partial:
-        return PackResult(out=out, num_frames=unpack_capture(source, partial))
-
-
-def _log_hundredth(progress: Progress, num_frames: int) -> None:
-    if num_frames % 100 == 0:
-        progress.log(f"{num_frames} frames")
 
 
 def _identity(options: SourceOptions, inputs: Mapping[str, str]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ REP 118, 0 = none, registered to colour), /CAM/people/mask (mono8, 255 = a perso
 /joint_states, /tf and /tf_static. The bytes hold no wall-clock time.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.records import MILLIMETRES, Float32, Float64, Intrinsics, JointState, RgbdFrame
+from splatctrl_cli.records import MILLIMETRES, Float64, Intrinsics, JointState, RgbdFrame
 
 FOREVER = "    sec: 9223372036\n    nsec: 854775807\n"
 LATCHED = (  # rosbag2's form of reliable, transient local, keep the last one
@@ -87,29 +87,7 @@ class McapLog:
             mask = np.where(frame.human > 0, np.uint8(255), np.uint8(0))
             self._add(f"/{frame.camera}/people/mask", self._image(header, "mono8", mask), frame.stamp_ns)
 
-    def add_image_file(self, topic: str, stamp_ns: int, frame_id: str, form: str, data: bytes) -> None:
-        """One CompressedImage: the bytes of a file as they are."""
-        header, content = self._header(stamp_ns, frame_id), np.frombuffer(data, np.uint8)
-        message = self._new("sensor_msgs/msg/CompressedImage", header=header, format=form, data=content)
-        self._add(topic, message, stamp_ns)
-
-    def add_image(
-        self, topic: str, stamp_ns: int, frame_id: str, encoding: str, pixels: NDArray[np.unsignedinteger] | Float32
-    ) -> None:
-        self._add(topic, self._image(self._header(stamp_ns, frame_id), encoding, pixels), stamp_ns)
-
-    def add_camera_info(self, topic: str, stamp_ns: int, frame_id: str, intrinsics: Intrinsics) -> None:
-        """One CameraInfo without distortion."""
-        self._add(topic, self._camera_info(self._header(stamp_ns, frame_id), intrinsics), stamp_ns)
-
-    def attach(self, name: str, media_type: str, data: bytes) -> None:
-        self._writer.add_attachment(0, 0, name, media_type, data)
-
-    def describe(self, name: str, values: Mapping[str, str]) -> None:
-        """One metadata record."""
-        self._writer.add_metadata(name, dict(values))
-
-    def _image(self, header: Any, encoding: str, pixels: NDArray[np.unsignedinteger] | Float32) -> Any:
+    def _image(self, header: Any, encoding: str, pixels: NDArray[np.unsignedinteger]) -> Any:
         return self._new(
             "sensor_msgs/msg/Image",
             header=header,

@@ -274,12 +274,6 @@ def test_the_script_of_the_page_writes_a_capture(tmp_path: Path, capsys: pytest.
     assert source.loss.damaged == 0
     assert main(["check", str(tmp_path / "mine.capture"), "--fail-on", "warning"]) == 0
     assert main(["info", str(tmp_path / "mine.capture")]) == 0
-    packed, back = tmp_path / "mine.mcap", tmp_path / "back.capture"
-    assert main(["capture", "pack", str(tmp_path / "mine.capture"), "-o", str(packed), "-q"]) == 0
-    assert main(["capture", "unpack", str(packed), "-o", str(back), "-q"]) == 0
-    assert {p.name: p.read_bytes() for p in back.rglob("*.*")} == {
-        p.name: p.read_bytes() for p in (tmp_path / "mine.capture").rglob("*.*")
-    }
 
 
 RECIPE = LogRecipe(num_frames=30, color_format="rgb8", has_joints=False)
@@ -352,3 +346,12 @@ def test_a_capture_whose_images_lie_outside_is_refused(tmp_path: Path) -> None:
     sums.write_text("\n".join([*lines, f"{sha256(frames.read_bytes()).hexdigest()}  frames.csv"]) + "\n")
     with pytest.raises(InputError, match=r"../secret.jpg lies outside the capture"):
         CaptureSource(capture, SourceOptions())
+
+
+def test_a_capture_of_a_capture_keeps_its_depth_unit(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, LogRecipe(depth_counts=12503), options=SourceOptions(depth_scale=1e-4))
+    write_capture(tmp_path / "again.capture", open_source(folder))
+    names = [path.relative_to(folder) for path in sorted(folder.glob("depth/*/*.png"))]
+    assert names
+    for name in names:
+        assert (folder / name).read_bytes() == (tmp_path / "again.capture" / name).read_bytes()

@@ -16,10 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.cli.commands import COMMANDS, Command, build_parser, function_of
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.sources.source import open_source
 from tests.cli import here
 from tests.conftest import ROOT
 from tests.logs.make_log import LogRecipe, make_log
@@ -74,7 +72,6 @@ class Work:
             "report": [scene],
             "view": [scene, "--no-open"],
             "demo": [],
-            "capture": ["pack", self.folder / "x.capture"],
         }
         return [command, *given[command], "-o", out]
 
@@ -83,7 +80,7 @@ class Work:
 def work(tmp_path_factory: pytest.TempPathFactory) -> Work:
     """A log of two cameras, its scene, and a two-joint arm whose joints are in the log."""
     work = Work(tmp_path_factory.mktemp("work"))
-    write_capture(work.folder / "x.capture", open_source(make_log(work.log, LogRecipe(cameras=("cam0", "cam1")))))
+    make_log(work.log, LogRecipe(cameras=("cam0", "cam1")))
     (work.folder / "points.csv").write_text("x,y,z\n0,0,1\n")
     (work.folder / "robot.urdf").write_text(ARM.format("joint_a", "joint_b"))
     done = splatctrl(*work.arguments("reconstruct", work.folder / "scene"), "-q")
@@ -190,7 +187,7 @@ def test_a_command_runs_without_the_files_of_the_others(
 @pytest.mark.parametrize("command", WRITERS)
 def test_an_unknown_option_is_exit_2_and_named(work: Work, tmp_path: Path, command: str) -> None:
     done = splatctrl(*work.arguments(command, tmp_path / "out"), "--colour")
-    action = {"robot": " spheres", "capture": " pack"}.get(command, "")
+    action = {"robot": " spheres"}.get(command, "")
     assert_refused(done, 2, f"{command}{action}: unrecognized arguments: --colour; ")
     assert not list(tmp_path.iterdir())
 
@@ -212,7 +209,7 @@ def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command
     assert not list(tmp_path.iterdir())
 
 
-FILE_WRITERS = ("calibrate", "export", "query", "report", "view", "robot", "capture")  # the others write a folder
+FILE_WRITERS = ("calibrate", "export", "query", "report", "view", "robot")  # the others write a folder
 
 
 @pytest.mark.parametrize("command", WRITERS)
@@ -256,7 +253,7 @@ def test_what_reconstruct_wrote_is_taken_by_the_next_steps(work: Work, tmp_path:
     assert (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("command", ["simulate", "ingest", "reconstruct", "robot", "capture"])
+@pytest.mark.parametrize("command", ["simulate", "ingest", "reconstruct", "robot"])
 def test_what_a_command_prints_as_json_is_as_the_schema_says(work: Work, tmp_path: Path, command: str) -> None:
     done = here.splatctrl(*work.arguments(command, tmp_path / "out"), "--json", "-q")
     assert done.returncode == 0, done.stderr
@@ -365,22 +362,11 @@ def test_a_reader_that_stops_after_the_first_line_ends_the_program_quietly(
 
 
 def test_an_output_is_written_though_stdout_is_closed(log: Path, tmp_path: Path) -> None:
-    capture = tmp_path / "x.capture"
-    write_capture(capture, open_source(log))
-    command = [
-        sys.executable,
-        "-m",
-        "splatctrl_cli",
-        "capture",
-        "pack",
-        str(capture),
-        "-o",
-        str(tmp_path / "out.mcap"),
-    ]
+    command = [sys.executable, "-m", "splatctrl_cli", "ingest", str(log), "-o", str(tmp_path / "x.capture")]
     shell = ["sh", "-c", '"$@" >&-', "sh", *command]
     done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 6 and "stdout: closed" in done.stderr
-    assert (tmp_path / "out.mcap").read_bytes().startswith(b"\x89MCAP")
+    assert (tmp_path / "x.capture/run.json").is_file()
 
 
 def test_a_partial_that_is_an_input_is_not_replaced(log: Path, tmp_path: Path) -> None:

@@ -199,7 +199,7 @@ for line in sys.stdin:
         code = main(line.split())
     print(code, said.getvalue().strip().splitlines()[-1:], flush=True)
 """
-COMMANDS = ("info {}", "check {}", "ingest {} -o out", "export {} -o out.ply", "capture unpack {}")
+COMMANDS = ("info {}", "check {}", "ingest {} -o out", "export {} -o out.ply")
 
 
 def odd_files(folder: Path) -> list[Path]:

@@ -16,7 +16,7 @@ from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.files.unpacking import unpacked
 
 _HEAD = struct.Struct("<BQ")
-READ = ("Footer", "Schema", "Channel", "Statistics", "Metadata", "ChunkIndex", "DataEnd")  # messages: below
+READ = ("Footer", "Schema", "Channel", "Statistics", "ChunkIndex", "DataEnd")  # messages: below
 
 
 def records_of(path: Path, damage: Damage) -> Iterator[Any]:

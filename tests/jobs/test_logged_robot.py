@@ -14,7 +14,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.containers.raw_log import RawMessage
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.check import CheckRequest, check
-from splatctrl_cli.jobs.ingest import IngestRequest, PackRequest, ingest, pack, unpack
+from splatctrl_cli.jobs.ingest import IngestRequest, ingest
 from splatctrl_cli.jobs.logged_robot import differs, logged_urdf, urdf_of
 from splatctrl_cli.jobs.reconstructions.reconstruct import _robot
 from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
@@ -222,17 +222,14 @@ def test_a_replay_keeps_the_robot_of_its_log_for_who_looks_at_it(
     assert space_of(out).motion is not None
 
 
-def test_a_capture_keeps_the_description_and_so_does_what_is_packed(tmp_path: Path) -> None:
+def test_a_capture_keeps_the_description(tmp_path: Path) -> None:
     path = log_with(tmp_path / "run.mcap", described(robot()))
     assert describe(path).facts["robot_description"] == ["/robot_description"]
     capture = ingest(IngestRequest(paths=(path,), out=tmp_path / "run.capture")).capture
     assert is_capture(capture)
     assert (capture / "robot_description.urdf").read_text() == robot()
-    packed = pack(PackRequest(source=capture, out=tmp_path / "packed.mcap")).out
-    again = unpack(PackRequest(source=packed, out=tmp_path / "again.capture")).out
-    for folder in (capture, again):
-        found = logged_urdf([folder])
-        assert found is not None and found.text == robot()
+    found = logged_urdf([capture])
+    assert found is not None and found.text == robot()
     (capture / "robot_description.urdf").write_text(robot(shift=0.3))
     with pytest.raises(InputError, match="its checksum differs from SHA256SUMS"):
         logged_urdf([capture])

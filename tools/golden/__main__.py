@@ -34,15 +34,12 @@ LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "matplotlib", "pin", "c
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A command line without its program; the command before it, the cases and the recording that it needs; and the
-    files that it writes whose bytes hold times.
-    """
+    """A command line without its program; the command before it, the cases and the recording that it needs."""
 
     run: str
     before: str = ""
     needs: Sequence[str] = ()
     data: str = ""
-    timed: Sequence[str] = ()
 
 
 def read_cases(path: Path = CASES) -> dict[str, Case]:
@@ -73,7 +70,7 @@ def run_case(name: str, case: Case, scratch: Path, places: Mapping[str, str]) ->
         raise SystemExit(f"golden: {name}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
     found = {"exit code": str(done.returncode), "--json": of_json(done.stdout, places)}
     found |= written(scratch, before, places)
-    return {f"{name} {artefact}": value for artefact, value in found.items() if artefact not in case.timed}
+    return {f"{name} {artefact}": value for artefact, value in found.items()}
 
 
 def prepare(scratch: Path, recordings: Path) -> dict[str, str]:
