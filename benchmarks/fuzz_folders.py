@@ -79,17 +79,6 @@ def scene_folder(folder: Path) -> tuple[Path, Commands]:
     return folder, (INFO, ("export", "IN", "-o", "OUT.ply"), bake, bake, (*bake, "--at", "0"))
 
 
-def lpips_weights(path: Path) -> Path:
-    """Weights of a network of AlexNet's form with two channels a layer."""
-    arrays = {}
-    for part, (number, before, size) in enumerate(((0, 3, 5), (3, 2, 3), (6, 2, 3), (8, 2, 3), (10, 2, 3)), 1):
-        arrays[f"net.slice{part}.{number}.weight"] = np.full((2, before, size, size), 0.1, np.float32)
-        arrays[f"net.slice{part}.{number}.bias"] = np.zeros(2, np.float32)
-        arrays[f"lin{part - 1}.model.1.weight"] = np.ones((1, 2, 1, 1), np.float32)
-    np.savez(path, **arrays)  # type: ignore[arg-type]
-    return path
-
-
 def _view(number: int) -> DtuView:
     depth = np.full((48, 64), 0.6, np.float32)
     depth[:5] = 0

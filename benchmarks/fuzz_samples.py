@@ -9,7 +9,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin
 
-from benchmarks.fuzz_folders import Commands, layout_folders, lpips_weights, scans, scene_folder
+from benchmarks.fuzz_folders import Commands, layout_folders, scans, scene_folder
 from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.raw_log import Damage
@@ -57,9 +57,6 @@ def make_samples(folder: Path, commands: tuple[str, ...]) -> list[Sample]:
     scene, of_scene = scene_folder(folder / "scene")
     made.append(_folder("scene", scene, of_scene))
     made += [_folder(name, *found) for name, found in scans(folder, scene).items()]
-    scan = ("--dtu", str(folder / "idr"), "--holdout", "2", "--threads", "1")
-    score = ("score", str(scene), *scan, "--allow-other-recording")
-    made.append(_file("lpips", lpips_weights(folder / "lpips.npz"), ((*score, "--lpips", "IN"),)))
     splats = (("info", "IN"), ("export", "IN", "-o", "OUT.ply"))
     made += [_file(p.suffix[1:], p, splats) for p in _splats(folder)]
     made += [_file(p.suffix[1:], p, (("info", "IN"),)) for p in _grids(folder / "field")]

@@ -19,6 +19,7 @@ MAX_SECONDS = 1e8  # [s] of a recording: three years
 MOST_WIDTH = 100  # columns of help
 GONE = {  # commands and options that left the command line, and what takes their place
     "capture": "`tar -cf X.tar X.capture` for one file, `splatctrl export REPLAY --mcap` for a viewer",
+    "splatctrl score --lpips": "the package lpips on renders and photos",
 }
 
 

@@ -19,9 +19,8 @@ from splatctrl_cli.cli.options import (
     output,
     settings,
 )
-from splatctrl_cli.cli.parser import MAX_SECONDS, either, group, option, real, setting, whole, words
+from splatctrl_cli.cli.parser import MAX_SECONDS, either, group, option, real, setting, words
 from splatctrl_cli.config import FieldConfig, SceneConfig
-from splatctrl_cli.config.map import MOST_ITERATIONS
 
 SPLAT_FORMATS = (".ply", ".splat", ".spz", ".glb", ".usda", ".usdc")  # as the registries have them, which are not
 GRID_FORMATS = ("npz", "vti", "nrrd", "vdb", "curobo", "moveit", "ply", "obj", "stl")  # imported for a help text
@@ -42,13 +41,6 @@ RECONSTRUCT = (
     group("scan of --dtu", *SCAN),
     group(
         "fit",
-        option(
-            "--method",
-            "a fixed budget of isotropic splats, or 3D Gaussian splatting, a baseline for views of a scene that"
-            " stands still, without distances",
-            ("budget", "3dgs"),
-            "budget",
-        ),
         option(
             "--points FILE.ply",
             "coloured points to start from instead of depth, for colour cameras alone (no occupancy)",
@@ -156,7 +148,6 @@ SCORE = (
         "SCENE",
         "a folder that reconstruct wrote, one of such folders, named like the scans of --dtu, or a splat file",
         Path,
-        nargs="?",
     ),
     either(
         option(
@@ -173,7 +164,7 @@ SCORE = (
         "score.json of an earlier score -o: prints the change of each figure, gated as change_NAME",
         Path,
     ),
-    *CONFIG,
+    THREADS,
     GATES,
     *OF_FOLDERS,
     group(
@@ -197,7 +188,6 @@ SCORE = (
             ("all", "best-worst", "none"),
             "best-worst",
         ),
-        option("--lpips FILE.npz", "weights of LPIPS (splatctrl help score); none are included", Path),
     ),
     group(
         "surface",
@@ -215,24 +205,5 @@ SCORE = (
         option("--cloud-unit M", "metres per unit (default: 0.001 with --dtu, else 1)", real(1e-9, 1e3, "m")),
         option("--cloud-max M", "farther points count in a share, not in a mean", real(1e-6, 1e3, "m"), 0.02),
         option("--cloud-spacing M", "both sides are thinned to points this far apart", real(1e-6, 1e3, "m"), 0.0002),
-    ),
-    DEVICE,
-    group(
-        "fit",
-        option(
-            "--fit",
-            "fit the scans of --dtu (--scan A,B; default: all), or the image folder of --reference, with both methods"
-            " and score them (default protocol: dtu-holdout8)",
-        ),
-        option(
-            "--fit-iterations N",
-            "of each method (default: those of the configuration, 2300)",
-            whole(1, MOST_ITERATIONS),
-        ),
-        option(
-            "--fit-splats N",
-            "the budget, and Gaussians to begin with (default: 10000)",
-            setting(SceneConfig, "max_splats"),
-        ),
     ),
 )

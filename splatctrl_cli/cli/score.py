@@ -5,26 +5,16 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from splatctrl_cli.cli.common import Console, shown, table
+from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.score_report import PREFIX
 from splatctrl_cli.evaluate.verdict import counted
-from splatctrl_cli.jobs import device
-from splatctrl_cli.jobs.scores.fit import EACH, METHODS, FitRequest, score_fits
 from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.scores.views import CloudSettings
 from splatctrl_cli.records import MILLIMETRE
 
-OF_FITS: dict[str, object] = {
-    "config": None,
-    "set": [],
-    "seed": 0,
-    "device": "auto",
-    "fit_iterations": None,
-    "fit_splats": None,
-}  # where they are not given
 COLUMNS = {
     "psnr_seen": "dB seen",
     "psnr_all": "dB all",
@@ -33,8 +23,6 @@ COLUMNS = {
     "ssim_seen": "SSIM seen",
     "ssim_all": "SSIM all",
     "ssim_published": "SSIM publ.",
-    "lpips": "LPIPS",
-    "lpips_published": "LPIPS publ.",
     "depth_median_seen": "depth mm seen",
     "depth_median_all": "depth mm all",
     "depth_median_all_corrected": "depth mm corrected",
@@ -49,38 +37,19 @@ SHARES = ("seen_share", "in_front_seen", "mask_share", "valid_share")
 
 def run(args: argparse.Namespace) -> int:
     console = Console(args)
-    return show_scored(console, score_fits(_fit(args), console) if args.fit else score(_request(args), console))
+    return show_scored(console, score(_request(args), console))
 
 
 def show_scored(console: Console, result: ScoreResult) -> int:
-    """The verdict, and a row per view, scan or method."""
+    """The verdict, and a row per view or scan."""
     return console.concluded(result.verdict, result.report, lines_of(result.report))
 
 
 def _request(args: argparse.Namespace) -> ScoreRequest:
-    if args.scene is None:
-        raise UsageError("score: expected a SCENE, got none", remedy="give what reconstruct wrote, or --fit")
-    for name, default in OF_FITS.items():
-        if getattr(args, name) != default:
-            raise UsageError(f"--{name.replace('_', '-')}: only with --fit", remedy="leave it out")
-    return request_of(ScoreRequest, args, **_scoring(args))
-
-
-def _fit(args: argparse.Namespace) -> FitRequest:
-    if args.scene is not None:
-        raise UsageError(f"--fit: makes the scenes itself, got {args.scene}", remedy="leave SCENE or --fit out")
-    if args.baseline is not None:
-        raise UsageError("--baseline: not with --fit", remedy="score the scenes that --fit -o leaves")
-    given = {"settings": tuple(args.set), "iterations": args.fit_iterations, **_scoring(args)}
-    given |= {} if args.fit_splats is None else {"num_splats": args.fit_splats}
-    return request_of(FitRequest, args, **given)
-
-
-def _scoring(args: argparse.Namespace) -> dict[str, Any]:
-    """What both kinds of request have in common."""
     first, *beside = args.reference or [None]
     recording = replace(recording_of(args, first, args.masks), beside=tuple(beside))
-    return {"recording": recording, "newest": args.snapshots == "newest", "cloud": _cloud(args)}
+    given = {"recording": recording, "newest": args.snapshots == "newest", "cloud": _cloud(args)}
+    return request_of(ScoreRequest, args, **given)
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:
@@ -101,8 +70,6 @@ def _cloud(args: argparse.Namespace) -> CloudSettings | None:
 
 def lines_of(report: Mapping[str, Any]) -> Iterable[str]:
     """The table of a report, and what belongs to its figures."""
-    if "fits" in report:
-        return _lines_of_fits(report)
     return _lines_of_scans(report) if "results" in report else _lines_of_views(report)
 
 
@@ -156,47 +123,6 @@ def _with_mean(
     lines = table((*header, *(COLUMNS[name] for name in columns)), [*rows, *last])
     lines.insert(2 + len(rows), lines[1])
     return lines
-
-
-def _lines_of_fits(report: Mapping[str, Any]) -> list[str]:
-    metrics, settings, fits = report["metrics"], report["settings"], report["fits"]
-    rows, psnr = [], {name: [fit["psnr"] for fit in fits if fit["method"] == name] for name in METHODS}
-    for name, method in METHODS.items():
-        rest = [shown(metrics[f"{what}_{method.key}"], ".0f") for what in ("splats", "memory", "seconds")]
-        scans = [_cell("psnr", value) for value in (*psnr[name], metrics[f"psnr_{method.key}"])]
-        rows.append([method.name, f"{method.psnr:.2f}", method.splats, *scans, *rest])
-    pairs = zip(psnr["budget"], psnr["3dgs"], strict=True)
-    gains: list[float | None] = [METHODS["budget"].psnr - METHODS["3dgs"].psnr]
-    gains += [None if None in pair else pair[0] - pair[1] for pair in pairs]
-    first, *others = [shown(value, "+.2f") for value in (*gains, metrics["psnr_gain"])]
-    rows.append(["ours - 3D-GS", first, "-", *others, "-", "-", "-"])
-    header = ("method", "paper's dB", "paper's splats", *(f"{scan} dB" for scan in report["scans"]))
-    devices = {fit["method"]: fit["devices"] for fit in fits}
-    return [
-        *table((*header, "mean dB", "splats", "memory MiB", "fit s"), rows),
-        "paper's: its section IV-A, on scans, views, sizes and iterations that it does not name; the rest: here",
-        "",
-        *_each_fit(fits),
-        "",
-        *_protocol_lines(report["protocol"]),
-        f"PSNR {report['psnr']}; {settings['splats']:,} splats to begin with, {settings['iterations']} iterations,"
-        f" seed {settings['seed']}, the same losses; memory: the largest of the scans",
-        *(f"{METHODS[name].name} computed on {device.shown(on[-1])}" for name, on in devices.items()),
-    ]
-
-
-def _each_fit(fits: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What else was scored, a row for each fit."""
-    names = [name for name in EACH if name in fits[0]["metrics"]]
-    rows = [
-        [
-            *(fit["scan"], METHODS[fit["method"]].name, fit["splats"]),
-            *_cells(names, fit["metrics"]),
-            *(shown(fit["memory"], ".0f"), shown(fit["seconds"], ".0f")),
-        ]
-        for fit in fits
-    ]
-    return table(("scan", "method", "splats", *(COLUMNS[name] for name in names), "memory MiB", "fit s"), rows)
 
 
 def _protocol_lines(protocol: Mapping[str, Any]) -> list[str]:

@@ -55,7 +55,6 @@ BAD_SHARE = Scale(better=Better.LOWER, absolute=0.005, relative=0.02)
 GOOD_SHARE = Scale(better=Better.HIGHER, absolute=0.005)
 DECIBELS = Scale(unit="dB", better=Better.HIGHER, absolute=0.2)  # as far as four seeds are apart
 SIMILARITY = Scale(better=Better.HIGHER, absolute=0.005)
-DISSIMILARITY = Scale(better=Better.LOWER, absolute=0.005)
 AGE = Scale(unit="s", better=Better.LOWER, absolute=0.01, relative=0.02)
 LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
 

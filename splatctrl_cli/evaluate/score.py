@@ -1,7 +1,7 @@
 """Scores of rendered views against recorded ones, over all pixels and over those that a training camera saw."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -10,22 +10,18 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import IN_FRONT
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, filled, psnr, published_ssim, ssim_map
+from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, psnr, published_ssim, ssim_map
 from splatctrl_cli.evaluate.metrics import (
     BAD_SHARE,
     DECIBELS,
     DESCRIBES,
-    DISSIMILARITY,
     GOOD_SHARE,
     SIMILARITY,
     Better,
     Scale,
 )
-from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, SplatSet
 from splatctrl_cli.voxels import OccupancyGrid
-
-Perceptual = Callable[[Float64, Float64], float]
-"""Render and photo (H, W, 3) in [0, 1] -> LPIPS."""
 
 PROTOCOL = {
     "average": "mean over views of each view's own figure; a view without a pixel of the region is left out",
@@ -44,8 +40,6 @@ PROTOCOL = {
     "ssim_published": "of the whole view with render and photo set to one colour outside the mask, as scikit-image's "
     "default has it: 7x7 box, sample moments, data range 2, border of 3 pixels left out; without a mask as 3D "
     "Gaussian splatting has it: as ssim, but zeros beyond the border",
-    "lpips": "of the whole view, colours scaled to [-1, 1]; lpips_published: with render and photo set to one colour "
-    "outside the mask",
     "corrected": "the same figures with the view's pose or exposure corrected by depth and colour of the training "
     "views, and its depth freed of its camera's bend, where theirs were; the render takes no part in it",
     "free_mass": "share of the mass of the final splats (opacity times radius squared, the robot's left out) whose "
@@ -86,9 +80,8 @@ CORRECTABLE = tuple(f"{name}_{region}" for name in REGION if name != "depth_pixe
 class ViewScore:
     """One view: `valid_share` of its pixels have a reference depth; `all` and `seen` are its regions.
 
-    Where there is a mask: `masked` is its region, ssim_published and lpips_published are those of the view with the
-    rest filled; without one, ssim_published is there where the protocol has one. lpips where weights were given.
-    size: width and height [px]. corrected: the same view at
+    Where there is a mask: `masked` is its region, ssim_published is that of the view with the rest filled; without
+    one, ssim_published is there where the protocol has one. size: width and height [px]. corrected: the same view at
     its corrected pose and exposure, its depth freed of its camera's bend.
     """
 
@@ -101,8 +94,6 @@ class ViewScore:
     all: RegionScore
     masked: RegionScore | None = None
     ssim_published: float | None = None
-    lpips: float | None = None
-    lpips_published: float | None = None
     corrected: "ViewScore | None" = None
 
     def figures(self) -> dict[str, float]:
@@ -112,8 +103,6 @@ class ViewScore:
             "seen_share": self.seen.share,
             "mask_share": None if self.masked is None else self.masked.share,
             "ssim_published": self.ssim_published,
-            "lpips": self.lpips,
-            "lpips_published": self.lpips_published,
         }
         figures = {name: value for name, value in found.items() if value is not None}
         for name, region in {"seen": self.seen, "all": self.all, "masked": self.masked}.items():
@@ -145,15 +134,13 @@ def score_view(
     mask: Bool | None = None,
     fill: float = 0.0,
     is_zero_padded: bool = False,
-    perceptual: Perceptual | None = None,
 ) -> ViewScore:
     """The scores of a rendering against `frame`.
 
     color (H, W, 3) in [0, 1], depth (H, W) [m] normalised by accumulated opacity, 0 = none; seen (H, W): pixels
     that a training camera saw; mask (H, W): pixels that the mask rule selects, `fill` the grey outside it for
-    the published figures; is_zero_padded: without a mask, the published SSIM is that of `ssim_map` of that kind;
-    perceptual: LPIPS. What is not valid in `frame` is in no region. `PROTOCOL` says what each
-    figure means.
+    the published SSIM; is_zero_padded: without a mask, it is that of `ssim_map` of that kind. What is not valid in
+    `frame` is in no region. `PROTOCOL` says what each figure means.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
     photo = frame.color.astype(np.float64) / 255.0
@@ -174,9 +161,6 @@ def score_view(
             in_front=in_front(depth, frame.depth, mask),
         )
 
-    def of_the_mask(perceptual: Perceptual, mask: Bool) -> float:
-        return perceptual(filled(rendered, mask, fill), filled(photo, mask, fill)) if mask.any() else math.nan
-
     return ViewScore(
         view=view,
         camera=frame.camera,
@@ -189,8 +173,6 @@ def score_view(
         ssim_published=published_ssim(rendered, photo, mask, fill)
         if mask is not None
         else (float(ssim_map(rendered, photo, is_zero_padded=True).mean()) if is_zero_padded else None),
-        lpips=None if perceptual is None else perceptual(rendered, photo),
-        lpips_published=None if perceptual is None or mask is None else of_the_mask(perceptual, mask),
     )
 
 
@@ -218,8 +200,8 @@ def in_front(depth: NDArray[np.floating], reference: NDArray[np.floating], mask:
 
 
 def metric_names() -> tuple[str, ...]:
-    """The names that `total_score` can have, known before anything is scored; those of a mask and of LPIPS only where
-    they were given.
+    """The names that `total_score` can have, known before anything is scored; those of a mask only where one was
+    given.
     """
     return tuple(metric_scales())
 
@@ -230,7 +212,6 @@ def metric_scales() -> dict[str, Scale]:
     return {
         **dict.fromkeys(("num_views", "valid_share", "seen_share", "mask_share"), DESCRIBES),
         "ssim_published": SIMILARITY,
-        **dict.fromkeys(("lpips", "lpips_published"), DISSIMILARITY),
         **of_regions,
         **{f"{name}{CORRECTED}": of_regions[name] for name in CORRECTABLE},
     }

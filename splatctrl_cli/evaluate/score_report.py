@@ -27,7 +27,7 @@ from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Bool, Float64
 
 PREFIX = "change_"
-COMPARED = ("name", "split", "mask_rule", "resolution", "averaging", "lpips", "scans")
+COMPARED = ("name", "split", "mask_rule", "resolution", "averaging", "scans")
 SUMS = ("num_views", "num_skipped", "num_warnings", "num_points", "num_reference")
 AVERAGING = "mean over the views"
 SCALES = {

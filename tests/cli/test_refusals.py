@@ -212,7 +212,6 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--scan scan1,scan9", 4, "no scan 'scan9'; scans: scan1"),
         ("--require psnr_best>=1", 2, "unknown metric"),
         ("--cloud .", 4, "expected the points of scan1, scan1.ply or stl001_total.ply, got neither"),
-        ("--lpips x.npz", 4, "x.npz: cannot be read: No such file"),
         ("--set scene.nothing=1", 2, "scene.nothing"),
     ],
     "replay states.mcap --scene scene": [

@@ -8,8 +8,6 @@ import pytest
 
 from splatctrl_cli.datasets.idr import read_idr
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate import images
-from splatctrl_cli.evaluate.images import Lpips
 from splatctrl_cli.files.arrays import DAMAGE, NpzFile, read_arrays, savez
 from splatctrl_cli.grid_files.npz_grid import MOST_PACKED, read_npz
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT, read_checkpoint
@@ -42,7 +40,6 @@ def read_state(path: Path) -> object:
         (read_states, "states", "|u1", "4294967296 bytes, expected at most 40"),
         (read_columns, "position", "<f8", "34359738368 bytes unpacked, over 100 times the size of the file"),
         (read_npz, "sdf", "<f4", f"bytes in compressed arrays, expected at most {MOST_PACKED}"),
-        (Lpips, "lin0.model.1.weight", "<f4", f"bytes of arrays, expected at most {images.MOST}"),
         (read_scan, "world_mat_0", "<f8", "34359738368 bytes, expected at most 167771"),
         (read_state, "alive", "<f4", "17179869184 bytes, expected at most 429"),
     ],

@@ -15,7 +15,7 @@ from splatctrl_cli.datasets.dtu import scan_folders
 from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.images import Lpips, psnr
+from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, TIME, Scale
 from splatctrl_cli.evaluate.score_report import AVERAGING, SCALES, judged, mean_of
 from splatctrl_cli.jobs.device import CPU, Device, demanded
@@ -56,8 +56,8 @@ METHODS = {
 EACH = {
     name: SCALES[name]
     for name in (
-        *("psnr_seen", "psnr_all", "psnr_masked", "ssim_seen", "ssim_all", "ssim_published", "lpips"),
-        *("lpips_published", "depth_median_seen", "depth_median_all", "chamfer"),
+        *("psnr_seen", "psnr_all", "psnr_masked", "ssim_seen", "ssim_all", "ssim_published"),
+        *("depth_median_seen", "depth_median_all", "chamfer"),
     )
 }
 OWN = {"psnr": DECIBELS, "splats": DESCRIBES, "memory": Scale(unit="MiB"), "seconds": TIME}
@@ -166,8 +166,6 @@ def _checked(request: FitRequest) -> FitRequest:
             f"--fit: expected scans (--dtu) or an image folder, got {recording.path}",
             remedy="the baseline fits views of a scene that stands still",
         )
-    if request.lpips is not None:
-        Lpips(request.lpips)
     scene = load_config(request.config, request.settings).scene
     check_gate_names(request.require, GATED)
     demanded(request.device)

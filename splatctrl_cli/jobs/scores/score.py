@@ -2,7 +2,7 @@
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from math import nan
 from pathlib import Path
@@ -10,7 +10,6 @@ from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.images import Lpips
 from splatctrl_cli.evaluate.score import PROTOCOL, as_json, free_mass, total_score
 from splatctrl_cli.evaluate.score_report import (
     AVERAGING,
@@ -42,21 +41,22 @@ from splatctrl_cli.scene_files.scene_folder import SceneFolder, open_splats, run
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scoring:
-    """How views are scored.
+class ScoreRequest:
+    """One scene, or a folder of scenes named like the scans of the recording's data set, and how views are scored.
 
-    recording: what is compared with; its options' cameras are those scored. out: folder for scores and pictures.
-    newest: render a view from the newest snapshot not later than it, else from the final splats. images: pictures of
-    ``all`` views, of each camera's ``best-worst``, or ``none``. lpips: weights (.npz). require: gates on the metrics.
-    Raises UsageError for pictures of all views without a folder.
+    recording: what is compared with; its options' cameras are those scored. baseline: score.json of an earlier score,
+    whose figures are compared. out: folder for scores and pictures. newest: render a view from the newest snapshot
+    not later than it, else from the final splats. images: pictures of ``all`` views, of each camera's ``best-worst``,
+    or ``none``. require: gates on the metrics. Raises UsageError for pictures of all views without a folder.
     """
 
+    scene: Path
     recording: RecordingRequest
+    baseline: Path | None = None
     out: Path | None = None
     force: bool = False
     newest: bool = True
     images: str = "best-worst"
-    lpips: Path | None = None
     cloud: CloudSettings | None = None
     allow_training: bool = False
     allow_other_recording: bool = False
@@ -69,28 +69,14 @@ class Scoring:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScoreRequest(Scoring):
-    """One scene, or a folder of scenes named like the scans of the recording's data set.
-
-    baseline: score.json of an earlier score, whose figures are compared.
-    """
-
-    scene: Path
-    baseline: Path | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class ScoreResult:
-    """report: everything that ``score.json`` holds; the folder `out` where one was asked for; first_view: photo and
-    render of the first view that was scored of one scene.
-    """
+    """report: everything that ``score.json`` holds; the folder `out` where one was asked for."""
 
     __repr__ = brief
 
     report: Mapping[str, Any]
     verdict: Verdict
     out: Path | None = None
-    first_view: ComparisonRow | None = None
 
     @property
     def metrics(self) -> Mapping[str, float | None]:
@@ -118,23 +104,17 @@ def score(request: ScoreRequest, progress: Progress = SILENT) -> ScoreResult:
     names = NAMES if request.baseline is None else NAMES_WITH_CHANGES
     check_gate_names(request.require, names, {"--baseline": NAMES_WITH_CHANGES})
     scenes = _scenes_of_scans(request)
-    with folder_of(request) or nullcontext() as folder:
+    with output_path(request.out, force=request.force, is_folder=True) if request.out else nullcontext() as folder:
         if scenes:
             return _score_scans(request, scenes, folder, progress)
-        return score_scene(request, folder, progress)
+        return _score_scene(request, folder, progress)
 
 
-def folder_of(request: Scoring) -> AbstractContextManager[Path] | None:
-    """The output folder while it is written, None where nothing is."""
-    return output_path(request.out, force=request.force, is_folder=True) if request.out else None
-
-
-def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) -> ScoreResult:
+def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) -> ScoreResult:
     """Score one scene, and write what is asked for into `folder`, where there is one."""
     stopwatch, recording = Stopwatch(), request.recording
     if folder:
         folder.mkdir(exist_ok=True)
-    lpips = None if request.lpips is None else Lpips(request.lpips)
     scene = open_splats(request.scene)
     if scene.is_anisotropic:
         scene.gaussians()  # either raises where there is none to compare
@@ -152,7 +132,6 @@ def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) 
         scene=scene,
         reference=reference,
         cameras=cameras_to_score(wanted, reference, scene.cameras, allow_training=allow_training),
-        perceptual=lpips,
         draw=_view_drawer(folder / "views") if folder and request.images == "all" else None,
         newest=request.newest,
         allow_training=allow_training,
@@ -167,14 +146,13 @@ def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) 
     if cloud is not None:
         with stopwatch.stage("cloud"):
             surface = cloud_figures(cloud, scene, scores.training, request.threads)
-    protocol = _protocol(reference, scene, scores, None if lpips is None else lpips.name)
+    protocol = _protocol(reference, scene, scores)
     definitions = PROTOCOL | ({} if cloud is None else {"cloud": cloud.words()})
     metrics = total_score(scores.views) | surface
     metrics |= {"free_mass": _free_mass(request.scene, scene), "num_skipped": len(scores.skipped)}
     metrics["num_warnings"] = len(scores.doubts) + len(same["differences"])
     report = _report(request, scorer, scores, same, protocol | {"definitions": definitions}, as_json(metrics))
-    concluded = _concluded(request, report, is_damaged=bool(reference.source.loss.damaged))
-    result = replace(concluded, first_view=scores.first)
+    result = _concluded(request, report, is_damaged=bool(reference.source.loss.damaged))
     if folder:
         _write_table(folder / "views.csv", report["views"])
         with stopwatch.stage("pictures"):
@@ -184,7 +162,7 @@ def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) 
         config = {"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol}
         made = request.scene if request.scene.is_file() else request.scene / "splats.ply"
         inputs = {**digests, f"scene/{made.name}": sha256(made)}
-        write_result(folder, result, config=config, inputs=inputs, stopwatch=stopwatch)
+        _write_result(folder, result, config=config, inputs=inputs, stopwatch=stopwatch)
     return result
 
 
@@ -216,7 +194,7 @@ def _report(
     }
 
 
-def _protocol(reference: Reference, scene: SceneFolder, scores: Scores, lpips: str | None) -> dict[str, Any]:
+def _protocol(reference: Reference, scene: SceneFolder, scores: Scores) -> dict[str, Any]:
     """What a figure has to be printed with to be compared with another."""
     named, split = reference.protocol, reference.split
     sizes = sorted({view.size for view in scores.views})
@@ -234,7 +212,6 @@ def _protocol(reference: Reference, scene: SceneFolder, scores: Scores, lpips: s
         "published_scans": None if named is None or not named.scans else list(named.scans),
         "background": [round(value, 4) for value in scene.background],
         "averaging": AVERAGING,
-        "lpips": lpips,
     }
 
 
@@ -269,14 +246,13 @@ def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         table.writerows(rows)
 
 
-def write_result(
+def _write_result(
     folder: Path,
     result: ScoreResult,
     *,
     config: Mapping[str, Any],
     inputs: Mapping[str, str] | None = None,
     stopwatch: Stopwatch | None = None,
-    seed: int = 0,
 ) -> None:
     """``score.json`` and ``run.json``."""
     write_json(folder / "score.json", result.report)
@@ -287,27 +263,26 @@ def write_result(
         inputs=inputs or {},
         metrics=result.metrics,
         stopwatch=stopwatch or Stopwatch(),
-        seed=seed,
         verdict=result.verdict.as_dict(),
     )
 
 
 def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
-    """The scenes by scan where the request's is a folder of them; empty where it is one, or of no data set."""
+    """The scenes by scan where the request's is a folder of them; empty where it is one, or of no data set.
+
+    Raises InputError for a scan that has none.
+    """
     folder, recording = request.scene, request.recording
     if not recording.is_dtu or not folder.is_dir() or (folder / "splats.ply").is_file():
         return {}
     found = {path.name: path for path in sorted(folder.iterdir()) if (path / "splats.ply").is_file()}
-    return {name: found[name] for name in chosen(list(found), recording.scan, folder, "scene")} if found else {}
-
-
-def chosen(known: Sequence[str], text: str | None, where: Path, noun: str) -> list[str]:
-    """The names between commas, each once; all that are known for None. Raises InputError for one that is not."""
-    wanted = known if text is None else [name.strip() for name in text.split(",") if name.strip()]
-    unknown = [name for name in wanted if name not in known]
+    if not found or recording.scan is None:
+        return found
+    wanted = [name.strip() for name in recording.scan.split(",") if name.strip()]
+    unknown = [name for name in wanted if name not in found]
     if unknown:
-        raise InputError(f"{where}: no {noun} {unknown[0]!r}", remedy=f"{noun}s: {', '.join(known)}")
-    return list(dict.fromkeys(wanted))
+        raise InputError(f"{folder}: no scene {unknown[0]!r}", remedy=f"scenes: {', '.join(found)}")
+    return {name: found[name] for name in wanted}
 
 
 def _score_scans(
@@ -320,7 +295,7 @@ def _score_scans(
         recording = of_scan(request.recording, scan)
         # the means alone are held to gates and a baseline
         alone = replace(request, scene=scene, recording=recording, require=(), baseline=None)
-        results[scan] = score_scene(alone, folder and folder / scan, progress)
+        results[scan] = _score_scene(alone, folder and folder / scan, progress)
     report = {"scenes": str(request.scene), "reference": str(request.recording.path)}
     report |= report_of_scans({scan: result.report for scan, result in results.items()})
     result = _concluded(request, report, is_damaged=any(one.verdict.is_damaged for one in results.values()))
@@ -328,7 +303,7 @@ def _score_scans(
         names = [name for name in result.metrics if name != "num_scans" and not name.startswith(PREFIX)]
         rows = [{"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items()]
         _write_table(folder / "scans.csv", rows)
-        write_result(folder, result, config={"scans": report["scans"]})
+        _write_result(folder, result, config={"scans": report["scans"]})
     return result
 
 

@@ -16,7 +16,7 @@ from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, spaced, thinned
 from splatctrl_cli.evaluate.protocols import ObservedSpace, cloud_of_scan, read_observed
-from splatctrl_cli.evaluate.score import Perceptual, ViewScore, score_view
+from splatctrl_cli.evaluate.score import ViewScore, score_view
 from splatctrl_cli.evaluate.score_report import Doubts
 from splatctrl_cli.evaluate.views import View, seen_by, seen_pixels, surface_points, views_to_score
 from splatctrl_cli.files.output import Stopwatch
@@ -37,8 +37,8 @@ Ranked = tuple[float, ComparisonRow]
 
 @dataclass(kw_only=True)
 class Scores:
-    """What scoring gathers: the views, the names of those before the first snapshot, the pictures of the first view
-    and of each camera's best and worst.
+    """What scoring gathers: the views, the names of those before the first snapshot, the pictures of each camera's
+    best and worst.
 
     training: the frames that count as known at the last view; doubts: what speaks against the scores, in words.
     """
@@ -46,7 +46,6 @@ class Scores:
     has_clock: bool
     views: list[ViewScore] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
-    first: ComparisonRow | None = None
     extremes: dict[str, tuple[Ranked, Ranked]] = field(default_factory=dict)
     training: tuple[RgbdFrame, ...] = ()
     doubts: list[str] = field(default_factory=list)
@@ -62,7 +61,6 @@ class Scorer:
     scene: SceneFolder
     reference: Reference
     cameras: tuple[str, ...]
-    perceptual: Perceptual | None = None
     draw: Callable[[ComparisonRow], None] | None = None
     newest: bool = True
     allow_training: bool = False
@@ -143,7 +141,6 @@ class Scorer:
         rank = score.all.psnr if isnan(score.seen.psnr) else score.seen.psnr
         if self.draw is not None:
             self.draw(row)
-        scores.first = scores.first or row
         best, worst = scores.extremes.get(frame.camera, ((rank, row), (rank, row)))
         ends = max(best, (rank, row), key=itemgetter(0)), min(worst, (rank, row), key=itemgetter(0))
         scores.extremes[frame.camera] = ends
@@ -169,7 +166,6 @@ class Scorer:
             mask=mask,
             fill=0.0 if protocol is None else protocol.fill,
             is_zero_padded=protocol is not None and protocol.is_zero_padded,
-            perceptual=self.perceptual,
         )
         return score, ComparisonRow(
             title=view.name,

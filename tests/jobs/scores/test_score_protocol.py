@@ -109,7 +109,7 @@ def test_the_report_says_by_what_its_figures_came_about(place: Path) -> None:
     protocol = result["protocol"]
     assert " ".join(protocol) == (
         "name source layout training_views scored_views left_out_views split mask_rule resolution"
-        " published_resolution published_scans background averaging lpips definitions"
+        " published_resolution published_scans background averaging definitions"
     )
     assert (protocol["training_views"], protocol["scored_views"]) == ([1, 2, 3, 5, 6, 7], [0, 4])
     assert len(protocol["background"]) == 3
@@ -279,10 +279,10 @@ def test_the_surface_is_compared_with_a_mesh(place: Path, views: list[DtuView], 
 
 
 def test_a_gate_on_what_was_not_scored_fails(place: Path) -> None:
-    verdict = scored(place, "mvsnet", require=("psnr_masked>=1", "lpips<=1")).verdict
+    verdict = scored(place, "mvsnet", require=("psnr_masked>=1", "mask_share<=1")).verdict
     first = "score: NOT EVALUABLE (2 views): --require psnr_masked>=1: psnr_masked is unknown, required >= 1"
     assert verdict.sentence.startswith(first)
-    assert verdict.decisive[1].sentence == "lpips is unknown, required <= 1"
+    assert verdict.decisive[1].sentence == "mask_share is unknown, required <= 1"
 
 
 def test_another_scan_of_the_same_camera_names_is_refused_with_figures(
