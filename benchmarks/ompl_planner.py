@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from experiments.drawn_task import solids_of
+from experiments.problems import Problem
 from splatctrl_cli.config import PlannerConfig
-from splatctrl_cli.jobs.simulated_task import solids_of
-from splatctrl_cli.jobs.studies.problems import Problem
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
 from splatctrl_cli.planner.path import joint_length, resampled

@@ -11,17 +11,17 @@ import numpy as np
 
 from benchmarks.measure import Limit, Options, Result
 from benchmarks.ompl_planner import notes_beside_ompl
+from experiments.drawn_task import solids_of
+from experiments.problems import Problem, panda, read_archive
+from experiments.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.errors import SplatCtrlError
-from splatctrl_cli.jobs.simulated_task import solids_of
-from splatctrl_cli.jobs.studies.problems import Problem, panda, read_archive
 from splatctrl_cli.planner.birrt import Plan, plan
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
 from splatctrl_cli.planner.path import TimedPath, effector_length, joint_length, least_clearance, resampled, timed
-from splatctrl_cli.planner.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.records import Bool, Float64
 
 FRAME = "panda_grasptarget"
@@ -104,7 +104,7 @@ def _followed(solved: Solved, room: Clearance) -> tuple[Followed, Followed]:
     planner, control = PlannerConfig(), ControlConfig(margin=0.0, self_margin=0.0, max_time=60.0, solver="daqp")
     path = timed(solved.plan.waypoints, room.model.velocity_limit, planner.max_acceleration)
     slow = timed(solved.plan.waypoints, room.model.velocity_limit / 4, planner.max_acceleration)
-    joints, scene = follow_joints(path, room.model, planner, control), solids_of(solved.problem.things)
+    joints, scene = follow_joints(path, room.model, control), solids_of(solved.problem.things)
     guided, _ = follow_with_controller(slow, room.model, lambda stamp_ns: scene, FRAME, planner, control)
     return _figures(joints, path, room, control), _figures(guided, slow, room, control)
 

@@ -18,7 +18,7 @@ from splatctrl_cli.field.clustered_splats import Spheres
 from splatctrl_cli.field.distance import make_field
 from splatctrl_cli.field.probability import CalibratedProbability, PaperProbability
 from splatctrl_cli.records import Float64
-from splatctrl_cli.report.study_pictures import Reliability, reliability, reliability_picture
+from splatctrl_cli.report.reliability import Reliability, reliability, reliability_picture
 
 SPACINGS = (0.01, 0.02)  # [m]
 NOISE = 0.002  # [m]

@@ -40,7 +40,6 @@ PRELOADED = (
     "bakes.bake",
     "scores.score",
     "replay",
-    "studies.study",
 )  # of a runner
 MOST_ROWS = 40  # recordings that are all printed
 OWN = ("out", "force", "resume", "threads")  # options that a batch gives itself, where a command has them

@@ -26,9 +26,7 @@ from splatctrl_cli.jobs.replay import ReplayResult
 from splatctrl_cli.jobs.scores.score import ScoreResult
 from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
 from splatctrl_cli.simulate.arm import UNMODELLED
-from splatctrl_cli.simulate.environments import ENVIRONMENT_S
 from splatctrl_cli.simulate.recording import RecordingOptions
-from splatctrl_cli.simulate.shared_workspace import DURATION_S
 
 
 def run(args: argparse.Namespace) -> int:
@@ -61,8 +59,6 @@ def _show(console: Console, result: StepResult) -> int:
 def run_simulate(args: argparse.Namespace) -> int:
     console = Console(args)
     given = {"duration_s": args.duration, "with_person": args.person, "is_free": args.free}
-    if args.duration is None and (args.human_arm is not None or args.environment is not None):
-        given["duration_s"] = DURATION_S if args.environment is None else ENVIRONMENT_S
     options = request_of(RecordingOptions, args, **{name: v for name, v in given.items() if v is not None})
     parts = () if args.unmodelled is None else names_of(args.unmodelled, tuple(UNMODELLED), "--unmodelled")
     of_arm: dict[str, Any] = {"is_slim": args.slim, "unmodelled": parts}

@@ -24,28 +24,14 @@ SIMULATE = (
     option("--urdf FILE", "another arm with collision geometry, its base on the table", Path),
     option("--spheres FILE", "its spheres (default: fitted to it)", Path),
     PACKAGES,
-    seed("the noise, of --environment and of --human-arm"),
-    option(
-        "--duration S",
-        "length in seconds (default: 7; with --environment 12, with --human-arm 24)",
-        real(0.5, 600, "s"),
-    ),
+    seed("the noise"),
+    option("--duration S", "length in seconds (default: 7)", real(0.5, 600, "s")),
     option("--free", "free space: floor and walls, no table and nothing on it"),
     option("--person", "a walking person with masks, instead of the standing cylinder"),
     option(
         "--visitor X,Y,RADIUS",
         "where the standing cylinder is, and its radius [m] (default: 0.42,0.08,0.06)",
         numbers,
-    ),
-    option(
-        "--human-arm",
-        "a table shared with a person's arm, with masks, that works beside the arm's pickup or its goal",
-        ("near-pickup", "near-goal"),
-    ),
-    option(
-        "--environment",
-        "things on tables, or a shelf, drawn by the seed, and a way through",
-        ("tabletop", "cubby", "merged-cubby"),
     ),
     option(
         "--dtu",
@@ -65,7 +51,6 @@ SIMULATE = (
             "--unmodelled PARTS",
             "parts of the arm that images and truth.json have and robot.urdf has not: tool,cable,bracket, or some",
         ),
-        option("--num-cameras N", "with --environment: 2 to 6 about the arm", whole(2, 6), 4),
         option("--fps HZ", "frames a second", real(0.1, 60, "Hz"), 5.0),
     ),
 )

@@ -1,9 +1,9 @@
-"""The options of ``batch``, ``sweep``, ``study``, ``compare``, ``report`` and ``view``: of many runs."""
+"""The options of ``batch``, ``sweep``, ``compare``, ``report`` and ``view``: of many runs."""
 
 import argparse
 from pathlib import Path
 
-from splatctrl_cli.cli.options import THREADS, output
+from splatctrl_cli.cli.options import output
 from splatctrl_cli.cli.parser import group, option, real, whole
 
 ROOT = "folder in which the scene and robot of a replay's command line are looked for, if they were moved"
@@ -71,28 +71,6 @@ SWEEP = (
     ),
     option("--workers N", "runs at once (default: one per core)", whole(1, 256)),
     option("--dask ADDRESS", "make the runs on a Dask cluster that shares this folder"),
-)
-STUDY = (
-    option(
-        "STUDY",
-        "table2: planning in reconstructed scenes; scenes: pick and place in twelve scenes; shared-workspace: a"
-        " person's arm comes near; dtu: splats beside 3D Gaussian splatting; ablation: table2 without a part of ours",
-        ("table2", "scenes", "shared-workspace", "dtu", "ablation"),
-    ),
-    option("-o/--out DIR", "folder of the study, where it goes on (default: STUDY)", Path),
-    option("--trials N", "problems of each kind (default: as many as the paper's)", whole(1, 100_000)),
-    option("--methods A,B", "some of the study's (splatctrl help study; default: all that are installed)", _names),
-    option(
-        "--problems DIR", "table2: MotionBenchMaker's (default: of SPLATCTRL_REAL_DATA); dtu: a tree of scans", Path
-    ),
-    option("--width PX", "of the cameras' images (default: 320; scenes 640, shared-workspace 160)", whole(32, 1280)),
-    option("--workers N", "problems that run at once (default: one per core)", whole(1, 256)),
-    option("--shard I/N", "only every N-th problem, from the I-th on", _shard),
-    option("--dask ADDRESS", "run the problems on a Dask cluster that shares this folder"),
-    option("--made PATH ...", "make the table of these trials (trials.csv, or a study's folder), and run none", Path),
-    option("--problem NAME", "run one problem alone, such as cubby-0007, wall-0002 or near-goal-0003"),
-    option("--force", "replace the output of --problem if it exists"),
-    THREADS,
 )
 COMPARE = (
     option("OUTPUT", "folder that a command or a batch wrote; of two the earlier first", Path, nargs="+"),

@@ -84,7 +84,6 @@ EVICT_ASKED = 8  # splats that are looked at for each missing slot, those that s
 EVICT_NEARER = 0.3  # [m] by which a surface must be nearer to the robot's path than one given up for it
 MOST_GROWTH = 4  # times the default, to which the budget grows by itself
 NEAREST_REACH = 0.01  # [m] about a pixel, times the scale, in which no depth may be farther than what floats
-SPLIT_PARTS = 2  # Gaussians that a split one becomes (the baseline 3dgs)
 
 # Map: occupancy, and which pixels are the robot's
 NARROW_HOLE = 2.0  # [voxels] holes that are not wider are common beside edges
@@ -190,10 +189,7 @@ UNWATCHED_NS = 500_000_000  # [ns] without depth from about the arm: two frame s
 UNWATCHED_AFTER_NS = 10_000_000_000  # [ns] after a motion, in which the next depth is waited for
 UNWATCHED_APART_NS = 20_000_000  # [ns] between postures that are held against the next map
 NEWS_LEAST = 3  # spheres new to a map in what was free: fewer come from single pixels of noise at every time step
-MAX_RESUME = 100.0  # [m] a zone wider than any hall would hold the arm for ever
-ZONE_RESOLUTION = 0.01  # [m] a person this near to a box counts as inside
 NEXT_SCENE_NS = 500_000_000  # [ns] after a motion, in which the next scene is looked for
-GOLDEN_TOLERANCE = 1e-6  # [rad/s] of --golden-tolerance: steps.csv keeps nine digits; another machine needs more
 
 # Planner (IV)
 SHORTCUT_WORTH = 1e-3  # [rad] that a shortcut has to save
@@ -220,12 +216,6 @@ SIMULATED_NEARINGS = 10  # times: to a fifth of it
 SIMULATED_SAMPLES = 25  # of a leg whose clearance is looked at
 SIMULATED_CLEARANCE = 0.05  # [m] that a leg should keep: twice the margin and what a map errs by
 SIMULATED_SHORTFALL = 20.0  # [rad] longer, a leg without any clearance
-TASK_CLEARANCE = 0.03  # [m] that a way through a drawn environment keeps: the margin, and what a map errs by
-TASK_SPARE = 0.002  # [m] more of start and goal
-TASK_ENVIRONMENTS = 50  # drawn until one has a way
-TASK_GUESSES = 24  # random postures that the search for a place begins with
-TASK_POSTURES = 4  # at a goal
-TASK_APART = 0.20  # [m] of start and goal
 
 # Robot: its spheres, and what they leave uncovered
 DEFICIT_GAP = 1e-5  # [m] between the proven and the found deficit
@@ -321,8 +311,6 @@ CLOUD_DISTANCE = 0.020  # [m] of DTU's evaluation: what is farther off counts in
 CLOUD_SPACING = 0.0002  # [m] of DTU's evaluation
 CLOUD_NO_OVERLAP = 0.001  # share of two boxes' volume: they do not meet
 CLOUD_GOOD_OVERLAP = 0.05  # share of two boxes' volume: their units agree
-COMPARED_SPLATS = 10_000  # IV-A: what both methods begin with, and the budget of ours
-COMPARED_FIRST = 300  # of ours: on the first time step, the rest refines
 EXPORT_MIN_PSNR = 80.0  # [dB] of a format that rounds to float32 alone; measured: 107 and more, or the same
 EXPORT_DIFFERENCE = 3 / 255  # the last bit can take a splat across the renderer's cut-off of 1/255
 EXPORT_MAX_COLOR = 1e4  # of a sensor's 0 to 1, or of a harmonic; from 1e6 on an isotropic PLY looks otherwise

@@ -169,7 +169,7 @@ MARKERS = ("run.json", "capture.json")  # at the top of every folder that a comm
 PARTIAL = ".partial"  # ends the name of an output that is not whole
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin", "clarabel", "mcap", "rosbags")
 _WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EBADF})
-WITH_PARTS = ("reconstruct", "sdf-bake", "replay", "study")  # commands whose folders others rely on
+WITH_PARTS = ("reconstruct", "sdf-bake", "replay")  # commands whose folders others rely on
 NO_PARTS = ("run.json", "checkpoint")  # what holds the digests, and what only an interrupted run reads
 
 

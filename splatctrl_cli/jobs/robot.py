@@ -17,7 +17,7 @@ from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.records import SphereSet
-from splatctrl_cli.report.study_pictures import robot_picture
+from splatctrl_cli.report.robot_picture import robot_picture
 from splatctrl_cli.robot.coverage import CoverageReport, LinkCoverage, coverage_of_solids
 from splatctrl_cli.robot.link_meshes import Solid, mesh_path, read_solids
 from splatctrl_cli.robot.model import RobotModel

@@ -1,6 +1,6 @@
 """A simulation from its request to its result: a recorded log of an arm at a table, with its truth."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,6 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.simulated_arm import adapted_motion, copied_arm
-from splatctrl_cli.jobs.simulated_task import task_of
 from splatctrl_cli.logs.mcap_writer import mcap_log
 from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
@@ -29,6 +28,7 @@ class SimulateRequest:
     urdf: of another arm than the simulated one, its base on the table at the world's origin; spheres: that cover it
     (None: fitted); packages: where its meshes are looked for. is_slim: the arm is seen by shapes inside of its
     collision shapes; unmodelled: names of `UNMODELLED` parts that move with it, in images and truth alone.
+    scene: what stands there and how the robot moves in it, instead of the table of the options.
     """
 
     out: Path
@@ -36,6 +36,7 @@ class SimulateRequest:
     spheres: Path | None = None
     packages: tuple[Path, ...] = ()
     options: RecordingOptions = field(default_factory=RecordingOptions)
+    scene: Callable[[RobotModel], Scene] | None = None
     is_slim: bool = False
     unmodelled: tuple[str, ...] = ()
     dtu: bool = False
@@ -122,12 +123,8 @@ def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Re
     else:
         progress.log(f"simulate: reading {request.urdf.name}")
         robot, surfaces = copied_arm(request.urdf, request.spheres, request.packages, folder, progress)
-    if options.environment is not None:
-        progress.log(f"simulate: looking for a way through the {options.environment}")
-        scene = task_of(options.environment, options.seed, robot).scene(robot, options)
-        return Recording(options, robot, scene, request.unmodelled)
-    scene = Scene.of(options)
-    if surfaces is not None:
+    scene = Scene.of(options) if request.scene is None else request.scene(robot)
+    if surfaces is not None and request.scene is None:
         progress.log("simulate: looking for a way through the scene")
         scene = replace(scene, motion=adapted_motion(scene, robot, surfaces))
     return Recording(options, robot, scene, request.unmodelled)

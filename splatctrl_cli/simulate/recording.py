@@ -12,10 +12,9 @@ from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFram
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import visual_urdf
-from splatctrl_cli.simulate import shared_workspace, tabletop
+from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.arm import UNMODELLED, Capsule, Motion, link_shape
 from splatctrl_cli.simulate.depth_camera import WIDTH, DepthNoise, StereoDepth
-from splatctrl_cli.simulate.environments import ENVIRONMENTS
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.render import Camera, Renderer
 from splatctrl_cli.simulate.truth import distance_to
@@ -37,10 +36,8 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 class RecordingOptions:
     """What to record: duration [s], frames per second of each camera, image size [px], depth noise, its seed.
 
-    with_person: a walking person with masks, instead of the standing cylinder. human_arm: one of
-    `shared_workspace.PLACES`, instead of both: the table shared with a person's arm, whose visit the seed draws.
-    is_free: floor and walls alone, without the table and what is on it. environment: one of `ENVIRONMENTS`, which the
-    seed draws, seen by `num_cameras`. visitor: x, y and radius [m] of the standing cylinder.
+    with_person: a walking person with masks, instead of the standing cylinder. is_free: floor and walls alone,
+    without the table and what is on it. visitor: x, y and radius [m] of the standing cylinder.
     color_rays: 0 to 4 rays for a pixel's colour beside the one for its depth.
     """
 
@@ -51,10 +48,7 @@ class RecordingOptions:
     noise: str = "realsense"
     seed: int = 0
     with_person: bool = False
-    human_arm: str | None = None
     is_free: bool = False
-    environment: str | None = None
-    num_cameras: int = 4
     visitor: tuple[float, ...] = tabletop.VISITOR
     color_rays: int = 4
 
@@ -68,22 +62,13 @@ class RecordingOptions:
                 raise UsageError(f"{option}: expected 16 to 4096 px, got {value}")
         if self.noise not in NOISES:
             raise UsageError(f"--noise: expected one of {', '.join(NOISES)}, got {self.noise}")
-        if self.human_arm is not None and (self.with_person or self.human_arm not in shared_workspace.PLACES):
-            places = ", ".join(shared_workspace.PLACES)
-            raise UsageError(f"--human-arm: expected one of {places}, without --person, got {self.human_arm}")
-        if self.is_free and (self.with_person or self.human_arm is not None):
-            raise UsageError("--free: expected neither --person nor --human-arm, who stand about the table")
-        if self.environment is not None and (self.with_person or self.human_arm is not None or self.is_free):
-            raise UsageError("--environment: expected neither --person, --human-arm nor --free, which have their own")
-        if self.environment not in (None, *ENVIRONMENTS) or not 2 <= self.num_cameras <= 6:
-            kinds = ", ".join(ENVIRONMENTS)
-            raise UsageError(f"--environment: expected one of {kinds}, and 2 to 6 --num-cameras")
+        if self.is_free and self.with_person:
+            raise UsageError("--free: expected no --person, who walks about the table")
         if len(self.visitor) != 3 or not 0.001 <= self.visitor[2] <= 1 or max(map(abs, self.visitor[:2])) > 5:
             given = ",".join(f"{value:g}" for value in self.visitor)
             raise UsageError(f"--visitor: expected X,Y within 5 m and RADIUS from 0.001 to 1 m, got {given}")
-        has_none = self.with_person or self.human_arm is not None or self.is_free or self.environment is not None
-        if self.visitor != tabletop.VISITOR and has_none:
-            raise UsageError("--visitor: expected no --person, --human-arm, --free or --environment")
+        if self.visitor != tabletop.VISITOR and (self.with_person or self.is_free):
+            raise UsageError("--visitor: expected no --person or --free")
         if self.seed < 0:
             raise UsageError(f"--seed: expected 0 or more, got {self.seed}")
 
@@ -91,38 +76,30 @@ class RecordingOptions:
 @dataclass(frozen=True, kw_only=True)
 class Scene:
     """What stands there (`primitives`, the last of them, `temporary`, for a while only), the motion of an arm among
-    it, and cameras other than those of the table.
+    it, and cameras other than those of the table. has_people: images have masks of what is temporary.
     """
 
     primitives: tuple[Primitive, ...]
     temporary: tuple[Primitive, ...]
     motion: Motion
     cameras: tuple[Camera, ...] = ()
+    has_people: bool = False
 
     @classmethod
     def of(cls, options: RecordingOptions) -> "Scene":
         """The scene that the options ask for."""
-        if options.human_arm is not None:
-            visit = shared_workspace.visit_of(options.human_arm, options.seed)
-            things = shared_workspace.things(options.human_arm, options.seed)
-            temporary = shared_workspace.human_arm(visit, START_NS)
-            return cls._with(tabletop.furniture(), things, temporary, shared_workspace.task_motion(visit))
         motion = tabletop.arm_motion(options.duration_s)
         if options.is_free:
-            return cls._with([p for p in tabletop.furniture() if p.name != "table"], [], [], motion)
+            walls = tuple(p for p in tabletop.furniture() if p.name != "table")
+            return cls(primitives=walls, temporary=(), motion=motion)
         span = round(options.duration_s * 1e9)
         third = (START_NS + span // 3, START_NS + 2 * span // 3)
         num_steps = max(round(options.duration_s * options.fps / 3), 1)
         temporary = (
             tabletop.person(*third, num_steps) if options.with_person else [tabletop.visitor(*third, options.visitor)]
         )
-        return cls._with(tabletop.furniture(), tabletop.things(), temporary, motion)
-
-    @classmethod
-    def _with(
-        cls, furniture: list[Primitive], things: list[Primitive], temporary: list[Primitive], motion: Motion
-    ) -> "Scene":
-        return cls(primitives=(*furniture, *things, *temporary), temporary=tuple(temporary), motion=motion)
+        there = (*tabletop.furniture(), *tabletop.things(), *temporary)
+        return cls(primitives=there, temporary=tuple(temporary), motion=motion, has_people=options.with_person)
 
 
 class Recording:
@@ -147,7 +124,7 @@ class Recording:
         scene = Scene.of(options) if scene is None else scene
         self.start_ns, self.end_ns = START_NS, START_NS + round(options.duration_s * 1e9)
         self.cameras = scene.cameras or tabletop.cameras(options.width, options.height)
-        self.primitives, self._temporary = scene.primitives, scene.temporary
+        self.primitives, self._temporary, self._has_people = scene.primitives, scene.temporary, scene.has_people
         self._motion = scene.motion.within(robot.velocity_limit)
         seen = visual_urdf(robot.urdf)
         self._shapes = (*seen.shapes, *(link_shape(link, capsule) for link, capsule in parts))
@@ -173,12 +150,12 @@ class Recording:
         arm = tabletop.arm_solids(self._shapes, poses)
         meshes = None if self._meshes is None else self._meshes.at(poses)
         passing = [p.at(stamp_ns) for p in self._temporary if p.is_present(stamp_ns)]
-        noise, has_masks = NOISES[self.options.noise], self.options.with_person or self.options.human_arm is not None
+        noise = NOISES[self.options.noise]
         for number, renderer in enumerate(self._renderers):
             if cameras is not None and renderer.camera.name not in cameras:
                 continue
             color, depth = renderer.image([*arm, *passing], meshes)
-            human = _shown(depth, renderer.depth(arm, meshes)) if has_masks else None
+            human = _shown(depth, renderer.depth(arm, meshes)) if self._has_people else None
             if noise is not None:
                 rng, focal = np.random.default_rng([self.options.seed, number, index]), renderer.camera.intrinsics.fx
                 depth = noise.applied(depth, rng, focal=focal)

@@ -141,17 +141,3 @@ def test_parts_of_another_arm_are_refused(tmp_path: Path, options: tuple[str, ..
     result = here.splatctrl("simulate", "-o", tmp_path / "out", *TINY, *options)
     assert result.returncode == 2 and message in result.stderr
     assert not (tmp_path / "out").exists()
-
-
-def test_a_persons_arm_is_in_the_log_and_moves_in_the_truth(tmp_path: Path) -> None:
-    out = tmp_path / "shared"
-    result = here.splatctrl("simulate", "-o", out, *TINY[2:], "--duration", "3", "--human-arm", "near-pickup", "-q")
-    assert (result.returncode, result.stderr) == (0, "")
-    truth = load_truth(out / "truth.json")
-    hand = next(p for p in truth.primitives if p.name == "human.hand")
-    assert hand.kind == "capsule"
-    assert hand.track is not None
-    first, later = (hand.at(int(hand.track.stamp_ns[0]) + dt).T_world_shape for dt in (0, 1_000_000_000))
-    assert np.linalg.norm(first[:3, 3] - later[:3, 3]) > 0.1
-    with AnyReader([out / "log.mcap"]) as reader:
-        assert "/cam0/people/mask" in {connection.topic for connection in reader.connections}

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.problems import simulated_arm
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import ReplayTask, is_at_goal
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.jobs.studies.problems import simulated_arm
 from splatctrl_cli.planner.birrt import plan
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.path import least_clearance

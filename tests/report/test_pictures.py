@@ -9,6 +9,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
+from experiments.pictures import Panel, trials_picture
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import DistanceGrid, UInt8
 from splatctrl_cli.report import replay_pictures
@@ -18,9 +19,9 @@ from splatctrl_cli.report.pictures import (
     ComparisonRow,
     comparison_picture,
     field_slice_picture,
-    renders_picture,
     view_picture,
 )
+from splatctrl_cli.report.reliability import reliability, reliability_picture
 from splatctrl_cli.report.replay_pictures import (
     SHORTEST,
     clearance_picture,
@@ -31,7 +32,6 @@ from splatctrl_cli.report.replay_pictures import (
     open_loop_picture,
     spans,
 )
-from splatctrl_cli.report.study_pictures import Panel, reliability, reliability_picture, trials_picture
 
 
 def row(depth_error: float) -> ComparisonRow:
@@ -269,19 +269,6 @@ def test_the_mask_is_outlined(tmp_path: Path) -> None:
     height = plain.shape[0] // 2
     assert not np.array_equal(plain[60 : height - 30], outlined[60 : height - 30])
     assert np.array_equal(plain[60 : height - 30], whole[60 : height - 30]), "nothing to outline"
-
-
-def test_methods_stand_side_by_side_with_their_errors(tmp_path: Path) -> None:
-    photo = scored_row(0.0).photo
-    exact, off = scored_row(0.0).render, scored_row(0.3).render
-    renders_picture(tmp_path / "a.png", "holdout-0000", photo, {"one": exact, "other": off})
-    renders_picture(tmp_path / "b.png", "holdout-0000", photo, {"one": exact, "other": exact})
-    a, b = (cv2.imread(str(tmp_path / name)) for name in ("a.png", "b.png"))
-    assert a is not None
-    assert b is not None
-    assert a.shape == b.shape
-    assert np.array_equal(a[40:, 420:790], b[40:, 420:790]), "the first method's column"
-    assert not np.array_equal(a[40:, 810:], b[40:, 810:])
 
 
 def test_each_kind_of_event_that_came_up_has_a_row(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.report.study_pictures import reliability
+from splatctrl_cli.report.reliability import reliability
 
 
 def test_a_probability_that_is_drawn_by_itself_is_reliable() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments.shared_workspace import scene_of
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import pose_at
@@ -86,16 +87,18 @@ def ur10e(folder: Path, text: str = "") -> RobotModel:
     return RobotModel.from_urdf(written(folder, text or ur10e_urdf()), spheres)
 
 
-@pytest.mark.parametrize("options", [RecordingOptions(), RecordingOptions(human_arm="near-goal", duration_s=24.0)])
-def test_an_arm_of_six_joints_goes_where_ours_goes(tmp_path: Path, options: RecordingOptions) -> None:
-    model, scene = ur10e(tmp_path), Scene.of(options)
+@pytest.mark.parametrize(
+    ("scene", "duration"), [(Scene.of(RecordingOptions()), 7.0), (scene_of("near-goal", 0), 24.0)]
+)
+def test_an_arm_of_six_joints_goes_where_ours_goes(tmp_path: Path, scene: Scene, duration: float) -> None:
+    model = ur10e(tmp_path)
     motion = adapted_motion(scene, model, SelfSurfaces(model, {}))
     np.testing.assert_array_equal(motion.times, scene.motion.times)
     for ours, theirs in zip(scene.motion.waypoints, motion.waypoints, strict=True):
         hand, tip = hand_pose(ours), model.frame_pose(theirs, "tool0")
         np.testing.assert_allclose(tip[:3, 3], hand[:3, 3], atol=2e-3)
         assert tip[:3, 2] @ hand[:3, 2] > 0.999
-    seconds = np.linspace(0, options.duration_s, 200)
+    seconds = np.linspace(0, duration, 200)
     velocity = np.array([motion.at(second)[1] for second in seconds])
     assert np.all(np.abs(velocity) <= model.velocity_limit)
 
@@ -160,7 +163,7 @@ def test_another_arm_keeps_its_velocity_limits_in_any_time(
 
 def test_an_arm_that_is_too_slow_for_its_task_beside_a_person_is_refused(tmp_path: Path) -> None:
     slow = ur10e(tmp_path, re.sub(r'velocity="[^"]+"', 'velocity="0.2"', ur10e_urdf()))
-    scene = Scene.of(RecordingOptions(human_arm="near-goal", duration_s=24.0))
+    scene = scene_of("near-goal", 0)
     with pytest.raises(InputError, match="expected a way between the waypoints, got none"):
         adapted_motion(scene, slow, SelfSurfaces(slow, {}))
 
@@ -169,5 +172,5 @@ def test_free_space_has_floor_and_walls_alone() -> None:
     scene = Scene.of(RecordingOptions(is_free=True))
     assert {p.name for p in scene.primitives} == {"floor", "wall_back", "wall_left", "wall_right"}
     assert scene.temporary == ()
-    with pytest.raises(UsageError, match="--free: expected neither --person nor --human-arm"):
+    with pytest.raises(UsageError, match="--free: expected no --person"):
         RecordingOptions(is_free=True, with_person=True)

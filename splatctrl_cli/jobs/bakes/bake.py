@@ -43,7 +43,7 @@ from splatctrl_cli.jobs.reconstructions.resume import deciding_versions, told_ho
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
-from splatctrl_cli.report.study_pictures import reliability_picture
+from splatctrl_cli.report.reliability import reliability_picture
 
 SUMMARY_METRICS = {
     **dict.fromkeys(("num_splats", "num_splats_left_out", "num_cells"), DESCRIBES),

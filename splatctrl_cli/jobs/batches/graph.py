@@ -26,7 +26,6 @@ ROLES: Mapping[str, Mapping[str, str]] = {  # what an option is where the suite 
     "sdf-bake": {"scene": SCENE},
     "score": {"scene": SCENE, "reference": CAPTURE},
     "replay": {"log": CAPTURE, "scene": SCENE},
-    "study": {},
 }
 COMMANDS = tuple(ROLES)
 TABLES = ("set", "perturb")  # options of which a matrix varies one entry: set.SECTION.KEY, perturb.NAME

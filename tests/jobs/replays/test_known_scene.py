@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from experiments.problems import simulated_arm
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.events import Obstacle
@@ -15,7 +16,6 @@ from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.grid_files.npz_grid import read_npz, write_npz
 from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene, fields_at, known_space
 from splatctrl_cli.jobs.replays.state_pass import ReplayRecord
-from splatctrl_cli.jobs.studies.problems import simulated_arm
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.self_model import ALWAYS
 from splatctrl_cli.scene.posture import posture_of

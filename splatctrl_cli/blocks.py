@@ -1,0 +1,286 @@
+"""The parts that jobs are made of, for programs of one's own: robot, scene, fields, planner, controller, simulation.
+
+The jobs and their requests are in `splatctrl_cli.api`; these names may change with a minor version.
+"""
+
+from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
+from splatctrl_cli.config.fixed import START_ROOM
+from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.control.audit import DistanceFunction, DistancesAt, audited
+from splatctrl_cli.control.events import runs_of
+from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, guided_goal, pose_error
+from splatctrl_cli.control.open_loop import is_shaped
+from splatctrl_cli.control.replay import Outcome as MotionOutcome
+from splatctrl_cli.control.replay import ReplayTask, closed_loop, is_at_goal
+from splatctrl_cli.control.scene_field import SceneStep, rate_of
+from splatctrl_cli.control.step import ControlStep, QpIkController
+from splatctrl_cli.datasets.dtu import scan_folders
+from splatctrl_cli.datasets.idr import idr_scans
+from splatctrl_cli.evaluate.protocols import SURFACE_SCANS
+from splatctrl_cli.evaluate.verdict import verdict_of
+from splatctrl_cli.field.baker import Baker, Planes
+from splatctrl_cli.field.distance import SphereField
+from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, GridLayout
+from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
+from splatctrl_cli.files.output import (
+    Stopwatch,
+    output_path,
+    write_json,
+    write_run,
+)
+from splatctrl_cli.geometry import (
+    back_project,
+    frame_along,
+    invert_transform,
+    look_at,
+    pose_at,
+    project,
+    transform_from,
+    transform_points,
+    turn_about_z,
+)
+from splatctrl_cli.jobs.progress import SILENT
+from splatctrl_cli.jobs.replays.criteria_input import Judged
+from splatctrl_cli.jobs.replays.detours import ROUNDING, Certified, certified_distance
+from splatctrl_cli.jobs.replays.goal import checked_pose, goal_waypoints
+from splatctrl_cli.jobs.replays.inputs import LoggedStates, MeasuredRobot, measured_robot
+from splatctrl_cli.jobs.replays.known_scene import (
+    KnownFields,
+    KnownScene,
+    fields_at,
+    known_space,
+    seen_of,
+    splat_fields,
+)
+from splatctrl_cli.jobs.replays.metrics import metrics_of
+from splatctrl_cli.jobs.replays.modes import replayed
+from splatctrl_cli.jobs.replays.request import ReplayInputs
+from splatctrl_cli.jobs.replays.verdict import replay_verdict
+from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
+from splatctrl_cli.kernels import gaussians as gaussian_kernels
+from splatctrl_cli.kernels import native, num_threads
+from splatctrl_cli.kernels.raster import ImageLoss, LossTerms
+from splatctrl_cli.libraries import is_installed, mpl, of_extra
+from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.planner.birrt import plan
+from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, OnlyDistance
+from splatctrl_cli.planner.edges import check_edges
+from splatctrl_cli.planner.path import TimedPath, effector_length, joint_length, least_clearance, resampled
+from splatctrl_cli.planner.planned import (
+    GOAL_BLOCKED,
+    START_BLOCKED,
+    PlannedPath,
+    goal_postures,
+    planned_detours,
+    planned_path,
+)
+from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Rod, Solid, Solids
+from splatctrl_cli.records import (
+    Bool,
+    DistanceField,
+    DistanceGrid,
+    Float32,
+    Float64,
+    GaussianSet,
+    Intrinsics,
+    LossReport,
+    Record,
+    RgbdFrame,
+    SplatSet,
+    Stamps,
+    UInt8,
+)
+from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, save_figure
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_collision import random_postures
+from splatctrl_cli.robot.surface import RobotSurface
+from splatctrl_cli.robot.urdf import Shape
+from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.keyframes import View
+from splatctrl_cli.scene.posture import RobotPosture, posture_of
+from splatctrl_cli.scene.render import loss_weights, mean_loss, psnr_of
+from splatctrl_cli.scene.scale import RecordedDepth, fitted_to
+from splatctrl_cli.scene.self_mask import PixelKind, self_mask, self_mask_metrics
+from splatctrl_cli.scene.time_steps import AuditRow, depth_box
+from splatctrl_cli.simulate.arm import PEAK, Motion, arm_spheres_yaml, arm_urdf
+from splatctrl_cli.simulate.depth_camera import DepthNoise
+from splatctrl_cli.simulate.primitives import Primitive, Texture, Track, box, solid
+from splatctrl_cli.simulate.recording import START_NS, Recording, RecordingOptions, Scene
+from splatctrl_cli.simulate.render import Camera, Renderer
+from splatctrl_cli.simulate.tabletop import PALETTE, arm_solids, cameras, furniture, texture
+from splatctrl_cli.simulate.truth import closest_of, distance_to
+from splatctrl_cli.sources.calibrated import Perturbation
+from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
+from splatctrl_cli.splat_files.splats import nearest_splats
+from splatctrl_cli.voxels import Balls, OccupancyGrid, SeenVoxels, VoxelState
+
+__all__ = [
+    "CURVE_COLORS",
+    "GOAL_BLOCKED",
+    "HALF_DIAGONAL",
+    "INK",
+    "PALETTE",
+    "PEAK",
+    "ROUNDING",
+    "SILENT",
+    "START_BLOCKED",
+    "START_NS",
+    "START_ROOM",
+    "SURFACE_SCANS",
+    "ArmModel",
+    "AuditRow",
+    "Baker",
+    "Ball",
+    "Balls",
+    "Bool",
+    "Camera",
+    "Certified",
+    "Clearance",
+    "ControlConfig",
+    "ControlStep",
+    "Cuboid",
+    "DepthNoise",
+    "Detour",
+    "DistanceField",
+    "DistanceFunction",
+    "DistanceGrid",
+    "DistancesAt",
+    "Float32",
+    "Float64",
+    "GaussianSet",
+    "GridField",
+    "GridLayout",
+    "Guide",
+    "HasDistance",
+    "ImageLoss",
+    "Intrinsics",
+    "Judged",
+    "KnownFields",
+    "KnownScene",
+    "LoggedMotion",
+    "LoggedStates",
+    "LossReport",
+    "LossTerms",
+    "MeasuredRobot",
+    "Motion",
+    "MotionOutcome",
+    "OccupancyGrid",
+    "OnlyDistance",
+    "Perturbation",
+    "PixelKind",
+    "PlanDetour",
+    "Planes",
+    "PlannedPath",
+    "PlannerConfig",
+    "Primitive",
+    "QpIkController",
+    "Record",
+    "RecordedDepth",
+    "Recording",
+    "RecordingOptions",
+    "Renderer",
+    "ReplayInputs",
+    "ReplayTask",
+    "RgbdFrame",
+    "RobotModel",
+    "RobotPosture",
+    "RobotSurface",
+    "Rod",
+    "Scene",
+    "SceneFitter",
+    "SceneStep",
+    "SeenVoxels",
+    "Shape",
+    "SimulateRequest",
+    "Solid",
+    "Solids",
+    "SphereField",
+    "SplatSet",
+    "Stamps",
+    "StateColumns",
+    "Stopwatch",
+    "Texture",
+    "TimedPath",
+    "Track",
+    "UInt8",
+    "View",
+    "VoxelState",
+    "arm_solids",
+    "arm_spheres_yaml",
+    "arm_urdf",
+    "audited",
+    "back_project",
+    "box",
+    "cameras",
+    "certified_distance",
+    "check_edges",
+    "checked_pose",
+    "closed_loop",
+    "closest_of",
+    "depth_box",
+    "distance_to",
+    "drawn_figure",
+    "effector_length",
+    "field_splats",
+    "fields_at",
+    "fitted_to",
+    "fixed",
+    "frame_along",
+    "furniture",
+    "gaussian_kernels",
+    "goal_postures",
+    "goal_waypoints",
+    "guided_goal",
+    "idr_scans",
+    "invert_transform",
+    "is_at_goal",
+    "is_installed",
+    "is_shaped",
+    "joint_length",
+    "known_space",
+    "least_clearance",
+    "look_at",
+    "loss_weights",
+    "mean_loss",
+    "measured_robot",
+    "metrics_of",
+    "mpl",
+    "native",
+    "nearest_splats",
+    "num_threads",
+    "obstacle_spheres",
+    "of_extra",
+    "output_path",
+    "plan",
+    "planned_detours",
+    "planned_path",
+    "pose_at",
+    "pose_error",
+    "posture_of",
+    "project",
+    "psnr_of",
+    "random_postures",
+    "rate_of",
+    "replay_verdict",
+    "replayed",
+    "resampled",
+    "runs_of",
+    "save_figure",
+    "scan_folders",
+    "seen_of",
+    "self_mask",
+    "self_mask_metrics",
+    "simulate",
+    "solid",
+    "sphere_names",
+    "splat_fields",
+    "texture",
+    "transform_from",
+    "transform_points",
+    "turn_about_z",
+    "verdict_of",
+    "write_gaussian_ply",
+    "write_json",
+    "write_run",
+]

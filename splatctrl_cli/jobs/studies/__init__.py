@@ -1,1 +1,0 @@
-"""Studies: the paper's experiments repeated, each trial published; every study is a batch of problems."""
