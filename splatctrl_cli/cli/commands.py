@@ -225,7 +225,7 @@ COMMANDS = {
         options=scene_options.QUERY,
     ),
     "score": Command(
-        summary="compare renders with recorded views: PSNR, SSIM, depth; or fit scans first (--fit)",
+        summary="compare renders with recorded views: PSNR, SSIM, depth",
         examples=(
             "score out/scene --reference out/x.capture --cameras cam3 -o out/score",
             "score out/scan --dtu sample_data/dtu --protocol holdout:2,5 --require 'psnr_all>=20'",
@@ -259,16 +259,6 @@ COMMANDS = {
         ),
         run="sweep:run",
         options=run_options.SWEEP,
-    ),
-    "study": Command(
-        summary="repeat an experiment of the paper, trial by trial",
-        examples=(
-            "study table2 --trials 20 -o out/table2",
-            "study table2 --problem cubby-0007 -o out/one",
-        ),
-        run="study:run",
-        options=run_options.STUDY,
-        judges=True,
     ),
     "compare": Command(
         summary="say what got worse between two runs, two batches, or since a stored baseline",

@@ -19,7 +19,21 @@ MAX_SECONDS = 1e8  # [s] of a recording: three years
 MOST_WIDTH = 100  # columns of help
 GONE = {  # commands and options that left the command line, and what takes their place
     "capture": "`tar -cf X.tar X.capture` for one file, `splatctrl export REPLAY --mcap` for a viewer",
+    "splatctrl reconstruct --method": "python -m experiments fits",
+    **dict.fromkeys(
+        (f"splatctrl score --{name}" for name in ("fit", "fit-iterations", "fit-splats")),
+        "python -m experiments fits",
+    ),
     "splatctrl score --lpips": "the package lpips on renders and photos",
+    "study": "python -m experiments",
+    **dict.fromkeys((f"splatctrl replay --{name}" for name in ("golden", "golden-tolerance")), "splatctrl compare"),
+    **dict.fromkeys(
+        (f"splatctrl replay --{name}" for name in ("baseline", "zone", "zone-box", "human")),
+        "python -m experiments baselines",
+    ),
+    "splatctrl simulate --environment": "python -m experiments record",
+    "splatctrl simulate --human-arm": "python -m experiments record",
+    "splatctrl simulate --num-cameras": "python -m experiments record",
 }
 
 
