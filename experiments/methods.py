@@ -1,295 +1,147 @@
-"""The methods of ``--baseline`` beside the closed loop and the log: one task, one scene, one table."""
+"""Methods side by side: every figure of each by name, as a table, ``methods.json`` and ``methods.png``."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.config import Config
-from splatctrl_cli.control.audit import DistanceFunction
-from splatctrl_cli.control.goals import PlanDetour
-from splatctrl_cli.control.open_loop import is_shaped
-from splatctrl_cli.control.replay import ReplayTask, ReplayTrace
-from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.metrics import DESCRIBES, GAP, TIME, Better, Scale
-from splatctrl_cli.files.output import finite
-from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.jobs.replays.goal import goal_waypoints
-from splatctrl_cli.jobs.replays.known_scene import KnownFields
-from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replays.result import Comparison, Replay
-from splatctrl_cli.planner.comparison import Motion, MotionFigures, Yardstick
-from splatctrl_cli.planner.planned import PlannedPath, planned_detours, planned_path
-from splatctrl_cli.planner.tracking import follow_joints, follow_with_controller
-from splatctrl_cli.records import Float64
-from splatctrl_cli.report.replay_pictures import methods_picture
+from experiments.standstill import Separation
+from experiments.tables import aligned, shown
+from experiments.yardstick import MotionFigures
+from splatctrl_cli.blocks import CURVE_COLORS, INK, Float64, PlannedPath, drawn_figure, save_figure
 
-BIRRT, BIRRT_IK, QP_IK = "birrt", "birrt-ik", "qp-ik"
-ALWAYS = ("closed_loop", "log")  # what stands in every comparison
-ROUNDING = 1e-5  # [m] taken off distances to splats, far above what float32 rounds within 8 m
-MOTION = {
-    "success": Scale(better=Better.HIGHER),
-    "goal_reached": Scale(better=Better.HIGHER),
-    "duration_s": Scale(unit="s", better=Better.LOWER, absolute=0.05, relative=0.02),
-    "joint_path_rad": Scale(unit="rad", better=Better.LOWER, absolute=0.01, relative=0.02),
-    "effector_path_m": Scale(unit="m", better=Better.LOWER, absolute=0.005, relative=0.02),
-    "effector_path_deg": Scale(unit="degrees", better=Better.LOWER, absolute=0.5, relative=0.02),
-    **dict.fromkeys(("min_clearance_barrier", "min_clearance", "min_clearance_proved", "min_clearance_true"), GAP),
-    "num_interventions": DESCRIBES,
-}
-PLAN = {
-    "planning_time_s": TIME,  # wall clock
-    "planned_margin": GAP,
-    "planned_self_margin": GAP,
-    "num_edges": DESCRIBES,
-    "num_edges_proved": DESCRIBES,
-}
-
-
-def method_named(baseline: str) -> str:
-    """The method of a baseline, as metrics begin with it."""
-    return baseline.replace("-", "_")
-
-
-def figure_scales(baselines: Sequence[str], *, has_truth: bool) -> dict[str, Scale]:
-    """How two runs are compared by the figures that `figures_of` gives; none without a baseline."""
-    if not baselines:
-        return {}
-    methods = (*ALWAYS, *map(method_named, baselines))
-    plans = {method_named(name) for name in (BIRRT, BIRRT_IK)}
-    of_method = {method: MOTION | (PLAN if method in plans else {}) for method in methods}
-    return {
-        f"{method}_{name}": scale
-        for method, scales in of_method.items()
-        for name, scale in scales.items()
-        if has_truth or name != "min_clearance_true"
-    }
-
-
-def figures_of(comparison: Comparison) -> dict[str, float | None]:
-    """Every figure of every method, by the names of `figure_scales`."""
-    has_truth = any(figures.true_clearance is not None for figures in comparison.figures.values())
-    found: dict[str, float | None] = {}
-    for method in comparison.methods:
-        values = _motion_values(comparison.figures.get(method))
-        if not has_truth:
-            del values["min_clearance_true"]
-        if method in comparison.plans:
-            plan = comparison.plans[method]
-            of_plan = (plan.seconds, finite(plan.margin), finite(plan.self_margin), plan.num_edges, plan.num_proved)
-            values |= dict(zip(PLAN, of_plan, strict=True))
-        found |= {f"{method}_{name}": value for name, value in values.items()}
-    return found
-
-
-def document_of(comparison: Comparison) -> dict[str, Any]:
-    """methods.json: figures by method, and what was planned."""
-    figures = figures_of(comparison)
-    by_method = {
-        method: {name: figures[f"{method}_{name}"] for name in (*MOTION, *PLAN) if f"{method}_{name}" in figures}
-        for method in comparison.methods
-    }
-    plans = {
-        method: {"outcome": str(plan.outcome), "waypoints": plan.path.waypoints.tolist() if plan.path else []}
-        for method, plan in comparison.plans.items()
-    }
-    return {"units": "m, rad, s, degrees where the name says so", "methods": by_method, "plans": plans}
-
-
-def draw_methods(folder: Path, comparison: Comparison, period: float, margin: float) -> None:
-    """Write methods.png, where there is more than the replay itself."""
-    if comparison.figures:
-        barrier = {method: figures.barrier for method, figures in comparison.figures.items()}
-        methods_picture(folder / "methods.png", barrier, period, margin)
-
-
-def check_comparable(request: ReplayRequest, baselines: Sequence[str]) -> None:
-    """Raise UsageError where a planner is asked for more than one goal, or our own controller beside itself."""
-    if QP_IK in baselines and request.controller is None and request.controller_command is None:
-        raise UsageError(
-            f"--baseline {QP_IK}: the closed loop is that already",
-            remedy="leave it out, or give --controller or --controller-command",
-        )
-    if not {BIRRT, BIRRT_IK} & set(baselines):
-        return
-    for option, given in (
-        ("--waypoints", request.waypoints),
-        ("--follow", request.follow),
-        ("--re-anchor", request.re_anchor),
-    ):
-        if given:
-            raise UsageError(f"--baseline birrt: expected a single goal, got {option}", remedy=f"leave out {option}")
-
-
-def compared(
-    request: ReplayRequest,
-    baselines: Sequence[str],
-    inputs: ReplayInputs,
-    replay: Replay,
-    config: Config,
-    console: Progress,
-) -> Comparison:
-    """The closed loop, the log and every baseline, each in the scene as it was known at its time.
-
-    Planned paths are those of the scene known at the start; they begin there and then, as if planning took no time.
-    """
-    trace = replay.closed_loop
-    if not baselines or trace is None:
-        return Comparison()
-    start_ns, control = int(trace.stamp_ns[0]), config.control
-    log = inputs.motion()
-    task = _task(request, inputs, trace.position[0], start_ns, log.position[-1])
-    num = max(math.ceil((log.last_ns - start_ns) * 1e-9 / control.period - 1e-6), 0) + 1
-    stamps = _stamps(start_ns, num, control.period)
-    motions = {
-        "closed_loop": _driven(trace, is_ours=replay.outside is None),
-        "log": Motion(stamp_ns=stamps, position=np.array([log.at(int(stamp))[0] for stamp in stamps])),
-    }
-    if "standstill" in baselines:
-        held = replay.separations["standstill"]
-        motions["standstill"] = Motion(stamp_ns=held.stamp_ns, position=held.position, is_intervened=held.is_stopped)
-    if replay.ours is not None:
-        motions[method_named(QP_IK)] = _driven(replay.ours, is_ours=True)
-    plans: dict[str, PlannedPath] = {}
-    if {BIRRT, BIRRT_IK} & set(baselines):
-        plans, followed = _planned(baselines, inputs, task, config, console)
-        motions |= followed
-    yardstick = _yardstick(inputs, task, config)
-    order = (*ALWAYS, *map(method_named, baselines))
-    motions = {method: motions[method] for method in order if method in motions}
-    return Comparison(
-        motions=motions,
-        figures={method: yardstick.figures(motion) for method, motion in motions.items()},
-        plans=plans,
-    )
-
-
-def _driven(trace: ReplayTrace, *, is_ours: bool) -> Motion:
-    """The motion of a closed loop; where a user's own controller intervened is not known."""
-    shaped = np.array([is_shaped(step) for step in trace.steps], dtype=np.bool_)
-    position = np.asarray(trace.position)
-    return Motion(stamp_ns=trace.stamp_ns, position=position, is_intervened=shaped if is_ours else None)
-
-
-def _planned(
-    baselines: Sequence[str], inputs: ReplayInputs, task: ReplayTask, config: Config, console: Progress
-) -> tuple[dict[str, PlannedPath], dict[str, Motion]]:
-    """One plan for both ways to follow it, and how each went."""
-    scene, control, planner = inputs.scene, config.control, config.planner
-    known = Certified(distance=certified_distance(scene.at(task.stamp_ns)))
-    plan = planned_path(inputs.model, known, task, planner, control)
-    console.log(f"replay: planned in {plan.seconds:.2f} s: {plan.outcome}")
-    plans, motions = {}, {}
-    for baseline in (name for name in baselines if name in (BIRRT, BIRRT_IK)):
-        plans[method_named(baseline)] = plan
-        if plan.path is None:
-            continue
-        if baseline == BIRRT:
-            position, shaped = follow_joints(plan.path, plan.clearance.model, planner, control), None
-        else:
-            position, steps = follow_with_controller(
-                plan.path, plan.clearance.model, lambda stamp: scene.at(stamp).barrier, task.frame, planner, control,
-                stamp_ns=task.stamp_ns, scene_step_at=scene.step_at,
-            )  # fmt: skip
-            shaped = np.array([is_shaped(step) for step in steps], dtype=np.bool_)
-        motions[method_named(baseline)] = Motion(
-            stamp_ns=_stamps(task.stamp_ns, len(position), control.period),
-            position=position,
-            is_intervened=shaped,
-        )
-    return plans, motions
-
-
-def planned_ways_out(inputs: ReplayInputs, task: ReplayTask, config: Config) -> PlanDetour | None:
-    """What plans the closed loop's ways out of local minima; None where it may take none."""
-    if config.control.max_detours == 0:
-        return None
-    return planned_detours(
-        inputs.model,
-        lambda stamp_ns: Certified(distance=certified_distance(inputs.scene.at(stamp_ns))),
-        task.frame,
-        config.planner,
-        config.control,
-        home=task.home,
-    )
+MOTION = (
+    *("success", "goal_reached", "duration_s", "joint_path_rad", "effector_path_m", "effector_path_deg"),
+    *("min_clearance_barrier", "min_clearance", "min_clearance_proved", "min_clearance_true", "num_interventions"),
+)
+PLAN = ("planning_time_s", "planned_margin", "planned_self_margin", "num_edges", "num_edges_proved")
+Values = Mapping[str, float | None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Certified:
-    """A scene to plan in: a lower bound of the exact distance to the splats."""
+class Method:
+    """The figures of a motion, None where no path was found to move on, and the plan of a method that plans."""
 
-    distance: DistanceFunction
+    figures: MotionFigures | None = None
+    plan: PlannedPath | None = None
 
-
-def certified_distance(fields: KnownFields) -> DistanceFunction:
-    """A lower bound of a 1-Lipschitz distance: of a grid its certified one, of splats the exact one less rounding.
-
-    Both bound the exact distance to the splats, so what is proved of an edge is proved of that. Of the kernel fields
-    nothing can be proved from samples: their slope has no useful bound.
-    """
-    certified = fields.distances.get("certified")
-    if certified is not None:
-        return certified
-    exact = fields.distances["exact"]
-    return lambda points: exact(points) - ROUNDING
-
-
-def _yardstick(inputs: ReplayInputs, task: ReplayTask, config: Config) -> Yardstick:
-    scene, truth = inputs.scene, inputs.truth
-    known: list[tuple[KnownFields, DistanceFunction]] = []  # the scene in use
-
-    def certified_at(stamp_ns: int) -> DistanceFunction:
-        fields = scene.at(stamp_ns)
-        if not known or known[0][0] is not fields:
-            known[:] = [(fields, certified_distance(fields))]
-        return known[0][1]
-
-    return Yardstick(
-        model=inputs.model,
-        frame=task.frame,
-        T_world_goal=task.T_world_goal,
-        config=config.control,
-        distances_at=lambda stamp: scene.at(stamp).distances,
-        certified_at=certified_at,
-        truth=None if truth is None else lambda points, stamp: truth.closest(points, stamp)[0],
-    )
-
-
-def _task(
-    request: ReplayRequest, inputs: ReplayInputs, start: Float64, stamp_ns: int, logged_end: Float64
-) -> ReplayTask:
-    """What the closed loop was asked for; without a posture the logged one at the end is where goals are sought."""
-    frame = request.frame or inputs.model.frame_names[-1]
-    goal = goal_waypoints(request, inputs.model, frame, logged_end)[-1]
-    return ReplayTask(
-        start=start,
-        T_world_goal=goal.T_world_goal,
-        frame=frame,
-        stamp_ns=stamp_ns,
-        home=logged_end if goal.posture is None else goal.posture,
-    )
-
-
-def _stamps(start_ns: int, num: int, period: float) -> Any:
-    return start_ns + np.round(np.arange(num) * period * 1e9).astype(np.int64)
+    def values(self) -> Values:
+        """Every figure by name (`MOTION`, and `PLAN` of a plan); None where it has no value."""
+        return _motion_values(self.figures) | ({} if self.plan is None else _plan_values(self.plan))
 
 
 def _motion_values(figures: MotionFigures | None) -> dict[str, float | None]:
     if figures is None:
-        return {"success": 0, "goal_reached": 0, **dict.fromkeys([*MOTION][2:])}
-    return {
-        "success": int(figures.is_success),
-        "goal_reached": int(figures.has_arrived),
-        "duration_s": figures.duration,
-        "joint_path_rad": figures.joint_path,
-        "effector_path_m": figures.effector_path,
-        "effector_path_deg": figures.effector_turn,
-        "min_clearance_barrier": finite(figures.clearance["barrier"]),
-        "min_clearance": finite(figures.clearance["exact"]),
-        "min_clearance_proved": finite(figures.proved),
-        "min_clearance_true": None if figures.true_clearance is None else finite(figures.true_clearance),
-        "num_interventions": figures.num_interventions,
-    }
+        return dict.fromkeys(MOTION) | {"success": 0, "goal_reached": 0}
+    values = (
+        int(figures.is_success),
+        int(figures.has_arrived),
+        figures.duration,
+        figures.joint_path,
+        figures.effector_path,
+        figures.effector_turn,
+        _finite(figures.clearance["barrier"]),
+        _finite(figures.clearance["exact"]),
+        _finite(figures.proved),
+        None if figures.true_clearance is None else _finite(figures.true_clearance),
+        figures.num_interventions,
+    )
+    return dict(zip(MOTION, values, strict=True))
+
+
+def _plan_values(plan: PlannedPath) -> dict[str, float | None]:
+    values = (plan.seconds, _finite(plan.margin), _finite(plan.self_margin), plan.num_edges, plan.num_proved)
+    return dict(zip(PLAN, values, strict=True))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SideBySide:
+    """Methods by name, in the order in which they stand side by side, at a controller's period [s]; beside_people: of
+    a standstill and the closed loop, the distances to people.
+    """
+
+    methods: Mapping[str, Method]
+    period: float
+    beside_people: Mapping[str, Separation]
+
+    def people(self) -> Mapping[str, Values]:
+        """The figures of `beside_people` by motion."""
+        return {name: of.figures(self.period) for name, of in self.beside_people.items()}
+
+    def figures(self) -> Mapping[str, Values]:
+        """The figures of every method."""
+        return {name: method.values() for name, method in self.methods.items()}
+
+    def metrics(self) -> Values:
+        """Every figure as METHOD_NAME."""
+        tables = (self.people(), self.figures())
+        return {f"{name}_{key}": x for table in tables for name, of in table.items() for key, x in of.items()}
+
+    def document(self) -> dict[str, Any]:
+        """``methods.json``: figures by method, and what was planned."""
+        plans = {name: method.plan for name, method in self.methods.items() if method.plan is not None}
+        return {
+            "units": "m, rad, s, degrees where the name says so",
+            "methods": self.figures(),
+            "plans": {
+                name: {"outcome": str(plan.outcome), "waypoints": plan.path.waypoints.tolist() if plan.path else []}
+                for name, plan in plans.items()
+            },
+            "people": self.people(),
+        }
+
+    def lines(self) -> Iterator[str]:
+        """The tables, and a line for each plan that was not found."""
+        if self.beside_people:
+            yield from ("Beside people, from the same moment:", *_table(self.people()), "")
+        yield "Side by side, from the same state to the same goal:"
+        yield from _table(self.figures())
+        for name, method in self.methods.items():
+            if method.plan is not None and method.plan.path is None:
+                yield f"{name}: no path: {method.plan.outcome}"
+
+    def draw(self, path: Path, margin: float) -> None:
+        """Write a curve [cm] for the clearance of each method by the controller's field, with its least value marked,
+        its end as a bar, and the margin [m] as a line. Gaps (NaN) stay gaps.
+        """
+        curves = {name: of.figures.barrier for name, of in self.methods.items() if of.figures is not None}
+        with drawn_figure(4.8) as figure:
+            axes = figure.subplots()
+            for number, (name, values) in enumerate(curves.items()):
+                is_last = number == len(curves) - 1  # what it covers shows between its dashes
+                style: Any = (0, (3, 2)) if is_last else "-"
+                self._draw_curve(axes, name, values, CURVE_COLORS[number % len(CURVE_COLORS)], style)
+            axes.axhline(
+                100 * margin, color=INK, linewidth=1.0, linestyle=(0, (6, 3)), label=f"margin {100 * margin:g} cm"
+            )
+            axes.axhline(0.0, color="#cccccc", linewidth=0.8, zorder=0)
+            axes.set(xlabel="time since the start [s]", ylabel="clearance [cm]")
+            axes.set_title("Clearance of every method, by the controller's field")
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.legend(frameon=False, fontsize=10, loc="center left", bbox_to_anchor=(1.0, 0.5))
+            save_figure(figure, path)
+
+    def _draw_curve(self, axes: Any, name: str, metres: Float64, color: str, style: Any) -> None:
+        centimetres, seconds = 100.0 * np.asarray(metres), self.period * np.arange(len(metres))
+        label = f"{name}, no value"
+        if np.isfinite(centimetres).any():
+            at = int(np.nanargmin(centimetres))
+            label = f"{name}, least {centimetres[at]:.1f} cm"
+            axes.plot(seconds[at], centimetres[at], "o", color=color, markersize=6, markeredgecolor="white")
+            axes.plot(seconds[-1], centimetres[-1], "|", color=color, markersize=14, markeredgewidth=2)
+        axes.plot(seconds, centimetres, color=color, linewidth=2.0, linestyle=style, label=label)
+
+
+def _table(columns: Mapping[str, Values]) -> list[str]:
+    """Lines of a table with a column each, of the figures that any of them has."""
+    names = dict.fromkeys(name for values in columns.values() for name in values)
+    found = {name: [values.get(name) for values in columns.values()] for name in names}
+    there = {name: values for name, values in found.items() if any(value is not None for value in values)}
+    return aligned(("", *columns), ((name, *(shown(value, ".4g") for value in of)) for name, of in there.items()))

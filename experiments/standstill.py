@@ -7,12 +7,12 @@ from typing import Protocol
 
 import numpy as np
 
-from splatctrl_cli.config.fixed import MAX_RESUME, ZONE_RESOLUTION
-from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.goals import LoggedMotion
-from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Bool, Box, Float64, Stamps
+from splatctrl_cli import Box, UsageError
+from splatctrl_cli.blocks import ArmModel, Bool, Float64, LoggedMotion, Stamps, runs_of
 
+MAX_RESUME = 100.0  # [m] a zone wider than any hall would hold the arm for ever
+ZONE_RESOLUTION = 0.01  # [m] a person this near to a box counts as inside
+STOP_ACCELERATION = 7.5  # [rad/s^2] with which the arm brakes and starts (the Panda's)
 DistanceToPeople = Callable[[Float64, int], Float64]
 """points (Q, 3) [m], world, and a stamp [ns] -> distance (Q,) [m] to the nearest person, inf where nobody is."""
 
@@ -116,6 +116,22 @@ class Separation:
     def duration_s(self) -> float:
         """From the first state to the last [s]."""
         return float(self.stamp_ns[-1] - self.stamp_ns[0]) * 1e-9
+
+    def figures(self, period: float) -> dict[str, float | None]:
+        """Figures by name of states a period [s] apart; distances over the states at which a person is there, None
+        where nobody ever is.
+        """
+        there = self.distance[np.isfinite(self.distance)]
+        stops = [(end - first) * period for first, end in runs_of(self.is_stopped)]
+        return {
+            "completed": int(self.is_complete),
+            "duration_s": self.duration_s,
+            "mean_human_distance": float(there.mean()) if len(there) else None,
+            "min_human_distance": float(there.min()) if len(there) else None,
+            "num_stops": len(stops),
+            "longest_stop_s": max(stops, default=0.0),
+            "stopped_s": sum(stops),
+        }
 
 
 def distance_to_people(model: ArmModel, q: Float64, stamp_ns: int, people: DistanceToPeople) -> float:

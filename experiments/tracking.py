@@ -1,30 +1,40 @@
 """A planned path, followed in closed loop: in joint space, or by the QP-IK controller with its barriers."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig, PlannerConfig
-from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.goals import Guide, guided_goal, pose_error
-from splatctrl_cli.control.replay import FieldAt, is_at_goal
-from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
-from splatctrl_cli.control.step import ControlStep, QpIkController
-from splatctrl_cli.planner.path import TimedPath
-from splatctrl_cli.records import Float64
+from splatctrl_cli.blocks import (
+    ArmModel,
+    ControlConfig,
+    ControlStep,
+    DistanceField,
+    Float64,
+    Guide,
+    PlannerConfig,
+    QpIkController,
+    SceneStep,
+    TimedPath,
+    guided_goal,
+    is_at_goal,
+    pose_error,
+    rate_of,
+)
+
+FOLLOW_GAIN = 10.0  # [1/s] joint error to velocity, following a path in joint space
 
 
-def follow_joints(path: TimedPath, model: ArmModel, planner: PlannerConfig, control: ControlConfig) -> Float64:
+def follow_joints(path: TimedPath, model: ArmModel, control: ControlConfig) -> Float64:
     """Follow in joint space: the path's velocity plus a pull towards its position, within the velocity limits.
 
     Returns the position (T, J) [rad] at every period.
     """
-    period = control.period
+    period, gain = control.period, min(FOLLOW_GAIN, 1 / control.period)
     q, positions = path.waypoints[0], [path.waypoints[0]]
     clock = period * np.arange(int(np.ceil(path.duration / period)) + 1)
     for now, following in pairwise(path.at(clock)[0]):
-        velocity = (following - now) / period + planner.follow_gain * (now - q)
+        velocity = (following - now) / period + gain * (now - q)
         q = q + period * np.clip(velocity, -model.velocity_limit, model.velocity_limit)
         positions.append(q)
     return np.array(positions)
@@ -33,13 +43,13 @@ def follow_joints(path: TimedPath, model: ArmModel, planner: PlannerConfig, cont
 def follow_with_controller(
     path: TimedPath,
     model: ArmModel,
-    field_at: FieldAt,
+    field_at: Callable[[int], DistanceField],
     frame: str,
     planner: PlannerConfig,
     control: ControlConfig,
     *,
     stamp_ns: int = 0,
-    scene_step_at: SceneStepAt | None = None,
+    scene_step_at: Callable[[int], SceneStep | None] | None = None,
 ) -> tuple[Float64, Sequence[ControlStep]]:
     """Follow with QP-IK from a stamp [ns] on: its goal is the end effector's pose on the path, as it moves there, and
     the posture it leans to is the path's.

@@ -8,14 +8,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.audit import CHUNK, DistanceFunction, DistancesAt, audit
-from splatctrl_cli.control.events import runs_of
-from splatctrl_cli.control.goals import pose_error
-from splatctrl_cli.control.replay import is_at_goal
-from splatctrl_cli.planner.path import effector_length, joint_length
-from splatctrl_cli.records import Bool, Float64, JointState, Stamps
+from splatctrl_cli.blocks import (
+    ArmModel,
+    Bool,
+    ControlConfig,
+    DistanceFunction,
+    DistancesAt,
+    Float64,
+    Stamps,
+    audited,
+    effector_length,
+    is_at_goal,
+    joint_length,
+    pose_error,
+    runs_of,
+)
+
+CHUNK = 256  # states whose spheres are asked at once
 
 TrueDistance = Callable[[Float64, int], Float64]
 """points (Q, 3) [m], world, and a stamp [ns] -> distance (Q,) [m] to what is really there."""
@@ -76,12 +85,8 @@ class Yardstick:
 
     def figures(self, motion: Motion) -> MotionFigures:
         """The figures of a motion, in the scene known at each of its stamps."""
-        states = [
-            JointState(stamp_ns=int(stamp), position=q, velocity=np.zeros_like(q))
-            for stamp, q in zip(motion.stamp_ns, motion.position, strict=True)
-        ]
-        audited = audit(self.model, states, self.distances_at)
-        clearance = {name: of.distance for name, of in audited.clearance.items()}
+        of_states = audited(self.model, motion.stamp_ns, motion.position, self.distances_at)
+        clearance = {name: of.distance for name, of in of_states.clearance.items()}
         error = pose_error(self.model.frame_pose(motion.position[-1], self.frame), self.T_world_goal)
         has_arrived = is_at_goal(error, self.config)
         moved, turned = effector_length(self.model, motion.position, self.frame)

@@ -18,12 +18,6 @@ class SplatCtrlError(Exception):
         self.remedy = remedy
 
 
-class GateFailed(SplatCtrlError):  # noqa: N818  (a verdict, not a fault)
-    """A `--require` gate or a check did not hold (exit code 1)."""
-
-    exit_code = 1
-
-
 class UsageError(SplatCtrlError):
     """Usage, configuration, or an output that exists or cannot be written (exit code 2)."""
 

@@ -101,23 +101,13 @@ def test_files_that_are_missing_or_no_toml_are_named(tmp_path: Path) -> None:
             ["control.barrier_gain=101"],
             "control.barrier_gain: expected at most 1 / control.period = 100 1/s, got 101.0",
         ),
-        (
-            ["control.period=0.05", "control.pose_gain=21", "planner.follow_gain=1", "control.barrier_gain=1"],
-            "pose_gain",
-        ),
+        (["control.period=0.05", "control.pose_gain=21", "control.barrier_gain=1"], "pose_gain"),
         (
             ["control.posture_gain=200"],
             "control.posture_gain: expected at most 1 / control.period = 100 1/s, got 200.0",
         ),
-        (
-            ["planner.follow_gain=200"],
-            "planner.follow_gain: expected at most 1 / control.period = 100 1/s, got 200.0",
-        ),
         (["control.self_slack_cost=10"], "control.self_slack_cost: expected at least control.slack_cost = 1000"),
-        (
-            ["control.period=0.1", "control.max_time=0.05", "planner.follow_gain=1"],
-            "control.max_time: expected at least",
-        ),
+        (["control.period=0.1", "control.max_time=0.05"], "control.max_time: expected at least"),
         (["planner.shortest=2"], "planner.shortest: expected at most planner.reach = 1.5 rad, got 2.0"),
     ],
 )

@@ -1,39 +1,56 @@
 """The planner, the log, the standstill and the closed loop side by side."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from experiments.__main__ import main
+from experiments.methods import MOTION, PLAN
 from splatctrl_cli.config import Config
-from splatctrl_cli.jobs.replays.compare import certified_distance, figure_scales
-from splatctrl_cli.jobs.replays.metrics import metric_names
+from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, scene_of, splats_of, write_field, write_scene
-from tests.cli.test_replay_modes import ball_ahead, moving, write_passing_person
-from tests.jobs.stage import MOVE
+from tests.cli.test_replay_modes import ball_ahead, moving
+from tests.jobs.stage import FAR, MOVE, Ball, Stage
 
 pytestmark = pytest.mark.usefixtures("unpainted")
+SHORT = ("--set", "control.max_time=4")
+STANDSTILL = ("--methods", "standstill")
 
-CLOSED = ("-q", "--mode", "closed-loop", "--set", "control.max_time=4")
+
+def compared(desk: Desk, *words: str, out: str = "out") -> dict[str, Any]:
+    """The metrics of a comparison that comes to a verdict, whichever that is."""
+    assert asked(desk, *words, *SHORT, out=out) in (0, 1, 5)
+    metrics: dict[str, Any] = json.loads((desk.folder / out / "run.json").read_text())["metrics"]
+    return metrics
+
+
+def asked(desk: Desk, *words: str, out: str = "out") -> int:
+    """The exit code."""
+    return main(["baselines", str(desk.folder / "fake.mcap"), *desk.robot, "-o", str(desk.folder / out), *words])
+
+
+def document(desk: Desk) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((desk.folder / "out" / "methods.json").read_text())
+    return found
 
 
 @pytest.mark.painted
-def test_every_method_has_every_figure_and_gates_can_name_them(
-    desk: Desk, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_method_has_every_figure(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     moving(desk)
-    gates = ("--require", "birrt_min_clearance>=0.02", "--require", "birrt_ik_success>=1")
-    assert desk.replay(*scene_of(desk, BALL), *CLOSED, "--baseline", "birrt", "--baseline", "birrt-ik", *gates) == 0
-    metrics = desk.metrics()
-    assert set(metrics) == set(
-        metric_names("closed-loop", ("exact", "barrier"), has_truth=False, baselines=["birrt", "birrt-ik"])
-    )
-    for method in ("closed_loop", "log", "birrt", "birrt_ik"):
+    metrics = compared(desk, *scene_of(desk, BALL))
+    methods, planned = ("closed_loop", "log", "birrt", "birrt_ik"), ("birrt", "birrt_ik")
+    names = {f"{method}_{name}" for method in methods for name in MOTION}
+    assert set(metrics) == names | {f"{method}_{name}" for method in planned for name in PLAN}
+    for method in methods:
         assert metrics[f"{method}_success"] == metrics[f"{method}_goal_reached"] == 1
         assert metrics[f"{method}_min_clearance_proved"] < metrics[f"{method}_min_clearance"]
+        assert metrics[f"{method}_min_clearance_true"] is None
     straight = float(np.linalg.norm(MOVE))
     assert metrics["log_joint_path_rad"] == pytest.approx(straight)
     assert metrics["birrt_joint_path_rad"] <= straight + 0.01  # nothing is in the way, and another posture is nearer
@@ -41,21 +58,17 @@ def test_every_method_has_every_figure_and_gates_can_name_them(
     assert metrics["birrt_planned_margin"] == Config().control.margin
     assert metrics["log_num_interventions"] is None and metrics["closed_loop_num_interventions"] >= 0
     out = capsys.readouterr().out
-    assert "Side by side, from the same state to the same goal:" in out
+    assert "Side by side, from the same state to the same goal:" in out and "min_clearance_true" not in out
     assert (desk.folder / "out" / "methods.png").is_file()
-    document = json.loads((desk.folder / "out" / "methods.json").read_text())
-    assert list(document["methods"]) == ["closed_loop", "log", "birrt", "birrt_ik"]
-    waypoints = np.array(document["plans"]["birrt"]["waypoints"])
-    np.testing.assert_allclose(waypoints[0], START)
-    assert document["methods"]["birrt"]["joint_path_rad"] == metrics["birrt_joint_path_rad"]
+    written = document(desk)
+    assert tuple(written["methods"]) == methods
+    np.testing.assert_allclose(np.array(written["plans"]["birrt"]["waypoints"])[0], START)
+    assert written["methods"]["birrt"]["joint_path_rad"] == metrics["birrt_joint_path_rad"]
 
 
 def test_a_ball_in_the_way_of_the_log_is_planned_around(desk: Desk, arm: RobotModel) -> None:
     moving(desk)
-    tip = arm.sphere_centers(START + MOVE / 2)[-1]
-    ball = ((float(tip[0]), float(tip[1]), float(tip[2])), 0.03)
-    assert desk.replay(*scene_of(desk, ball), *CLOSED, "--baseline", "birrt") == 0
-    metrics = desk.metrics()
+    metrics = compared(desk, *scene_of(desk, in_the_way(arm)), "--methods", "birrt")
     assert metrics["log_success"] == 0 and metrics["log_min_clearance"] < 0
     assert metrics["birrt_success"] == 1
     assert metrics["birrt_min_clearance"] >= metrics["birrt_planned_margin"] - 1e-4
@@ -63,14 +76,16 @@ def test_a_ball_in_the_way_of_the_log_is_planned_around(desk: Desk, arm: RobotMo
     assert metrics["birrt_num_edges_proved"] == metrics["birrt_num_edges"] > 1
 
 
+def in_the_way(arm: RobotModel, q: Float64 = START + MOVE / 2) -> Ball:
+    tip = arm.sphere_centers(q)[-1]
+    return (float(tip[0]), float(tip[1]), float(tip[2])), 0.03
+
+
 def test_a_ball_that_comes_later_is_not_planned_for_but_is_measured(desk: Desk, arm: RobotModel) -> None:
     moving(desk)
-    tip = arm.sphere_centers(START + MOVE)[-1]
-    late = ((float(tip[0]), float(tip[1]), float(tip[2])), 0.03)
-    later = splats_of(BALL, late)
+    later = splats_of(BALL, in_the_way(arm, START + MOVE))
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)), (3 * SECOND // 10, later), (SECOND, later))
-    assert desk.replay("--scene", str(scene), *CLOSED, "--baseline", "birrt") == 0
-    metrics = desk.metrics()
+    metrics = compared(desk, "--scene", str(scene), "--methods", "birrt")
     assert metrics["birrt_goal_reached"] == 1 and metrics["birrt_success"] == 0
     assert metrics["birrt_min_clearance"] < 0 < metrics["birrt_planned_margin"]
 
@@ -80,70 +95,140 @@ def test_a_goal_that_is_in_collision_leaves_a_row_without_a_motion(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
     moving(desk)
-    assert desk.replay(*scene_of(desk, ball_ahead(arm, -0.02)), *CLOSED, "--baseline", "birrt", out="a") == 0
-    metrics = desk.metrics("a")
+    metrics = compared(desk, *scene_of(desk, ball_ahead(arm, -0.02)), "--methods", "birrt")
     assert metrics["birrt_success"] == 0 and metrics["birrt_min_clearance"] is None
     assert "birrt: no path: goal-in-collision" in capsys.readouterr().out
-    gate = ("--require", "birrt_success>=1")
-    assert desk.replay("--scene", str(desk.folder / "scene"), *CLOSED, "--baseline", "birrt", *gate, out="b") == 1
-
-
-def test_all_baselines_stand_in_one_table(desk: Desk, arm: RobotModel) -> None:
-    moving(desk)
-    scene = str(write_passing_person(desk, arm))
-    assert desk.replay("--scene", scene, *CLOSED, "--baseline", "standstill,birrt", "--zone", "0.9,1.0") == 0
-    metrics = desk.metrics()
-    assert set(figure_scales(["standstill", "birrt"], has_truth=False)) <= set(metrics)
-    assert metrics["standstill_num_interventions"] == metrics["standstill_num_stops"] == 1
-    assert metrics["standstill_joint_path_rad"] == pytest.approx(metrics["log_joint_path_rad"])
-    assert metrics["standstill_duration_s"] > metrics["log_duration_s"] + 1
-
-
-def test_what_is_planned_in_never_exceeds_the_exact_distance_and_the_kernel_field_is_no_proof(tmp_path: Path) -> None:
-    """Beside and between splats of many sizes: certified <= the exact distance in float64 everywhere, which is
-    1-Lipschitz; the controller's own field is steeper than that somewhere, so nothing follows from its samples.
-    """
-    from splatctrl_cli.jobs.replays.known_scene import splat_fields
-
-    steepest = 0.0
-    for seed in range(12):
-        random = np.random.default_rng(seed)
-        centers = random.uniform(-1.5, 1.5, (200, 3)).astype(np.float32)
-        centers[100:] = centers[0] + random.normal(size=(100, 3)) * 0.03
-        radii = random.uniform(0.002, 0.02, 200).astype(np.float32)
-        fields = splat_fields(splats_of(*zip(map(tuple, centers), map(float, radii), strict=True)), Config(), 1)  # type: ignore[arg-type]
-        points = np.concatenate(
-            [
-                random.uniform(-3, 3, (500, 3)),
-                centers[100:] + random.normal(size=(100, 3)) * 0.02,
-                centers.astype(float),
-            ]
-        )
-        gap = np.linalg.norm(points[:, None] - centers.astype(np.float64), axis=2) - radii.astype(np.float64)
-        certified = certified_distance(fields)(points)
-        assert np.all(certified < gap.min(axis=1))
-        assert np.all(certified > gap.min(axis=1) - 3e-5)
-        near = points + random.normal(size=points.shape) * 2e-3
-        change = np.abs(fields.barrier.query(near)[0] - fields.barrier.query(points)[0])
-        steepest = max(steepest, float(np.max(change / np.linalg.norm(near - points, axis=1))))
-    assert steepest > 1.2
+    assert document(desk)["plans"]["birrt"]["waypoints"] == []
 
 
 @pytest.mark.parametrize("is_grid", [False, True])
 def test_a_path_is_clear_of_the_splats_between_its_waypoints(desk: Desk, arm: RobotModel, is_grid: bool) -> None:
     moving(desk)
-    tip = arm.sphere_centers(START + MOVE / 2)[-1]
-    ball = ((float(tip[0]), float(tip[1]), float(tip[2])), 0.03)
+    ball = in_the_way(arm)
     if is_grid:
         where = ("--field", str(write_field(desk.folder / "field", ball, voxel=0.02)))
     else:
         where = scene_of(desk, ball)
-    assert desk.replay(*where, *CLOSED, "--baseline", "birrt", "--max-unknown", "1") == 0
-    document = json.loads((desk.folder / "out" / "methods.json").read_text())
-    figures, waypoints = document["methods"]["birrt"], np.array(document["plans"]["birrt"]["waypoints"])
+    compared(desk, *where, "--methods", "birrt")
+    figures, waypoints = (document(desk)[key]["birrt"] for key in ("methods", "plans"))
     assert figures["num_edges_proved"] == figures["num_edges"] > 1
     assert 0 < figures["planned_margin"] <= Config().control.margin
-    for a, b in pairwise(waypoints):
+    for a, b in pairwise(np.array(waypoints["waypoints"])):
         for share in np.linspace(0, 1, 200):
             assert clearance(arm, a + share * (b - a), ball) > figures["planned_margin"]
     assert figures["min_clearance_proved"] < figures["min_clearance"]
+
+
+def test_the_standstill_waits_where_the_controller_goes_on(
+    desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moving(desk)
+    scene = write_passing_person(desk, arm)
+    metrics = compared(desk, "--scene", str(scene), "--methods", "standstill,birrt", "--zone", "0.9,1.0")
+    assert metrics["standstill_completed"] == metrics["closed_loop_completed"] == 1
+    assert metrics["standstill_duration_s"] == pytest.approx(1.0 + 1.7, abs=0.02)
+    stopped = pytest.approx(1.7 - 0.5 / 7.5, abs=0.02)  # of the visit less the time to brake
+    assert metrics["standstill_longest_stop_s"] == metrics["standstill_stopped_s"] == stopped
+    assert metrics["closed_loop_num_stops"] == 0
+    assert 0.25 < metrics["closed_loop_min_human_distance"] < 0.9
+    assert metrics["standstill_num_interventions"] == metrics["standstill_num_stops"] == 1
+    assert metrics["standstill_joint_path_rad"] == pytest.approx(metrics["log_joint_path_rad"])
+    assert metrics["standstill_duration_s"] > metrics["log_duration_s"] + 1
+    assert "Beside people, from the same moment:" in capsys.readouterr().out
+    assert [*document(desk)["people"]] == ["closed_loop", "standstill"]
+    assert [*document(desk)["methods"]] == ["closed_loop", "log", "standstill", "birrt"]
+
+
+def write_passing_person(desk: Desk, arm: RobotModel) -> Path:
+    """A scene of nobody, from 0.3 to 2 s a person 30 cm ahead of the arm at the log's end, and nobody again."""
+    alone, beside = splats_of(BALL), splats_of(BALL, ball_ahead(arm, 0.3))
+    beside = replace(beside, labels=np.array([0, Label.HUMAN], np.uint8))
+    maps = ((0, alone), (3 * SECOND // 10, beside), (2 * SECOND, alone), (3 * SECOND, alone))
+    return write_scene(desk.folder / "scene", *maps)
+
+
+def test_people_of_the_truth_are_preferred_to_those_of_the_scene(stage: Stage) -> None:
+    stage.people = [((-1.0, 0.3, 1.3), 0.05)]
+    person: Ball = ((1.5, 0.0, 0.5), 0.1)
+    truth = stage.truth(FAR, person, name="human")  # all of it are people
+    stage.desk.source.states = stage.states
+    where = ("--scene", str(stage.scene()), *STANDSTILL)
+    by_truth = compared(stage.desk, *where, "--truth", str(truth), "--human", "human1", out="true")
+    assert by_truth["standstill_min_human_distance"] == pytest.approx(nearest_to(stage, person), abs=0.02)
+    by_scene = compared(stage.desk, *where)
+    assert by_scene["standstill_min_human_distance"] == pytest.approx(nearest_to(stage, stage.people[0]), abs=0.02)
+    assert abs(by_scene["standstill_min_human_distance"] - by_truth["standstill_min_human_distance"]) > 0.2
+
+
+def nearest_to(stage: Stage, ball: Ball) -> float:
+    """Of the moving arm's surface over the logged motion [m]."""
+    moved = np.flatnonzero(stage.arm.moving_spheres)
+    centers = stage.arm.sphere_centers_batch(np.array([s.position for s in stage.states]))[:, moved]
+    gaps = np.linalg.norm(centers - np.array(ball[0]), axis=2) - stage.arm.sphere_set.radii[moved] - ball[1]
+    return float(gaps.min())
+
+
+def test_a_standstill_without_anybody_is_not_evaluable(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
+    stage.desk.source.states = stage.states
+    where = ("--scene", str(stage.scene()), *STANDSTILL)
+    assert asked(stage.desk, *where) == 5
+    assert "expected splats labelled human, got none at any time" in capsys.readouterr().err
+    assert asked(stage.desk, *where, "--truth", str(stage.truth(FAR, name="box"))) == 5
+    assert "expected a primitive named human* or person*, got box0" in capsys.readouterr().err
+    assert not (stage.desk.folder / "out").exists()
+
+
+def test_ours_stands_beside_a_controller_of_the_users_own(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage.desk.source.states = stage.states
+    (stage.desk.folder / "own.py").write_text(STILL)
+    monkeypatch.chdir(stage.desk.folder)
+    scene = ("--scene", str(stage.scene()), "--methods")
+    metrics = compared(stage.desk, *scene, "qp-ik", "--controller", "own:Still")
+    assert metrics["qp_ik_success"] == 1 and metrics["closed_loop_success"] == 0
+    ours = compared(stage.desk, *scene, "birrt", out="ours")
+    assert metrics["qp_ik_duration_s"] == ours["closed_loop_duration_s"]
+    assert metrics["closed_loop_num_interventions"] is None and metrics["qp_ik_num_interventions"] is not None
+
+
+STILL = """
+class Still:
+    def __init__(self, start):
+        self.num = len(start.joints)
+
+    def step(self, now):
+        return [0.0] * self.num
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "told"),
+    [
+        (("--methods", "qp-ik"), 2, "--methods qp-ik: the closed loop is that already"),
+        (("--methods", "standstill", "--zone", "1"), 2, "--zone 1: expected STOP,RESUME"),
+        (("--methods", "standstill", "--zone", "2,1"), 2, "zone: expected 0 < stop <= resume"),
+        (("--methods", "standstill", "--zone", "0.5,inf"), 2, "expected 0 < stop <= resume <= 100, got"),
+        (("--methods", "standstill", "--zone-box", "0,0,0,1,1,0"), 2, "expected finite x0,y0,z0,x1,y1,z1"),
+        (("--human", "visitor"), 2, "--human: expected --truth"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(
+    desk: Desk, words: tuple[str, ...], code: int, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert asked(desk, "--scene", "nowhere", *words) == code
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--methods", "prm"), "expected standstill, birrt, birrt-ik, qp-ik, got 'prm'"),
+        (("--goal", "1,2"), "expected 7 numbers"),
+        (("--goal", "0,0,0,0,0,0,2"), "expected a unit quaternion"),
+    ],
+)
+def test_words_that_do_not_parse_are_named(
+    desk: Desk, words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        asked(desk, "--scene", str(Path("nowhere")), *words)
+    assert told in capsys.readouterr().err

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.config.fixed import ZONE_RESOLUTION
-from splatctrl_cli.control.events import runs_of
-from splatctrl_cli.control.goals import LoggedMotion
-from splatctrl_cli.control.standstill import (
+from experiments.standstill import (
+    ZONE_RESOLUTION,
     BoxZone,
     Separation,
     Standstill,
@@ -16,6 +14,8 @@ from splatctrl_cli.control.standstill import (
     remembered,
     separation_of,
 )
+from splatctrl_cli.control.events import runs_of
+from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Box, Float64
 from tests.control.fakes import PlanarArm

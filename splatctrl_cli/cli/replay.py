@@ -9,11 +9,9 @@ from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.config import load_config
 from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.jobs.replay import ReplayResult, replay
-from splatctrl_cli.jobs.replays.compare import MOTION, PLAN, figures_of
 from splatctrl_cli.jobs.replays.files import chunks_of, when_and_why
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.jobs.replays.result import Comparison, Replay
-from splatctrl_cli.jobs.replays.standstill_baseline import FIGURES
+from splatctrl_cli.jobs.replays.result import Replay
 
 HEADLINE = (
     *("min_clearance", "min_clearance_certified", "min_clearance_true", "min_self_clearance", "min_limit_margin"),
@@ -52,12 +50,6 @@ def _lines(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator
     shown = metrics if is_long else {name: metrics[name] for name in HEADLINE if metrics.get(name) is not None}
     lines = when_and_why(replay)
     lines += ["", *table(("replay", "value"), [(name, _shown(value)) for name, value in shown.items()])]
-    if replay.separations:
-        rows = [
-            (figure, *(_shown(metrics[f"{motion}_{figure}"]) for motion in replay.separations)) for figure in FIGURES
-        ]
-        lines += ["", "Beside people, from the same moment:", *table(("", *replay.separations), rows)]
-    lines += _comparison_lines(replay.comparison)
     yield from lines
     yield from result.notes
     yield from _mount_lines(replay.static_violations)
@@ -97,16 +89,3 @@ def _shown(value: object) -> str:
     if value is None or value == "":
         return "-"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _comparison_lines(comparison: Comparison) -> list[str]:
-    """The table of all methods side by side, and a line for each plan that was not found or has a smaller margin."""
-    if not comparison.methods:
-        return []
-    figures, methods = figures_of(comparison), comparison.methods
-    names = [name for name in (*MOTION, *PLAN) if any(f"{method}_{name}" in figures for method in methods)]
-    rows = [(name, *(_shown(figures.get(f"{method}_{name}")) for method in methods)) for name in names]
-    lines = ["", "Side by side, from the same state to the same goal:", *table(("", *methods), rows)]
-    return lines + [
-        f"{method}: no path: {plan.outcome}" for method, plan in comparison.plans.items() if not plan.path
-    ]

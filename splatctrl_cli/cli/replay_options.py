@@ -1,10 +1,8 @@
 """The options of ``splatctrl replay``."""
 
-import argparse
 from pathlib import Path
 
 from splatctrl_cli.cli.options import (
-    BOX,
     CONFIG,
     DECLARE,
     DEVICE,
@@ -21,21 +19,10 @@ from splatctrl_cli.cli.options import (
     pose,
 )
 from splatctrl_cli.cli.parser import MAX_SECONDS, either, group, option, real, whole
-from splatctrl_cli.config.fixed import GOLDEN_TOLERANCE
 
 MODES = ("audit", "open-loop", "closed-loop")
 UNSEEN_IS = ("judge", "occupied")
-BASELINES = ("standstill", "birrt", "birrt-ik", "qp-ik")
 STEP_LIMIT = 10.0  # [s]
-
-
-def _baselines(text: str) -> list[str]:
-    """Names joined by commas, for argparse."""
-    names = text.split(",")
-    for name in names:
-        if name not in BASELINES:
-            raise argparse.ArgumentTypeError(f"expected {', '.join(BASELINES)}, got {name!r}")
-    return names
 
 
 def _start(text: str) -> float | str:
@@ -131,30 +118,6 @@ REPLAY = (  # what people use, and in groups the rest
         option("--require-proof", "not evaluable (exit 5) where space beside the arm was assumed to be free"),
         *DISAGREEMENT,
     ),
-    group(  # ``--golden``, and what is driven beside the closed loop
-        "comparison",
-        option(
-            "--golden FILE",
-            "fail (exit 1) where a command differs from an earlier replay (its folder, run.json or steps.csv)",
-            Path,
-        ),
-        option("--golden-tolerance RAD/S", "by more than this, per joint", real(0, 100, "rad/s"), GOLDEN_TOLERANCE),
-        option(
-            "--baseline NAME,...",
-            "beside the closed loop (repeatable): standstill, the logged path held while a person is in the zone;"
-            " birrt, a path planned in the scene known at the start, followed by the joints; birrt-ik, by the"
-            " controller; qp-ik, our controller beside one of --controller",
-            _baselines,
-            action="extend",
-            default=[],
-        ),
-        option("--zone STOP,RESUME", "distances [m] of that zone", str, "0.5,0.6"),
-        option(
-            f"--zone-box {BOX}",
-            "a box [m] instead: stop while a person is in it, resume when nobody is within RESUME - STOP of it",
-        ),
-        option("--human NAME ...", "a primitive of --truth that counts as a person; default: human*, person*"),
-    ),
     group(
         "report",
         option(
@@ -163,7 +126,7 @@ REPLAY = (  # what people use, and in groups the rest
             whole(0, 1000),
             3,
         ),
-        option("--report-only", "exit 0 whatever the verdict; a --require or --golden still counts"),
+        option("--report-only", "exit 0 whatever the verdict; a --require still counts"),
         option("--steps", "print a row per step as well"),
     ),
 )

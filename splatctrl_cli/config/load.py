@@ -33,9 +33,6 @@ class Config:
 
     def __post_init__(self) -> None:
         check_voxel(self.scene, self.occupancy)
-        gain, period = self.planner.follow_gain, self.control.period
-        expected = f"at most 1 / control.period = {1 / period:g} 1/s"
-        check(gain * period <= 1 + 1e-9, "planner.follow_gain", expected, gain)
 
     def derived(self, **sections: Section) -> Self:
         """A copy with sections that follow from a recording (`Section.derived`), which are not checked."""

@@ -74,16 +74,6 @@ class ControlConfig(Section, section="control"):
     stall_speed: Annotated[float, Within(0, 10, "rad/s", "mean joint speed of a stuck arm")] = 2e-3
     max_cuts: Annotated[int, Within(0, 1000, "", "rounds of further rows for what a step would come near")] = 3
     max_detours: Annotated[int, Within(0, 1000, "", "planned ways out of local minima in one closed loop")] = 0
-    stop_acceleration: Annotated[
-        float,
-        Within(
-            0.01,
-            1000,
-            "rad/s^2",
-            "with which a monitored standstill brakes and starts (the Panda's); 0: at once",
-            or_zero=True,
-        ),
-    ] = 7.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,7 +91,7 @@ class ControlConfig(Section, section="control"):
 
 @dataclass(frozen=True, kw_only=True)
 class PlannerConfig(Section, section="planner"):
-    """IV: the sampling-based planner (BiRRT) that the controller is compared with."""
+    """IV: the sampling-based planner (BiRRT), which finds the controller's ways out of local minima."""
 
     seed: Annotated[int, Within(0, MAX_SEED, "", "of samples and shortcuts")] = 0
     goal_postures: Annotated[
@@ -121,9 +111,6 @@ class PlannerConfig(Section, section="planner"):
     max_acceleration: Annotated[float, Within(0.01, 1000, "rad/s^2", "of every joint: the least of the Panda's")] = (
         7.5
     )
-    follow_gain: Annotated[
-        float, Within(0, 10_000, "1/s", "joint error to velocity, following a path in joint space")
-    ] = 10.0
     wait_distance: Annotated[float, Within(1e-4, 10, "m", "the reference waits for an arm this far behind")] = 0.05
     limit_tolerance: Annotated[
         float, Within(0, 0.1, "rad", "a start or goal this far outside a joint limit is taken for encoder noise")

@@ -27,7 +27,6 @@ from splatctrl_cli.jobs.reconstructions import gaussians as reconstruct_gaussian
 from splatctrl_cli.jobs.reconstructions import verdict as reconstruct_verdict
 from splatctrl_cli.jobs.replays.metrics import metric_scales, shown_metrics
 from splatctrl_cli.jobs.replays.request import MODES
-from splatctrl_cli.jobs.replays.standstill_baseline import BASELINES
 from splatctrl_cli.jobs.scores import fit as score_fit
 
 REPLAY_FIELDS = ("exact", "barrier", "certified")
@@ -38,7 +37,7 @@ def scales() -> Mapping[str, Mapping[str, Scale]]:
     """How two runs are compared by each figure, by command and name."""
     replay: dict[str, Scale] = {}
     for mode in MODES:
-        replay |= metric_scales(mode, REPLAY_FIELDS, has_truth=True, baselines=BASELINES, has_twists=True)
+        replay |= metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True)
     bands = [field_accuracy.band_name(lower, upper) for lower, upper in BANDS]
     return {
         "reconstruct": reconstruct_gaussians.GATED | reconstruct_verdict.GATED,

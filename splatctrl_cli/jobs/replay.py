@@ -19,7 +19,6 @@ from splatctrl_cli.jobs.replays.criteria_input import Judged
 from splatctrl_cli.jobs.replays.evidence import Evidence, check_evidence, map_error, open_evidence
 from splatctrl_cli.jobs.replays.files import write_replay
 from splatctrl_cli.jobs.replays.goal import check_controller, check_goal, check_twists
-from splatctrl_cli.jobs.replays.golden import read_golden
 from splatctrl_cli.jobs.replays.inputs import (
     LoggedStates,
     MeasuredRobot,
@@ -40,7 +39,6 @@ from splatctrl_cli.jobs.replays.pictures import draw_worst_frames, worst_sights
 from splatctrl_cli.jobs.replays.provenance import Mismatch, made_from_mismatches, scene_mismatches, truth_mismatch
 from splatctrl_cli.jobs.replays.request import MODES, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
-from splatctrl_cli.jobs.replays.standstill_baseline import read_baselines, read_zone
 from splatctrl_cli.jobs.replays.truth import with_agreement, with_truth
 from splatctrl_cli.jobs.replays.verdict import ASKED, replay_verdict
 from splatctrl_cli.records import RgbdFrame
@@ -53,6 +51,7 @@ from splatctrl_cli.simulate.truth import load_truth
 class ReplayResult:
     """What a replay found, all of it written to `out`.
 
+    inputs: what it read, with the scene as it was known at each time (of ``lockstep``, while the replay ran).
     verdict: what it comes to; notes: sentences on the robot, the pictures and the log. is_damaged: part of the log
     was lost.
     """
@@ -60,6 +59,7 @@ class ReplayResult:
     __repr__ = brief
 
     out: Path
+    inputs: ReplayInputs
     replay: Replay
     metrics: Metrics
     verdict: Verdict
@@ -67,8 +67,8 @@ class ReplayResult:
     is_damaged: bool
 
     def exit_code(self, *, report_only: bool = False) -> int:
-        """1 or 5 as the verdict says, 3 for a damaged log, else 0; with `report_only` only what the request asked for
-        itself, gates and a golden run, turns it.
+        """1 or 5 as the verdict says, 3 for a damaged log, else 0; with `report_only` only the request's own gates
+        turn it.
         """
         return self.verdict.exit_code_of(ASKED if report_only else None) or (3 if self.is_damaged else 0)
 
@@ -77,7 +77,6 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
     """Replay, and write the output folder. Raises SplatCtrlError for what cannot be replayed."""
     check_request(request)
     config, stopwatch = request.config, Stopwatch()
-    golden = read_golden(request)
     with output_path(request.out, force=request.force, is_folder=True) as folder:
         motion = ImageMotion()
         with stopwatch.stage("read"):
@@ -96,7 +95,7 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         metrics = metrics_of(found) | logged.metrics()
         with stopwatch.stage("verdict"):
             judged = Judged(request=request, inputs=inputs, logged=logged, replay=found, metrics=metrics)
-            verdict = replay_verdict(judged, golden)
+            verdict = replay_verdict(judged)
         with stopwatch.stage("worst_frames"):
             unseen = draw_worst_frames(folder, found, sights)
         write_json(folder / "states.json", logged.as_dict())
@@ -107,6 +106,7 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         )
     return ReplayResult(
         out=request.out,
+        inputs=inputs,
         replay=found,
         metrics=metrics,
         verdict=verdict,
@@ -120,14 +120,9 @@ def check_request(request: ReplayRequest) -> None:
     belong to another mode.
     """
     fields = ("exact", "barrier", *(("certified",) if request.field is not None else ()))
-    baselines, has_truth = read_baselines(request), request.truth is not None
-    has_twists = request.twist_topic is not None
-    names = {
-        mode: metric_names(mode, fields, has_truth=has_truth, baselines=baselines, has_twists=has_twists)
-        for mode in MODES
-    }
+    has_truth, has_twists = request.truth is not None, request.twist_topic is not None
+    names = {mode: metric_names(mode, fields, has_truth=has_truth, has_twists=has_twists) for mode in MODES}
     check_gate_names(request.require, names[request.mode], {f"--mode {mode}": names[mode] for mode in names})
-    read_zone(request)
     check_lockstep(request)
     check_evidence(request)
     check_twists(request)

@@ -1,15 +1,13 @@
-"""Open loop, golden commands, explanations, gates, and what a closed loop may be asked for."""
+"""Open loop, explanations, gates, and what a closed loop may be asked for."""
 
 import json
 import re
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from splatctrl_cli.jobs.replays.metrics import metric_names
-from splatctrl_cli.records import JointState, Label
+from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, scene_of, splats_of, write_scene
 
@@ -112,32 +110,6 @@ def test_an_old_scene_is_stale(desk: Desk) -> None:
     assert desk.metrics()["max_map_age_s"] == pytest.approx(0.5)
 
 
-def test_a_replay_agrees_with_its_own_steps_and_another_is_told_by_step_and_joint(
-    desk: Desk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    moving(desk)
-    drive = (*scene_of(desk, BALL), "-q", "--mode", "closed-loop")
-    golden = str(desk.folder / "golden")
-    assert desk.replay(*drive, out="golden") == 0
-    assert desk.replay(*drive, "--golden", golden + "/run.json") == 0
-    assert desk.replay(*drive, "--golden", golden + "/steps.csv", "--golden-tolerance", "0", "--force") == 1
-    capsys.readouterr()
-    other = ("--set", "control.posture_gain=0.6", "--golden", golden)
-    assert desk.replay(*drive, *other, out="other") == 1
-    said = capsys.readouterr().out
-    assert "golden: step 0 at 0.000 s: joint joint" in said and "within 1e-06, got" in said
-    assert desk.replay(*drive, *other, "--golden-tolerance", "10", out="loose") == 0
-    assert desk.metrics("loose")["num_steps"] == desk.metrics()["num_steps"]
-
-
-def test_a_golden_file_without_commands_is_refused(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    assert desk.replay("--scene", str(scene), "-q", out="audit") == 0
-    arguments = ("--mode", "open-loop", "--golden", str(desk.folder / "audit"))
-    assert desk.replay("--scene", str(scene), "-q", *arguments) == 4
-    assert "expected commands (columns v_JOINT), got none" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
 def test_the_names_of_gates_are_those_of_the_metrics(desk: Desk, mode: str) -> None:
     assert desk.replay(*scene_of(desk, BALL), "-q", "--mode", mode, out=mode) == 0
@@ -212,37 +184,6 @@ def test_waypoints_are_reached_one_after_the_other(desk: Desk, arm: RobotModel, 
     ]
     for posture, rows in zip(postures, (places, places[-1:]), strict=True):
         assert np.linalg.norm(rows - arm.frame_pose(posture, frame)[:3, 3], axis=1).min() <= 0.01
-
-
-def write_passing_person(desk: Desk, arm: RobotModel) -> Path:
-    """A scene of nobody, from 0.3 to 2 s a person 30 cm ahead of the arm at the log's end, and nobody again."""
-    alone, beside = splats_of(BALL), splats_of(BALL, ball_ahead(arm, 0.3))
-    beside = replace(beside, labels=np.array([0, Label.HUMAN], np.uint8))
-    maps = ((0, alone), (3 * SECOND // 10, beside), (2 * SECOND, alone), (3 * SECOND, alone))
-    return write_scene(desk.folder / "scene", *maps)
-
-
-@pytest.mark.painted
-def test_the_standstill_waits_where_the_controller_goes_on(
-    desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
-) -> None:
-    moving(desk)
-    scene = write_passing_person(desk, arm)
-    drive = ("--scene", str(scene), "-q", "--mode", "closed-loop", "--baseline", "standstill", "--zone", "0.9,1.0")
-    assert desk.replay(*drive, "--require", "standstill_num_stops<=1") == 0
-    metrics = desk.metrics()
-    assert metrics["standstill_completed"] == metrics["closed_loop_completed"] == 1
-    assert metrics["standstill_duration_s"] == pytest.approx(1.0 + 1.7, abs=0.02)
-    assert (
-        metrics["standstill_longest_stop_s"]
-        == metrics["standstill_stopped_s"]
-        == pytest.approx(1.7 - 0.5 / 7.5, abs=0.02)
-    )  # of the visit less the time to brake
-    assert metrics["closed_loop_num_stops"] == 0
-    assert 0.25 < metrics["closed_loop_min_human_distance"] < 0.9
-    assert "Beside people, from the same moment:" in capsys.readouterr().out
-    names = metric_names("closed-loop", ("exact", "barrier"), has_truth=False, baselines=["standstill"])
-    assert set(metrics) == set(names)
 
 
 def test_a_closed_loop_that_outlasts_the_log_says_so_and_how_to_end_it_sooner(

@@ -73,10 +73,10 @@ def test_the_sentence_names_outcome_scope_the_decisive_reason_and_how_many_more(
 
 
 def test_what_was_asked_for_alone_can_turn_the_exit_code() -> None:
-    gate, asked = reason(Outcome.FAILED, "--require x>=1"), ("--require", "golden")
+    gate, asked = reason(Outcome.FAILED, "--require x>=1"), ("--require",)
     assert verdict_of("replay", [FAILED, UNKNOWN]).exit_code_of(asked) == 0
     assert verdict_of("replay", [UNKNOWN, gate]).exit_code_of(asked) == 1
-    assert verdict_of("replay", [FAILED, reason(Outcome.NOT_EVALUABLE, "golden run")]).exit_code_of(asked) == 5
+    assert verdict_of("replay", [FAILED, reason(Outcome.NOT_EVALUABLE, "--require y>=1")]).exit_code_of(asked) == 5
     assert verdict_of("replay", [PASSED, UNKNOWN]).exit_code_of(None) == 5
 
 

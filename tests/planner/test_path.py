@@ -1,11 +1,7 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.config import ControlConfig, PlannerConfig
-from splatctrl_cli.control.goals import pose_error
-from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.planner.birrt import plan
 from splatctrl_cli.planner.path import (
     effector_length,
     effector_rates,
@@ -14,8 +10,7 @@ from splatctrl_cli.planner.path import (
     resampled,
     timed,
 )
-from splatctrl_cli.planner.tracking import follow_joints, follow_with_controller
-from tests.control.fakes import Balls, PlanarArm
+from tests.control.fakes import PlanarArm
 from tests.planner.walls import clearance, one_wall, thin_post
 
 PATH = np.array([[0.7, 0.2], [0.9, 2.0], [-0.4, 1.5], [-0.42, 1.5]])
@@ -84,26 +79,3 @@ def test_a_path_keeps_the_speed_of_a_frame_too() -> None:
 def test_an_edge_that_leaves_a_frame_where_it_is_has_no_rate() -> None:
     still = effector_rates(ARM, np.array([[0.1, 0.2], [0.1, 0.2]]), "tip", max_linear=0.2, max_angular=0.5)
     assert still == np.inf
-
-
-def test_a_path_is_followed_to_its_end_by_the_joints() -> None:
-    room = clearance(one_wall(), margin=0.02)
-    planned = plan(room, PATH[0], np.array([-0.7, -0.2]), PlannerConfig())
-    path = timed(planned.waypoints, ARM.velocity_limit, 7.5)
-    position = follow_joints(path, ARM, PlannerConfig(), ControlConfig())
-    np.testing.assert_allclose(position[-1], planned.waypoints[-1], atol=1e-3)
-    assert joint_length(position) == pytest.approx(joint_length(planned.waypoints), rel=1e-3)
-    assert ControlConfig().period * (len(position) - 1) == pytest.approx(path.duration, abs=0.011)
-    assert np.min(room.at(position)) >= least_clearance(room, planned.waypoints).lower - 1e-3
-
-
-def test_a_path_is_followed_to_its_end_by_the_controller() -> None:
-    room = clearance(thin_post(), margin=0.03)  # more than the controller's own margin, which may not give way
-    field = Balls([[0.62, 0.31, 0.0]], [0.002])
-    planned = plan(room, np.array([1.2, 0.3]), np.array([-0.4, 0.5]), PlannerConfig())
-    path = timed(planned.waypoints, ARM.velocity_limit / 3, 3.0)
-    config = ControlConfig()
-    position, steps = follow_with_controller(path, ARM, lambda stamp_ns: field, "tip", PlannerConfig(), config)
-    arrived = pose_error(ARM.frame_pose(position[-1], "tip"), ARM.frame_pose(path.waypoints[-1], "tip"))
-    assert is_at_goal(arrived, config) and len(steps) == len(position) - 1
-    assert np.min(room.at(position)) > -0.01 - 1e-3  # of 0.03: the controller keeps 0.02

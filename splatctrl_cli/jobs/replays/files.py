@@ -16,7 +16,6 @@ from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, finite, write_json, write_run
 from splatctrl_cli.files.spilled_rows import BLOCK
-from splatctrl_cli.jobs.replays.compare import document_of, draw_methods
 from splatctrl_cli.jobs.replays.metrics import Metrics
 from splatctrl_cli.jobs.replays.pictures import draw_replay
 from splatctrl_cli.jobs.replays.result import Replay
@@ -129,12 +128,9 @@ def write_replay(
     """Write steps.csv, events.json, summary.json, pictures and run.json; robot: what is said of it, by subject."""
     write_steps(folder / "steps.csv", chunks_of(replay))
     write_json(folder / "events.json", events_document(replay))
-    if replay.comparison.methods:
-        write_json(folder / "methods.json", document_of(replay.comparison))
     write_json(folder / "summary.json", summary_of(replay, metrics, verdict, robot))
     with stopwatch.stage("picture"):
         draw_replay(folder, replay, seconds_of(replay))
-        draw_methods(folder, replay.comparison, replay.period, replay.margin)
     write_run(
         folder,
         command="replay",

@@ -39,15 +39,12 @@ from splatctrl_cli.evaluate.metrics import (
     Shown,
     counted,
     folded,
-    known,
     largest_of,
     least_of,
 )
-from splatctrl_cli.jobs.replays.compare import figure_scales, figures_of
 from splatctrl_cli.jobs.replays.goal import TWIST_FIGURES
 from splatctrl_cli.jobs.replays.inputs import LOG_FIGURES, LoggedStates
 from splatctrl_cli.jobs.replays.result import Replay
-from splatctrl_cli.jobs.replays.standstill_baseline import BESIDE, FIGURES, STANDSTILL, separation_figures
 from splatctrl_cli.jobs.replays.state_store import RUNGS
 from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.voxels import EvidenceClass
@@ -314,22 +311,19 @@ def _declared_of(replay: Replay) -> Declared:
 
 
 def metric_names(
-    mode: str, of_fields: Sequence[str], *, has_truth: bool, baselines: Sequence[str] = (), has_twists: bool = False
+    mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
 ) -> tuple[str, ...]:
-    """The names that `metrics_of` and the log's own figures have for a --mode and --baseline."""
-    return tuple(metric_scales(mode, of_fields, has_truth=has_truth, baselines=baselines, has_twists=has_twists))
+    """The names that `metrics_of` and the log's own figures have for a --mode."""
+    return tuple(metric_scales(mode, of_fields, has_truth=has_truth, has_twists=has_twists))
 
 
 def metric_scales(
-    mode: str, of_fields: Sequence[str], *, has_truth: bool, baselines: Sequence[str] = (), has_twists: bool = False
+    mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
 ) -> dict[str, Scale]:
     """How two runs are compared by each of `metric_names`."""
     scales = {metric.name: metric.scale for metric in _declared(mode, of_fields)}
     scales |= LOG_FIGURES
     scales |= TWIST_FIGURES if has_twists else {}
-    if STANDSTILL in baselines:
-        scales |= {f"{motion}_{figure}": scale for motion in BESIDE for figure, scale in FIGURES.items()}
-    scales |= figure_scales(baselines, has_truth=has_truth)
     if has_truth:
         scales |= {f"truth_{figure}_{name}": scale for name in of_fields for figure, scale in AGREEMENT.items()}
         scales["truth_tolerance"] = LENGTH
@@ -345,10 +339,6 @@ def metrics_of(replay: Replay) -> Metrics:
     """Every figure that is printed, written and gated on, by name; None where there is no value."""
     metrics: Metrics = {metric.name: metric.value(replay) for metric in _declared_of(replay)}
     metrics |= replay.twist_figures
-    for motion, separation in replay.separations.items():
-        figures = separation_figures(separation, replay.period)
-        metrics |= {f"{motion}_{figure}": value for figure, value in figures.items()}
-    metrics |= figures_of(replay.comparison)
     for name, agreement in replay.agreement.items():
         found = dict(zip(TRUTH, asdict(agreement).values(), strict=True))
         tolerance = found.pop("tolerance")
@@ -363,12 +353,6 @@ def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> Counts:
     """
     found = dict.fromkeys(metrics, num_states(replay))
     found |= {metric.name: metric.count(replay) for metric in _declared_of(replay)}
-    for motion, separation in replay.separations.items():
-        there = known(separation.distance)
-        found |= {f"{motion}_{name}_human_distance": there for name in ("min", "mean")}
-    for method in replay.comparison.methods:
-        if method not in replay.comparison.figures:
-            found |= {name: 0 for name in metrics if name.startswith(f"{method}_min_")}
     for field, agreement in replay.agreement.items():
         names = (name for name in TRUTH if name not in {"num_compared", "tolerance"})
         found |= {f"truth_{name}_{field}": agreement.num_states for name in names}

@@ -11,17 +11,16 @@ from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.preconditions import StaticViolation, check_within_limits, static_violations
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, StepRecord, closed_loop, divergence, scene_change
-from splatctrl_cli.control.step import OURS, Commander
+from splatctrl_cli.control.step import Commander
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.jobs.replays.compare import QP_IK, compared, planned_ways_out
+from splatctrl_cli.jobs.replays.detours import planned_ways_out
 from splatctrl_cli.jobs.replays.goal import commander_of, goal_waypoints, outside_run, twist_figures, twist_track
 from splatctrl_cli.jobs.replays.inputs import check_inside
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.jobs.replays.provenance import times_apart
 from splatctrl_cli.jobs.replays.request import FIRST_MAP, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
-from splatctrl_cli.jobs.replays.standstill_baseline import read_baselines, read_zone, separations
 from splatctrl_cli.jobs.replays.state_pass import ReplayRecord
 from splatctrl_cli.jobs.replays.state_store import Figures, StoredLoop, StoredOpenLoop
 from splatctrl_cli.logs.state_columns import StateColumns
@@ -34,10 +33,7 @@ def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, conso
     if inputs.scene.box is not None:
         check_inside(inputs.model, inputs.states.position[0], inputs.scene.box)
     mode = {"audit": _audited, "open-loop": _asked, "closed-loop": _driven}[request.mode]
-    zone = read_zone(request)
-    replay = mode(request, inputs, config, console)
-    replay = replace(replay, separations=separations(request, zone, inputs, replay, config))
-    return replace(replay, comparison=compared(request, read_baselines(request), inputs, replay, config, console))
+    return mode(request, inputs, config, console)
 
 
 def _audited(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
@@ -127,7 +123,6 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, consol
             model, config.control, task.frame, task.twists, trace.stamp_ns, trace.position, trace.steps
         ),
         outside=outside_run(commander),
-        ours=_trace(inputs, task, config) if QP_IK in request.baseline else None,
     )
 
 
@@ -135,8 +130,8 @@ def _trace(
     inputs: ReplayInputs,
     task: ReplayTask,
     config: Config,
-    record: StepRecord | None = None,
-    commander: Commander = OURS,
+    record: StepRecord,
+    commander: Commander,
 ) -> ReplayTrace:
     """The closed loop of a commander."""
     scene = inputs.scene

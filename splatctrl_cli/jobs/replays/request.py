@@ -70,12 +70,6 @@ class ReplayRequest(RobotOptions, RunOptions):
     controller_command: str | None = None
     controller_step_limit: float = STEP_LIMIT
     controller_twice: bool = False
-    golden: Path | None = None
-    golden_tolerance: float = 1e-6
-    baseline: tuple[str, ...] = ()
-    zone: str = "0.5,0.6"
-    zone_box: str | None = None
-    human: tuple[str, ...] = ()
     worst_frames: int = 3
     declare: Path | None = None
     require: tuple[str, ...] = ()

@@ -8,31 +8,14 @@ from splatctrl_cli.control.events import Event
 from splatctrl_cli.control.outside import Failure
 from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
-from splatctrl_cli.control.standstill import Separation
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.clearance_agreement import ClearanceAgreement
 from splatctrl_cli.jobs.replays.evidence import MapError
 from splatctrl_cli.jobs.replays.hindsight import Overtaken, Unwatched
 from splatctrl_cli.jobs.replays.state_store import Figures, StoredAudit, StoredOpenLoop, StoredSteps
-from splatctrl_cli.planner.comparison import Motion, MotionFigures
-from splatctrl_cli.planner.planned import PlannedPath
 from splatctrl_cli.records import FloatRows
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin
-
-
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Motions and their figures by method, and plans of the methods that plan; without a path there is no motion."""
-
-    motions: Mapping[str, Motion] = field(default_factory=dict)
-    figures: Mapping[str, MotionFigures] = field(default_factory=dict)
-    plans: Mapping[str, PlannedPath] = field(default_factory=dict)
-
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """Every method, in the order in which they stand side by side."""
-        return tuple(dict.fromkeys((*self.motions, *self.plans)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +35,8 @@ class Replay:
     the first state in the log [s]; between, near, strain, statics and closest: as `ReplayRecord` has them; unwatched,
     overtaken: what later depth showed; obstacles (T,): what is nearest to the nearest sphere, in words; map_age_s
     (T,): of the scene in use; kept_steps: of a controller; divergence: of a closed loop from the log, by columns
-    joints [rad], position [m], rotation [rad]; map_error: where the request names evidence of it; separations: with a
-    standstill the distances from people, by
-    name of the motion, sampled at `period` [s]; comparison: every motion of --baseline and its figures; outside: of a
-    user's own controller, and ours, with the baseline qp-ik: our controller in its place.
+    joints [rad], position [m], rotation [rad]; map_error: where the request names evidence of it; outside: of a
+    user's own controller.
     """
 
     model: RobotModel
@@ -82,22 +63,14 @@ class Replay:
     true_clearance: FloatRows | None = None
     agreement: Mapping[str, ClearanceAgreement] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
-    separations: Mapping[str, Separation] = field(default_factory=dict)
-    comparison: Comparison = field(default_factory=Comparison)
     twist_figures: Mapping[str, float | None] = field(default_factory=dict)
     map_error: MapError | None = None
     outside: OutsideRun | None = None
-    ours: ReplayTrace | None = None
 
     @property
     def margin(self) -> float:
         """Of clearance [m]."""
         return self.config.control.margin
-
-    @property
-    def period(self) -> float:
-        """Of the controller [s]."""
-        return self.config.control.period
 
     @property
     def mode(self) -> str:

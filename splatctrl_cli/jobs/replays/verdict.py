@@ -8,13 +8,12 @@ from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
 from splatctrl_cli.jobs.replays.criteria_input import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replays.evidence_criteria import OF_EVIDENCE, bound_words
-from splatctrl_cli.jobs.replays.golden import Golden, golden_reason
 from splatctrl_cli.jobs.replays.metrics import counts_of, first_time
 from splatctrl_cli.jobs.replays.motion_criteria import OF_MOTION
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.robot.declared_contact import carried_words
 
-ASKED = ("--require", "golden")  # criteria that the request itself asked for
+ASKED = ("--require",)  # criteria that the request itself asked for
 LARGER_IS_LAXER = (
     *("max_unknown", "max_map_age", "max_pose_jump", "allow_disagreement", "config.control.limit_tolerance"),
     *("config.verdict.unjudged", "config.verdict.lead_in", "config.verdict.longest_interval"),
@@ -26,10 +25,8 @@ SMALLER_IS_LAXER = (
 CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
 
 
-def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
-    """The verdict on a replay: every criterion, each ``--require`` of its request, and the golden run where one is
-    given.
-    """
+def replay_verdict(judged: Judged) -> Verdict:
+    """The verdict on a replay: every criterion, and each ``--require`` of its request."""
     replay, request = judged.replay, judged.request
     reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
     reasons.sort(key=lambda reason: reason.label != CONTACT)  # by any measure, before what only broke a margin
@@ -37,8 +34,6 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
     reasons += gate_reasons(
         request.require, judged.metrics, counts, first_time=lambda name, holds: first_time(replay, name, holds)
     )
-    if golden is not None:
-        reasons.append(golden_reason(golden, replay, request.golden_tolerance))
     stamps = replay.audit.stamp_ns
     first, last = replay.start_time_s, replay.start_time_s + float(stamps[-1] - stamps[0]) * 1e-9
     motion = "driven" if replay.closed_loop else "logged"

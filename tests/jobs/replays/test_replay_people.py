@@ -9,7 +9,6 @@ from tests.cli.replay_desk import START
 from tests.jobs.stage import FAR, Ball, Stage, decisive, resting
 
 pytestmark = pytest.mark.usefixtures("without_plots")
-STANDSTILL = ("--baseline", "standstill")
 
 
 @pytest.mark.parametrize(("human_margin", "code"), [(0.02, 0), (0.055, 0), (0.065, 1)])
@@ -24,35 +23,12 @@ def test_things_are_not_kept_at_the_margin_of_people(stage: Stage) -> None:
     assert stage.judged("--set", "control.human_margin=0.1")[0] == 0
 
 
-def test_people_of_the_truth_are_preferred_to_those_of_the_scene(stage: Stage) -> None:
-    stage.people = [((-1.0, 0.3, 1.3), 0.05)]
-    person: Ball = ((1.5, 0.0, 0.5), 0.1)
-    truth = stage.truth(FAR, person, name="human")  # all of it are people
-    code, _ = stage.judged(*STANDSTILL, "--truth", str(truth), "--human", "human1", mode="closed-loop")
-    assert code == 0
-    by_truth = stage.desk.metrics()["standstill_min_human_distance"]
-    assert by_truth == pytest.approx(nearest_to(stage, person), abs=0.02)
-    stage.judged(*STANDSTILL, mode="closed-loop", scene=stage.desk.folder / "scene")
-    by_scene = stage.desk.metrics()["standstill_min_human_distance"]
-    assert by_scene == pytest.approx(nearest_to(stage, stage.people[0]), abs=0.02)
-    assert abs(by_scene - by_truth) > 0.2
-
-
 def nearest_to(stage: Stage, ball: Ball) -> float:
     """Of the moving arm's surface over the logged motion [m]."""
     moving = np.flatnonzero(stage.arm.moving_spheres)
     centers = stage.arm.sphere_centers_batch(np.array([s.position for s in stage.states]))[:, moving]
     gaps = np.linalg.norm(centers - np.array(ball[0]), axis=2) - stage.arm.sphere_set.radii[moving] - ball[1]
     return float(gaps.min())
-
-
-def test_a_standstill_without_anybody_is_not_evaluable(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = stage.scene()
-    assert stage.judged(*STANDSTILL, mode="closed-loop", scene=scene) == (5, {})
-    assert "expected splats labelled human, got none at any time" in capsys.readouterr().err
-    truth = str(stage.truth(FAR, name="box"))
-    assert stage.judged(*STANDSTILL, "--truth", truth, mode="closed-loop", scene=scene) == (5, {})
-    assert "expected a primitive named human* or person*, got box0" in capsys.readouterr().err
 
 
 def test_the_truth_is_that_of_the_nearest_surface_not_of_the_nearest_centre(stage: Stage, arm: RobotModel) -> None:
