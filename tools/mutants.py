@@ -3,8 +3,9 @@
 ``python -m tools.mutants`` prints killed or survived for each, and the share killed by room; ``--room R`` or ``--only
 NAME`` takes some. It ends with 1 where one survived. A test run that takes too long counts as killed.
 
-An entry is ``[room.what-is-wrong]`` with `file`, the name of the file below splatctrl_cli/, `old`, text that stands
-there once, `new`, what replaces it, and `tests`, names of test files. Names, not paths, so that files may move.
+An entry is ``[room.what-is-wrong]`` with `file`, the name of a file below splatctrl_cli/ or experiments/, `old`,
+text that stands there once, `new`, what replaces it, and `tests`, names of test files. Names, not paths, so that files
+may move.
 """
 
 import argparse
@@ -24,7 +25,9 @@ from queue import SimpleQueue
 
 ROOT = Path(__file__).parent.parent
 TABLE = Path(__file__).with_name("mutants.toml")
-COPIED = ("splatctrl_cli", "tests", "tools")  # everything else is linked to
+PLANTED = ("splatctrl_cli", "experiments")  # where bugs are planted
+TESTS = ("tests", "experiments/tests")
+COPIED = (*PLANTED, "tests", "tools")  # everything else is linked to
 PREBUILT = "_native_*.so"
 # An editable install finds the package where it is; in the copy, the copy's is wanted.
 IN_THE_COPY = """import sys
@@ -45,7 +48,7 @@ class Mutant:
 
     def place(self, root: Path) -> Path:
         """The file below `root`. Raises ValueError unless exactly one of that name has the text, once."""
-        places = sorted((root / "splatctrl_cli").rglob(self.file))
+        places = sorted(path for room in PLANTED for path in (root / room).rglob(self.file))
         counts = {path: path.read_text().count(self.old) for path in places}
         if list(filter(None, counts.values())) != [1]:
             raise ValueError(f"{self.name}: expected the text once in {self.file}, got {sum(counts.values())} times")
@@ -53,7 +56,7 @@ class Mutant:
 
     def test_files(self, root: Path) -> list[Path]:
         """Raises ValueError for a name that no test file has."""
-        found = {name: sorted((root / "tests").rglob(name)) for name in self.tests}
+        found = {name: [p for room in TESTS for p in sorted((root / room).rglob(name))] for name in self.tests}
         if not found or not all(found.values()):
             raise ValueError(f"{self.name}: no test file {', '.join(name for name in found if not found[name])}")
         return [path for paths in found.values() for path in paths]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import CONTRADICTED, CONTRADICTING_COLUMNS, CONTRADICTING_PIXELS, MASK_STEP
 from splatctrl_cli.geometry import back_project_pixels, transform_points
-from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
 from splatctrl_cli.scene.labels import Seen
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at
 from splatctrl_cli.scene.stereo_shadow import shadowed
@@ -24,29 +24,55 @@ BESIDE = np.ones((3, 3), np.uint8)  # a block and its neighbours
 
 @dataclass(frozen=True, kw_only=True)
 class Contradicted:
-    """Blocks of `side` pixels (h, w) of a frame whose rays run through the surface of another. until (h, w) float32
-    [m]: the depth of that surface, 0 where there is none; is_blank (h, w): the frame has no depth there.
+    """Blocks of `side` pixels (h, w) of a frame that another frame contradicts.
+
+    until (h, w) float32 [m]: the depth at which the block's rays run through the surface of another frame, 0 where
+    they do not; is_blank (h, w): the frame has no depth there. through (h, w) float32 [m]: the depth of the block's
+    own surface where rays of another frame run through it, 0 where none do.
     """
 
     side: int
     until: Float32
     is_blank: Bool
+    through: Float32
 
     def pixels(self, shape: tuple[int, ...]) -> Bool:
-        """The contradicted pixels (H, W) that have depth."""
-        out = np.zeros(shape, bool)
-        blocks = np.kron((self.until > 0) & ~self.is_blank, np.ones((self.side, self.side), bool))
-        out[: blocks.shape[0], : blocks.shape[1]] = blocks
-        return out
+        """The pixels (H, W) whose depth is of no surface: their rays run through that of another."""
+        return self._spread((self.until > 0) & ~self.is_blank, shape)
+
+    def unproven(self, frame: RgbdFrame) -> RgbdFrame:
+        """The frame without depth where rays of another run through its surface: its own rays prove no space free."""
+        is_through = self._spread(self.through > 0, frame.depth.shape)
+        return replace(frame, depth=np.where(is_through, np.float32(0.0), frame.depth)) if is_through.any() else frame
 
     def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Float64:
-        """Points (K, 3) [m], world, half a voxel apart on the rays of its blocks before that surface."""
-        v, u = np.nonzero((self.until > 0) & (self.is_blank == is_blank))
-        depths = np.arange(config.min_range, self.until.max(initial=config.min_range), 0.5 * config.voxel)
+        """Points (K, 3) [m], world, half a voxel apart on the rays of its blocks before the surface in question."""
+        end = np.maximum(self.until, self.through)
+        v, u = np.nonzero((end > 0) & (self.is_blank == is_blank))
+        depths = np.arange(config.min_range, end.max(initial=config.min_range), 0.5 * config.voxel)
         middle = self.side // 2
         rays = back_project_pixels(frame.intrinsics, self.side * u + middle, self.side * v + middle, np.ones(len(u)))
-        is_before = depths < self.until[v, u][:, None]
+        is_before = depths < end[v, u][:, None]
         return transform_points(frame.T_world_camera, (rays[:, None] * depths[:, None])[is_before])
+
+    def _spread(self, blocks: Bool, shape: tuple[int, ...]) -> Bool:
+        """Pixels (H, W) of blocks (h, w)."""
+        out = np.zeros(shape, bool)
+        pixels = np.kron(blocks, np.ones((self.side, self.side), bool))
+        out[: pixels.shape[0], : pixels.shape[1]] = pixels
+        return out
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Surface:
+    """Points (K, 3) [m], world, of a frame's objects, and their block (K,) of the frame, rows and columns, and depth
+    (K,) [m]; none beside a step of depth.
+    """
+
+    points: Float64
+    v: Index
+    u: Index
+    depth: Float32
 
 
 def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
@@ -55,12 +81,26 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
     All rays of a block and of those beside it run through a surface that another frame measures, and end more than
     `CONTRADICTED` [m] behind it, or return no depth: outside of a stereo shadow, within the range of depth of the
     frame. So does a ray to a robot, drawn by its own surface, that returns no depth. Fewer than
-    `CONTRADICTING_PIXELS` blocks side by side are noise.
+    `CONTRADICTING_PIXELS` blocks side by side are noise. Which of the two is wrong is not known: a ray that measures
+    something proves no space free either where another runs through what it measures.
     """
     surfaces = [_surface(*one) for one in seen]
+    through = [np.zeros([size // _side(frame) for size in frame.depth.shape], np.float32) for frame, _ in seen]
+    until = []
     for index, (frame, mask) in enumerate(seen):
-        others = [points for number, points in enumerate(surfaces) if number != index]
-        yield _run_through(frame, mask, np.concatenate([np.zeros((0, 3)), *others]), is_drawn)
+        rays, depths = _Rays.of(frame, mask), np.zeros_like(through[index])
+        for number, surface in enumerate(surfaces):
+            if number != index:
+                is_passed = rays.run_through(surface, depths)
+                through[number][surface.v[is_passed], surface.u[is_passed]] = surface.depth[is_passed]
+        robot = _blocks(mask.robot_depth, rays.side).min(axis=2)
+        is_before = rays.is_blank & (robot > 0) & is_drawn
+        depths[is_before] = robot[is_before]
+        until.append(_without_noise(depths))
+    for (frame, _), end, passed in zip(seen, until, through, strict=True):
+        side = _side(frame)
+        is_blank = np.asarray((_blocks(frame.depth, side) <= 0).all(axis=2))
+        yield Contradicted(side=side, until=end, is_blank=is_blank, through=_without_noise(passed))
 
 
 def without_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
@@ -80,39 +120,56 @@ def _blocks(image: NDArray[T], side: int) -> NDArray[T]:
     return parts.swapaxes(1, 2).reshape(h, w, side * side)
 
 
-def _surface(frame: RgbdFrame, mask: SelfMask) -> Float64:
-    """Points (K, 3) [m], world, of a frame's objects, one a block, none beside a step of depth."""
+def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:
     side = _side(frame)
     depth = _blocks(frame.depth, side)
     nearest, farthest = depth.min(axis=2), depth.max(axis=2)
     is_flat = cv2.dilate(farthest, BESIDE) - cv2.erode(nearest, BESIDE) < 2 * MASK_STEP
     is_object = _blocks(mask.kinds == PixelKind.OBJECT, side).all(axis=2)
     v, u = np.nonzero(is_flat & is_object)
-    middle = side // 2
-    points = back_project_pixels(frame.intrinsics, side * u + middle, side * v + middle, depth.mean(axis=2)[v, u])
-    return transform_points(frame.T_world_camera, points)
+    middle, mean = side // 2, depth.mean(axis=2)[v, u]
+    points = back_project_pixels(frame.intrinsics, side * u + middle, side * v + middle, mean)
+    return _Surface(points=transform_points(frame.T_world_camera, points), v=v, u=u, depth=mean)
 
 
-def _run_through(frame: RgbdFrame, mask: SelfMask, surface: Float64, is_drawn: bool) -> Contradicted:
-    """The blocks of a frame whose rays run through points (K, 3) [m], world, of a surface."""
-    side = _side(frame)
-    surely = cv2.erode(_blocks(frame.depth, side).min(axis=2), BESIDE)  # 0 beside lost pixels
-    is_lost = (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~shadowed(frame.depth, frame.intrinsics.fx)
-    if frame.valid is not None:
-        is_lost &= frame.valid
-    is_blank = cv2.erode(_blocks(is_lost, side).all(axis=2).view(np.uint8), BESIDE) > 0
-    pixel, z = pixels_at(frame, surface)
-    v, u = pixel // frame.intrinsics.width // side, pixel % frame.intrinsics.width // side
-    is_inside = (pixel >= 0) & (v < surely.shape[0]) & (u < surely.shape[1])
-    v, u, z = v[is_inside], u[is_inside], z[is_inside]
-    is_through = (surely[v, u] > z + CONTRADICTED) | (is_blank[v, u] & (z < frame.depth.max() + CONTRADICTED))
-    until = np.zeros(surely.shape, np.float32)
-    until[v[is_through], u[is_through]] = z[is_through]
-    robot = _blocks(mask.robot_depth, side).min(axis=2)
-    is_before = is_blank & (robot > 0) & is_drawn
-    until[is_before] = robot[is_before]
-    wide = cv2.dilate(until, BESIDE)
+@dataclass(frozen=True, kw_only=True)
+class _Rays:
+    """How far the rays of a frame's blocks (h, w) surely go [m], and which return nothing although they should."""
+
+    frame: RgbdFrame
+    side: int
+    surely: Float32
+    is_blank: Bool
+
+    @classmethod
+    def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_Rays":
+        side = _side(frame)
+        surely = cv2.erode(_blocks(frame.depth, side).min(axis=2), BESIDE)  # 0 beside lost pixels
+        is_lost = (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~shadowed(frame.depth, frame.intrinsics.fx)
+        if frame.valid is not None:
+            is_lost &= frame.valid
+        is_blank = cv2.erode(_blocks(is_lost, side).all(axis=2).view(np.uint8), BESIDE) > 0
+        return cls(frame=frame, side=side, surely=surely, is_blank=np.asarray(is_blank))
+
+    def run_through(self, surface: _Surface, until: Float32) -> Index:
+        """Note in `until` (h, w) how far off a surface is where the rays run through it.
+
+        Returns the surface's points behind which a ray measures something.
+        """
+        pixel, z = pixels_at(self.frame, surface.points)
+        width = self.frame.intrinsics.width
+        v, u = pixel // width // self.side, pixel % width // self.side
+        asked = np.flatnonzero((pixel >= 0) & (v < self.surely.shape[0]) & (u < self.surely.shape[1]))
+        v, u, z = v[asked], u[asked], z[asked]
+        is_behind = self.surely[v, u] > z + CONTRADICTED
+        is_through = is_behind | (self.is_blank[v, u] & (z < self.frame.depth.max() + CONTRADICTED))
+        until[v[is_through], u[is_through]] = z[is_through]
+        return asked[is_behind]
+
+
+def _without_noise(depths: Float32) -> Float32:
+    """Depths (h, w) [m] of blocks and of their neighbours, where `CONTRADICTING_PIXELS` blocks are side by side."""
+    wide = cv2.dilate(depths, BESIDE)
     num, piece = cv2.connectedComponents((wide > 0).view(np.uint8), connectivity=8)
-    counts = np.bincount(piece[until > 0], minlength=num)
-    until = np.where((counts >= CONTRADICTING_PIXELS)[piece], wide, np.float32(0.0))
-    return Contradicted(side=side, until=until, is_blank=np.asarray((_blocks(frame.depth, side) <= 0).all(axis=2)))
+    counts = np.bincount(piece[depths > 0], minlength=num)
+    return np.where((counts >= CONTRADICTING_PIXELS)[piece], wide, np.float32(0.0))

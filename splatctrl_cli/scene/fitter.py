@@ -135,7 +135,10 @@ class SceneFitter:
         seen = self.seen = list(zip(frames, masks, strict=True))
         if self.descent.background is None:
             self.descent.background = self._behind(views)
-        self.people.take_in(self.occupancy, [without(*one, PixelKind.CONTRADICTED) for one in seen])
+        proving = [
+            found.unproven(without(*one, PixelKind.CONTRADICTED)) for one, found in zip(seen, rays, strict=True)
+        ]
+        self.people.take_in(self.occupancy, proving)
         unanswered = self._each(lambda one: unanswered_points(one[0], one[1].robot_depth, config), seen)
         for frame, found in zip(frames, rays, strict=True):
             self.occupancy.mark_unseen(found.points(frame, config, is_blank=False), Unseen.CONTRADICTED)

@@ -49,6 +49,26 @@ def test_depth_far_behind_what_another_camera_measures_is_contradicted(behind: f
         assert HEIGHT - CONFIG.min_range - 0.01 < points[:, 2].max() <= HEIGHT - CONFIG.min_range
 
 
+def test_a_ray_proves_nothing_free_where_another_camera_sees_through_what_it_measures() -> None:
+    """A block is measured in the air behind which the other camera sees the floor."""
+    shiny, other = block_measured_at(0.6), frame(x=BESIDE, camera="cam1")
+    found, beside = contradicted(masks_of(shiny, other), is_drawn=False)
+    is_block = shiny.depth < HEIGHT
+    proving = found.unproven(shiny)
+    is_unproven = (proving.depth == 0) & (shiny.depth > 0)
+    assert is_unproven.sum() > 0.5 * is_block.sum() and not found.until.any()
+    assert not found.pixels(shiny.depth.shape).any()  # what it measures stays a surface of the map
+    points = found.points(shiny, CONFIG, is_blank=False)
+    assert HEIGHT - 0.6 - 1e-6 <= points[:, 2].min() < HEIGHT - 0.6 + CONFIG.voxel
+    assert beside.until.any() and beside.unproven(other) is other
+
+
+def test_a_camera_without_depth_makes_no_surface_doubtful() -> None:
+    dark, other = block_measured_at(0.0), frame(x=BESIDE, camera="cam1")
+    _, beside = contradicted(masks_of(dark, other), is_drawn=False)
+    assert not beside.through.any()
+
+
 def test_a_camera_without_depth_where_another_measures_a_surface_looked_in_vain() -> None:
     dark, other = block_measured_at(0.0), frame(x=BESIDE, camera="cam1")
     found, _ = contradicted(masks_of(dark, other), is_drawn=False)
