@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 from experiments import dtu
-from experiments.dtu import GIVEN, METHODS, SIMULATED, Fit, fits, notes, problems, sections
+from experiments.dtu import GIVEN, METHODS, SIMULATED, Fit, notes, problems, sections, trials_of
 from experiments.problems import ProblemRequest
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import Stopwatch
 
-SAMPLE = Path(__file__).parents[3] / "sample_data" / "dtu"
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "dtu"
 GOOD = Fit(environment=GIVEN, number=24, method="5k", psnr=24.0, psnr_seen=25.0, ssim=0.9, depth=0.003, splats=4900)
 
 
@@ -53,17 +53,17 @@ def test_without_a_tree_the_simulated_scan_is_fitted_by_several_seeds(tmp_path: 
 
 @pytest.mark.usefixtures("fast")
 def test_a_scan_of_a_tree_goes_through_budgets_and_baseline() -> None:
-    rows = list(fits(asked("dtu-0001", SAMPLE, METHODS), Config(), Stopwatch()))
+    rows = list(trials_of(asked("dtu-0001", SAMPLE, METHODS), Config(), Stopwatch()))
     assert [row.method for row in rows] == list(METHODS)
     assert [row.splats for row in rows[:2]] < [row.splats for row in rows[1:3]]
     assert all(row.success and row.psnr is not None and row.psnr > 5 for row in rows)
     with pytest.raises(InputError, match="has no scan 7"):
-        list(fits(asked("dtu-0007", SAMPLE, METHODS), Config(), Stopwatch()))
+        list(trials_of(asked("dtu-0007", SAMPLE, METHODS), Config(), Stopwatch()))
 
 
 def test_a_scan_of_a_tree_is_not_the_simulated_one() -> None:
     with pytest.raises(InputError, match="is of a DTU tree"):
-        list(fits(asked("dtu-0024", None, METHODS), Config(), Stopwatch()))
+        list(trials_of(asked("dtu-0024", None, METHODS), Config(), Stopwatch()))
 
 
 @pytest.mark.usefixtures("fast")
@@ -72,7 +72,7 @@ def test_a_method_that_fails_is_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch
         raise InputError("no depth")
 
     monkeypatch.setattr(dtu, "_fit", refused)
-    rows = list(fits(asked("dtu-0001", SAMPLE, ["5k", "3dgs"]), Config(), Stopwatch()))
+    rows = list(trials_of(asked("dtu-0001", SAMPLE, ["5k", "3dgs"]), Config(), Stopwatch()))
     assert [row.error for row in rows] == ["no depth"] * 2 and not rows[0].success
     assert sum("no depth" in note for note in notes(rows)) == 2
 

@@ -1,10 +1,8 @@
 """``splatctrl reconstruct``: a log into splats, occupancy, audit and snapshots."""
 
 import argparse
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of, source_options
@@ -13,7 +11,6 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.device import shown
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.reconstructions.correct_views import Corrections
-from splatctrl_cli.jobs.reconstructions.gaussians import reconstruct_gaussians
 from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.reconstructions.resume import DECIDING_OPTIONS
@@ -46,8 +43,8 @@ def run(args: argparse.Namespace) -> int:
         corrections=Corrections(poses=args.refine_poses, exposure=args.refine_exposure),
         options={name: getattr(args, name) for name in DECIDING_OPTIONS},
     )
-    console, is_baseline = Console(args), args.method == "3dgs"
-    return show_reconstructed(console, (reconstruct_gaussians if is_baseline else reconstruct)(request, console))
+    console = Console(args)
+    return show_reconstructed(console, reconstruct(request, console))
 
 
 def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None) -> RecordingRequest:
@@ -59,24 +56,20 @@ def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None
 
 def show_reconstructed(console: Console, result: ReconstructResult) -> int:
     """The verdict, and a row of figures."""
-    is_baseline = result.metrics.get("method") == "3dgs"
-    found = {"scene": str(result.out), "metrics": result.metrics}
-    found |= {} if is_baseline else {"removed": result.removed}
-    return console.concluded(result.verdict, found, [*_lines(result, is_baseline=is_baseline), f"wrote {result.out}"])
+    found = {"scene": str(result.out), "metrics": result.metrics, "removed": result.removed}
+    return console.concluded(result.verdict, found, [*_lines(result), f"wrote {result.out}"])
 
 
-def _lines(result: ReconstructResult, *, is_baseline: bool) -> list[str]:
+def _lines(result: ReconstructResult) -> list[str]:
     metrics, removed = result.metrics, result.removed
-    if is_baseline:
-        names = ("iterations", "splats", "cloned", "split", "pruned", "unmet")
-        columns = {name: metrics[name] for name in names} | _quality(metrics, result.seconds["fit"])
-        return table(list(columns), [list(columns.values())])
+    psnr = metrics["psnr"]
     columns = {
         **{name.replace("_", " "): metrics[name] for name in ("time_steps", "splats")},
         "robot": metrics["robot_splats"],
         "shell": metrics["shell_splats"],
         **{name: metrics[name] for name in ("added", "relocated", "unmet")},
-        **_quality(metrics, sum(result.seconds.values())),
+        "training dB": "-" if psnr is None else f"{psnr:.2f}",
+        "seconds": f"{sum(result.seconds.values()):.1f}",
     }
     reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in removed.items() if count)
     return [
@@ -84,8 +77,3 @@ def _lines(result: ReconstructResult, *, is_baseline: bool) -> list[str]:
         f"removed: {', '.join(reasons) or 'none'}",
         f"computed on {', then '.join(map(shown, metrics['devices']))}",
     ]
-
-
-def _quality(metrics: Mapping[str, Any], seconds: float) -> dict[str, str]:
-    psnr = metrics["psnr"]
-    return {"training dB": "-" if psnr is None else f"{psnr:.2f}", "seconds": f"{seconds:.1f}"}

@@ -1,7 +1,7 @@
 """Every number of the method, by section of the paper. The paper's value is the default where it gives one."""
 
 from splatctrl_cli.config.load import PRESETS, Config, check_voxel, load_config, sources_of
-from splatctrl_cli.config.map import FieldConfig, GaussianConfig, HumanConfig, OccupancyConfig, SceneConfig
+from splatctrl_cli.config.map import FieldConfig, HumanConfig, OccupancyConfig, SceneConfig
 from splatctrl_cli.config.motion import ControlConfig, PlannerConfig, VerdictConfig
 
 __all__ = [
@@ -9,7 +9,6 @@ __all__ = [
     "Config",
     "ControlConfig",
     "FieldConfig",
-    "GaussianConfig",
     "HumanConfig",
     "OccupancyConfig",
     "PlannerConfig",

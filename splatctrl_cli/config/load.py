@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
-from splatctrl_cli.config.map import FieldConfig, GaussianConfig, HumanConfig, OccupancyConfig, SceneConfig
+from splatctrl_cli.config.map import FieldConfig, HumanConfig, OccupancyConfig, SceneConfig
 from splatctrl_cli.config.motion import ControlConfig, PlannerConfig, VerdictConfig
 from splatctrl_cli.config.ranges import Section, Within, check, cut, shown
 from splatctrl_cli.errors import InputError, UsageError
@@ -23,7 +23,6 @@ class Config:
     """The whole configuration, one table per section in TOML."""
 
     scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)
-    gaussians: GaussianConfig = dataclasses.field(default_factory=GaussianConfig)
     occupancy: OccupancyConfig = dataclasses.field(default_factory=OccupancyConfig)
     human: HumanConfig = dataclasses.field(default_factory=HumanConfig)
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)

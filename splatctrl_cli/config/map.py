@@ -135,54 +135,6 @@ class SceneConfig(Section, section="scene"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaussianConfig(Section, section="gaussians"):
-    """The baseline, `reconstruct --method 3dgs`: 3D Gaussian splatting (Kerbl et al. 2023), with its numbers. Shares
-    are of `iterations`, of which it had 30,000.
-    """
-
-    iterations: Annotated[int, Within(0, MOST_ITERATIONS, "", "optimiser steps")] = 3000
-    max_gaussians: Annotated[int, Within(1, 10_000_000, "", "limit, which 3DGS lacks; ten million take 7 GB")] = (
-        500_000
-    )
-    max_degree: Annotated[int, Within(0, 3, "", "of the spherical harmonics")] = 3
-    degree_every: Annotated[float, Within(0, 1, "", "share of the iterations until the degree rises by one")] = 1 / 30
-    initial_opacity: Annotated[float, Within(0.001, 0.99, "", "opacity of a new Gaussian")] = 0.1
-    lr_center: Annotated[float, Within(1e-12, 1, "", "learning rate of centres, times the extent of the scene")] = (
-        1.6e-4
-    )
-    lr_center_final: Annotated[float, Within(1e-12, 1, "", "the same at the end, reached exponentially")] = 1.6e-6
-    lr_log_scale: Annotated[float, Within(0, 1, "", "learning rate of log sigmas")] = 5e-3
-    lr_quat: Annotated[float, Within(0, 1, "", "learning rate of rotations")] = 1e-3
-    lr_color: Annotated[float, Within(0, 1, "", "learning rate of the constant harmonic")] = 2.5e-3
-    lr_harmonics: Annotated[float, Within(0, 1, "", "learning rate of the other harmonics")] = 1.25e-4
-    lr_logit_opacity: Annotated[float, Within(0, 10, "", "learning rate of opacity logits")] = 5e-2
-    densify_from: Annotated[
-        int,
-        Within(0, MOST_ITERATIONS, "", "iterations before the first adding and removing, or half of densify_until"),
-    ] = 500
-    densify_until: Annotated[float, Within(0, 1, "", "share of the iterations after which their number is fixed")] = (
-        0.5
-    )
-    densify_every: Annotated[int, Within(1, MOST_ITERATIONS, "", "iterations between such rounds")] = 100
-    densify_gradient: Annotated[
-        float, Within(0, 1, "", "mean screen gradient [half images] from which a Gaussian is cloned or split")
-    ] = 2e-4
-    dense_share: Annotated[float, Within(0, 1, "", "share of the extent: larger are split, others cloned")] = 0.01
-    split_shrink: Annotated[float, Within(1, 10, "", "sigmas of a split Gaussian's parts are divided by this")] = 1.6
-    min_opacity: Annotated[float, Within(1e-4, 0.9, "", "fainter Gaussians are removed")] = 0.005
-    max_screen_radius: Annotated[float, Within(1, 100_000, "px", "larger are removed once opacities were reset")] = (
-        20.0
-    )
-    max_size_share: Annotated[
-        float, Within(1e-3, 100, "", "share of the extent: Gaussians with a larger sigma are removed then, too")
-    ] = 0.1
-    reset_every: Annotated[
-        float, Within(0, 1, "", "share of the iterations between resets of opacity; 0: none (0.1 cost over 1 dB)")
-    ] = 0.0
-    reset_opacity: Annotated[float, Within(1e-4, 0.9, "", "opacity after a reset")] = 0.01
-
-
-@dataclass(frozen=True, kw_only=True)
 class OccupancyConfig(Section, section="occupancy"):
     """III-C: occupancy grid, free-space filter, robot labels."""
 

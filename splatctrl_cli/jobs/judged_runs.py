@@ -23,11 +23,9 @@ from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PARTIAL, output_path
 from splatctrl_cli.jobs import robot
 from splatctrl_cli.jobs.bakes import bake
-from splatctrl_cli.jobs.reconstructions import gaussians as reconstruct_gaussians
 from splatctrl_cli.jobs.reconstructions import verdict as reconstruct_verdict
 from splatctrl_cli.jobs.replays.metrics import metric_scales, shown_metrics
 from splatctrl_cli.jobs.replays.request import MODES
-from splatctrl_cli.jobs.scores import fit as score_fit
 
 REPLAY_FIELDS = ("exact", "barrier", "certified")
 
@@ -40,9 +38,9 @@ def scales() -> Mapping[str, Mapping[str, Scale]]:
         replay |= metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True)
     bands = [field_accuracy.band_name(lower, upper) for lower, upper in BANDS]
     return {
-        "reconstruct": reconstruct_gaussians.GATED | reconstruct_verdict.GATED,
+        "reconstruct": reconstruct_verdict.GATED,
         "sdf-bake": bake.SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS, bands),
-        "score": score_report.SCALES | score_fit.GATED,
+        "score": score_report.SCALES,
         "replay": replay,
         "robot": robot.SCALES,
     }

@@ -6,7 +6,7 @@ readable without red and green. The bars of the errors end at the same values in
 methods can be compared by eye.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -267,26 +267,6 @@ def view_picture(path: Path, row: ComparisonRow) -> None:
         )
         for panel, text in zip(axes.flat, titles, strict=True):
             _finish(panel, text)
-        save_figure(figure, path)
-
-
-def renders_picture(path: Path, view: str, photo: UInt8, renders: Mapping[str, NDArray[np.floating]]) -> None:
-    """Write a photo (H, W, 3) beside renders (H, W, 3) in [0, 1] under their titles, their colour errors below."""
-    height, width = photo.shape[:2]
-    columns = 1 + len(renders)
-    with drawn_figure(2 * ((WIDTH - 0.6) / columns * height / width + 0.4) + 0.2) as figure:
-        axes = figure.subplots(2, columns, squeeze=False)
-        axes[0, 0].imshow(photo, interpolation="nearest")
-        _finish(axes[0, 0], f"photo   {view}")
-        axes[1, 0].set_axis_off()
-        for (title, render), (above, below) in zip(renders.items(), axes.T[1:], strict=True):
-            error = _color_error(render, photo)
-            above.imshow(np.clip(render, 0.0, 1.0), interpolation="nearest")
-            image = _draw_color_error(below, error)
-            _finish(above, title)
-            _finish(below, f"colour error   mean {error.mean():.1f}%")
-        bar = figure.colorbar(image, ax=axes[1, 0], extend="max", orientation="horizontal", fraction=0.3)
-        bar.set_label("mean of |render - photo| over RGB, % of the range")
         save_figure(figure, path)
 
 

@@ -1,4 +1,4 @@
-"""Anisotropic Gaussians as rows of parameters and as sets, and how they look from a camera."""
+"""Sets of anisotropic Gaussians as rows of parameters, and how they look from a camera."""
 
 import numpy as np
 
@@ -10,41 +10,13 @@ from splatctrl_cli.kernels.gaussians import (
     LOGIT,
     NUM_PARAMETERS,
     QUAT,
-    RED_0,
     GaussianRasteriser,
 )
-from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label
-from splatctrl_cli.scene.buffer import Seeds
+from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics
 from splatctrl_cli.scene.render import Rendering, camera_array
-from splatctrl_cli.splat_files.splat_format import SH_C0
 
 LARGEST_LOGIT = 16.0  # opacity 1 to float32
 PER_CHANNEL = 16  # harmonics
-
-
-def seeded(seeds: Seeds, opacity: float) -> Float32:
-    """Parameters (N, 59) of isotropic seeds as Gaussians of one colour."""
-    rows = np.zeros((len(seeds), NUM_PARAMETERS), np.float32)
-    rows[:, CENTER] = seeds.centers
-    rows[:, LOG_SCALE] = np.log(seeds.radii)[:, None]
-    rows[:, QUAT.start] = 1.0
-    rows[:, LOGIT] = np.log(opacity / (1.0 - opacity))
-    rows[:, RED_0::PER_CHANNEL] = (seeds.colors - 0.5) / SH_C0
-    return rows
-
-
-def gaussians_of(parameters: Float32, degree: int) -> GaussianSet:
-    """The set that parameters (N, 59) describe, with harmonics up to `degree`; all are objects."""
-    quats = parameters[:, QUAT].astype(np.float64)
-    harmonics = parameters[:, HARMONICS].reshape(-1, 3, PER_CHANNEL)[:, :, : (degree + 1) ** 2]
-    return GaussianSet(
-        centers=parameters[:, CENTER].copy(),
-        scales=np.exp(parameters[:, LOG_SCALE]),
-        quats_wxyz=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
-        opacities=(1.0 / (1.0 + np.exp(-parameters[:, LOGIT].astype(np.float64)))).astype(np.float32),
-        harmonics=np.ascontiguousarray(np.moveaxis(harmonics, 1, 2)),
-        labels=np.full(len(parameters), Label.OBJECT, np.uint8),
-    )
 
 
 def parameters_of(gaussians: GaussianSet) -> Float32:

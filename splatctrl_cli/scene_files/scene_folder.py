@@ -231,7 +231,7 @@ class SceneFolder:
 
     @property
     def is_anisotropic(self) -> bool:
-        """True for what `reconstruct --method 3dgs` made: `gaussians` instead of splats and occupancy."""
+        """True for what 3D Gaussian splatting made: `gaussians` instead of splats and occupancy."""
         return self._metric("method", "3dgs".__eq__, "")
 
     def _metric(self, name: str, kind: Callable[[Any], T], default: object = None) -> T:
@@ -254,8 +254,8 @@ class SceneFolder:
     def _expect_isotropic(self) -> None:
         if self.is_anisotropic:
             raise InputError(
-                f"{self.path}: made by --method 3dgs; distances are defined on isotropic splats",
-                remedy="reconstruct without --method, or 'splatctrl score' it",
+                f"{self.path}: made by 3D Gaussian splatting; distances are defined on isotropic splats",
+                remedy="reconstruct the recording, or 'splatctrl score' this scene",
             )
 
     def occupancy(self) -> OccupancyGrid:

@@ -1,7 +1,6 @@
-"""``splatctrl reconstruct``: small logs and scans, by both methods, with people, and with something wrong."""
+"""``splatctrl reconstruct``: small logs and scans, with people, and with something wrong."""
 
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,6 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.records import Label, RgbdFrame
 from splatctrl_cli.scene_files.scene_folder import open_scene
-from splatctrl_cli.splat_files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from tests.logs.make_log import LogRecipe, make_log
 from tests.scene.wall import INTRINSICS, frame
 
@@ -234,71 +232,3 @@ def test_who_the_masks_show_is_human_in_scene_and_field(tmp_path: Path, capsys: 
     capsys.readouterr()
     used = [json.loads((tmp_path / name / "field.json").read_text())["splats_used"] for name in ("field", "without")]
     assert [counts["human"] for counts in used] == [is_human.sum(), 0]
-
-
-SAMPLES = Path(__file__).parents[2] / "sample_data"
-DTU = ["--dtu", str(SAMPLES / "dtu"), "--holdout", "2,5"]
-SHORT = [
-    *("--method", "3dgs", "-q"),
-    *("--set", "gaussians.iterations=24", "--set", "gaussians.densify_from=8"),
-    *("--set", "gaussians.densify_every=8", "--set", "gaussians.densify_until=0.9"),
-]
-
-
-@pytest.fixture(scope="module")
-def gaussians_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("gaussians") / "scene"
-    assert main(["reconstruct", *DTU, *SHORT, "--threads", "2", "-o", str(out)]) == 0
-    return out
-
-
-def said(capsys: pytest.CaptureFixture[str]) -> str:
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    return err
-
-
-def test_the_scene_holds_a_gaussian_file_and_an_audit_that_agree(gaussians_scene: Path) -> None:
-    gaussians, comments = read_gaussian_ply(gaussians_scene / "splats.ply")
-    rows = [json.loads(line) for line in (gaussians_scene / "audit.jsonl").read_text().splitlines()]
-    metrics = json.loads((gaussians_scene / "run.json").read_text())["metrics"]
-    assert comments["format"].startswith("splatctrl-scene")
-    assert len(gaussians) == rows[-1]["gaussians"] == metrics["splats"] > 4500
-    assert metrics["method"] == "3dgs"
-    assert metrics["iterations"] == rows[-1]["iteration"] == 24
-    assert len(metrics["training_stamps_ns"]) == 6
-
-
-def test_score_renders_the_held_out_views(gaussians_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["score", str(gaussians_scene), *DTU, "-q", "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert result["metrics"]["num_views"] == 2
-    assert result["metrics"]["psnr_all"] > 5
-    assert main(["score", str(gaussians_scene), "--dtu", str(SAMPLES / "dtu"), "--holdout", "3", "-q"]) == 2
-    assert "trained the scene" in said(capsys)
-
-
-def test_score_refuses_a_scene_without_gaussians(
-    gaussians_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    empty = tmp_path / "empty"
-    shutil.copytree(gaussians_scene, empty)
-    gaussians, comments = read_gaussian_ply(gaussians_scene / "splats.ply")
-    write_gaussian_ply(empty / "splats.ply", gaussians.select(np.zeros(len(gaussians), dtype=np.bool_)), comments)
-    run = json.loads((gaussians_scene / "run.json").read_text())
-    (empty / "run.json").write_text(json.dumps({name: run[name] for name in run if name != "parts"}))
-    assert main(["score", str(empty), *DTU, "-q", "-o", str(tmp_path / "scores")]) == 4
-    assert "empty: expected Gaussians, got none: there is nothing to render" in said(capsys)
-    assert not (tmp_path / "scores").exists()
-
-
-def test_what_needs_distances_is_refused_in_one_line(
-    gaussians_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["sdf-bake", str(gaussians_scene), "-o", str(tmp_path / "field"), "-q"]) == 4
-    assert "reconstruct without --method" in said(capsys)
-    log, urdf = str(SAMPLES / "tabletop" / "log.mcap"), str(SAMPLES / "tabletop" / "robot.urdf")
-    spheres = str(SAMPLES / "tabletop" / "robot_spheres.yaml")
-    robot = ["--urdf", urdf, "--spheres", spheres]
-    assert main(["replay", log, *robot, "--scene", str(gaussians_scene), "-o", str(tmp_path / "run"), "-q"]) == 4
-    assert "reconstruct without --method" in said(capsys)

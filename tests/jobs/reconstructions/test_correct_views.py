@@ -12,7 +12,6 @@ from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.open_recording import RecordingRequest
 from splatctrl_cli.jobs.reconstructions.correct_views import Corrections, corrected, corrected_among
-from splatctrl_cli.jobs.reconstructions.gaussians import reconstruct_gaussians
 from splatctrl_cli.jobs.reconstructions.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.scores import reference as score_reference
@@ -26,7 +25,6 @@ SMALL = [
     "scene.max_splats=1500",
     "scene.first_iterations=60",
     "scene.refine_iterations=200",
-    "gaussians.iterations=50",
 ]
 HELD_OUT = 3
 POSES, EXPOSURE = Corrections(poses=True), Corrections(exposure=True)
@@ -130,15 +128,6 @@ def test_a_view_held_out_is_scored_at_its_own_exposure_and_at_that_of_the_others
     assert scored.metrics["psnr_all_corrected"] > scored.metrics["psnr_all"] + 1.0  # type: ignore[operator]
 
 
-def test_the_baseline_is_put_right_alike(views: list[RgbdFrame], tmp_path: Path) -> None:
-    off = disturbed(views, 15.0, 1.0)
-    of_ours, of_theirs = (
-        make(request(off, tmp_path / name)).metrics["corrected_views"]
-        for name, make in (("splats", reconstruct), ("gaussians", reconstruct_gaussians))
-    )
-    assert of_ours == of_theirs
-
-
 def test_a_view_that_cannot_be_put_right_is_named(views: list[RgbdFrame], tmp_path: Path) -> None:
     off = disturbed(views, 15.0, 1.0)
     away = off[2].T_world_camera.copy()
@@ -153,4 +142,4 @@ def test_what_nothing_tells_is_refused(views: list[RgbdFrame], tmp_path: Path) -
         reconstruct(request(views, tmp_path / "scene", has_clock=True))
     bare = [replace(view, depth=np.zeros_like(view.depth)) for view in views]
     with pytest.raises(InputError, match="depth"):
-        reconstruct_gaussians(request(bare, tmp_path / "scene"))
+        reconstruct(request(bare, tmp_path / "scene"))

@@ -8,9 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config import GaussianConfig
-from splatctrl_cli.config.fixed import SPLIT_PARTS
-from splatctrl_cli.kernels.gaussians import (
+from experiments.gaussian_step import (
     CENTER,
     GRADIENT_SUM,
     LOG_SCALE,
@@ -21,7 +19,38 @@ from splatctrl_cli.kernels.gaussians import (
     SCREEN_RADIUS,
     GaussianArrays,
 )
-from splatctrl_cli.records import Bool, Float32, Float64
+from splatctrl_cli.blocks import Bool, Float32, Float64
+
+SPLIT_PARTS = 2  # Gaussians that a split one becomes
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussianSettings:
+    """The numbers of 3D Gaussian splatting. Shares are of `iterations`, of which the original has 30,000."""
+
+    iterations: int = 3000
+    max_gaussians: int = 500_000  # which the original does not limit
+    max_degree: int = 3  # of the spherical harmonics
+    degree_every: float = 1 / 30  # share of the iterations until the degree rises by one
+    initial_opacity: float = 0.1
+    lr_center: float = 1.6e-4  # times the extent of the scene
+    lr_center_final: float = 1.6e-6  # the same at the end, reached exponentially
+    lr_log_scale: float = 5e-3
+    lr_quat: float = 1e-3
+    lr_color: float = 2.5e-3  # of the constant harmonic
+    lr_harmonics: float = 1.25e-4  # of the others
+    lr_logit_opacity: float = 5e-2
+    densify_from: int = 500  # iterations before the first adding and removing, or half of densify_until
+    densify_until: float = 0.5  # share of the iterations after which their number is fixed
+    densify_every: int = 100  # iterations between such rounds
+    densify_gradient: float = 2e-4  # mean screen gradient [half images] from which a Gaussian is cloned or split
+    dense_share: float = 0.01  # of the extent: larger are split, others cloned
+    split_shrink: float = 1.6  # sigmas of a split Gaussian's parts are divided by this
+    min_opacity: float = 0.005  # fainter Gaussians are removed
+    max_screen_radius: float = 20.0  # [px] larger are removed once opacities were reset
+    max_size_share: float = 0.1  # of the extent: Gaussians with a larger sigma are removed then, too
+    reset_every: float = 0.0  # share of the iterations between resets of opacity; 0: none (0.1 cost over 1 dB)
+    reset_opacity: float = 0.01  # after a reset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +79,7 @@ def fresh(parameters: Float32) -> GaussianArrays:
 
 
 def densify(
-    arrays: GaussianArrays, config: GaussianConfig, extent: float, rng: np.random.Generator, *, prunes_large: bool
+    arrays: GaussianArrays, settings: GaussianSettings, extent: float, rng: np.random.Generator, *, prunes_large: bool
 ) -> tuple[GaussianArrays, Densified]:
     """One round: clone, split, prune; growth statistics start again.
 
@@ -58,12 +87,12 @@ def densify(
     `dense_share` of the scene's `extent` [m], else split. Where `max_gaussians` leaves too little room, the largest
     gradients have it.
     """
-    wanted, num_unmet = _wanted(arrays, config)
-    is_small = _largest_sigma(arrays.parameters) <= config.dense_share * extent
+    wanted, num_unmet = _wanted(arrays, settings)
+    is_small = _largest_sigma(arrays.parameters) <= settings.dense_share * extent
     is_cloned, is_split = wanted & is_small, wanted & ~is_small
-    born = [arrays.parameters[is_cloned], split_parts(arrays.parameters[is_split], config.split_shrink, rng)]
+    born = [arrays.parameters[is_cloned], split_parts(arrays.parameters[is_split], settings.split_shrink, rng)]
     grown = _joined(_selected(arrays, ~is_split), fresh(np.concatenate(born)))
-    reasons = prune_reasons(grown, config, extent, prunes_large=prunes_large)
+    reasons = prune_reasons(grown, settings, extent, prunes_large=prunes_large)
     kept = _selected(grown, ~np.any(list(reasons.values()), axis=0))
     kept.growth[:] = 0.0
     done = Densified(
@@ -85,16 +114,16 @@ def split_parts(parameters: Float32, shrink: float, rng: np.random.Generator) ->
 
 
 def prune_reasons(
-    arrays: GaussianArrays, config: GaussianConfig, extent: float, *, prunes_large: bool
+    arrays: GaussianArrays, settings: GaussianSettings, extent: float, *, prunes_large: bool
 ) -> dict[str, Bool]:
     """Masks (N,) of what is to be removed, by reason; a Gaussian has one at most."""
     p = arrays.parameters
     nothing = np.zeros(len(p), bool)
     found = {
         "broken": ~np.isfinite(p).all(axis=1),
-        "opacity": p[:, LOGIT] < _logit(config.min_opacity),
-        "screen": arrays.growth[:, SCREEN_RADIUS] > config.max_screen_radius if prunes_large else nothing,
-        "size": _largest_sigma(p) > config.max_size_share * extent if prunes_large else nothing,
+        "opacity": p[:, LOGIT] < _logit(settings.min_opacity),
+        "screen": arrays.growth[:, SCREEN_RADIUS] > settings.max_screen_radius if prunes_large else nothing,
+        "size": _largest_sigma(p) > settings.max_size_share * extent if prunes_large else nothing,
     }
     taken = nothing.copy()
     reasons = {}
@@ -125,11 +154,11 @@ def rotations(quats_wxyz: NDArray[np.floating]) -> Float64:
     )
 
 
-def _wanted(arrays: GaussianArrays, config: GaussianConfig) -> tuple[Bool, int]:
+def _wanted(arrays: GaussianArrays, settings: GaussianSettings) -> tuple[Bool, int]:
     """The Gaussians (N,) to clone or split, and how many more found no room; each adds one."""
     gradient = arrays.growth[:, GRADIENT_SUM] / np.maximum(arrays.growth[:, NUM_VIEWS], 1.0)
-    wanted = gradient >= config.densify_gradient
-    room = max(config.max_gaussians - len(arrays), 0)
+    wanted = gradient >= settings.densify_gradient
+    room = max(settings.max_gaussians - len(arrays), 0)
     num_unmet = max(int(wanted.sum()) - room, 0)
     if num_unmet:
         by_gradient = np.argsort(np.where(wanted, -gradient, np.inf), kind="stable")

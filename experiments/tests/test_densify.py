@@ -5,13 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatctrl_cli.config import GaussianConfig
-from splatctrl_cli.kernels.gaussians import CENTER, LOG_SCALE, LOGIT, QUAT, Float32, GaussianArrays
-from splatctrl_cli.scene.densify import densify, fresh, prune_reasons, reset_opacity, rotations, split_parts
+from experiments.densify import (
+    GaussianSettings,
+    densify,
+    fresh,
+    prune_reasons,
+    reset_opacity,
+    rotations,
+    split_parts,
+)
+from experiments.gaussian_step import CENTER, LOG_SCALE, LOGIT, QUAT, GaussianArrays
+from splatctrl_cli.records import Float32
 
-CONFIG = GaussianConfig()
+SETTINGS = GaussianSettings()
 EXTENT = 1.0  # [m]: up to 1 cm is cloned
-QUIET, LOUD = 0.5 * CONFIG.densify_gradient, 2.0 * CONFIG.densify_gradient
+QUIET, LOUD = 0.5 * SETTINGS.densify_gradient, 2.0 * SETTINGS.densify_gradient
 
 
 def arrays(sigmas: list[float], gradients: list[float], num_views: int = 4) -> GaussianArrays:
@@ -27,8 +35,10 @@ def arrays(sigmas: list[float], gradients: list[float], num_views: int = 4) -> G
     return out
 
 
-def grown(before: GaussianArrays, config: GaussianConfig = CONFIG, **flags: bool) -> GaussianArrays:
-    return densify(before, config, EXTENT, np.random.default_rng(0), prunes_large=flags.get("prunes_large", False))[0]
+def grown(before: GaussianArrays, settings: GaussianSettings = SETTINGS, **flags: bool) -> GaussianArrays:
+    return densify(before, settings, EXTENT, np.random.default_rng(0), prunes_large=flags.get("prunes_large", False))[
+        0
+    ]
 
 
 def test_what_the_images_pull_at_little_stays_as_it_is() -> None:
@@ -83,7 +93,7 @@ def test_what_is_faint_or_not_finite_is_removed() -> None:
     before = arrays([0.005] * 3, [QUIET] * 3)
     before.parameters[0, LOGIT] = np.log(0.004 / 0.996)
     before.parameters[1, 20] = np.nan
-    reasons = prune_reasons(before, CONFIG, EXTENT, prunes_large=False)
+    reasons = prune_reasons(before, SETTINGS, EXTENT, prunes_large=False)
     assert {name: mask.tolist() for name, mask in reasons.items()} == {
         "broken": [False, True, False],
         "opacity": [True, False, False],
@@ -106,8 +116,8 @@ def test_growth_starts_again_after_each_round() -> None:
 
 def test_where_room_is_short_the_largest_gradients_have_it() -> None:
     before = arrays([0.005] * 4, [LOUD, 3 * LOUD, QUIET, 2 * LOUD])
-    config = replace(CONFIG, max_gaussians=6)
-    after, done = densify(before, config, EXTENT, np.random.default_rng(0), prunes_large=False)
+    settings = replace(SETTINGS, max_gaussians=6)
+    after, done = densify(before, settings, EXTENT, np.random.default_rng(0), prunes_large=False)
     assert sorted(after.parameters[:, 0].tolist()) == [0, 1, 1, 2, 3, 3]
     assert (done.cloned, done.split, done.unmet) == (2, 0, 1)
 

@@ -5,22 +5,23 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from splatctrl_cli.config import Config, GaussianConfig, SceneConfig
-from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Box, GaussianSet, RgbdFrame
-from splatctrl_cli.scene.gaussian_fitter import (
+from experiments.densify import GaussianSettings
+from experiments.gaussian_fitter import (
     GaussianAuditRow,
     GaussianFitter,
     center_rate,
-    first_seeds,
+    first_map,
+    gaussians_of,
     scene_extent,
 )
-from splatctrl_cli.scene.gaussians import gaussians_of, parameters_of, render_gaussians
-from splatctrl_cli.scene.keyframes import make_view
+from splatctrl_cli.config import Config, SceneConfig
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Box, GaussianSet, RgbdFrame
+from splatctrl_cli.scene.gaussians import parameters_of, render_gaussians
 from tests.scene.wall import HEIGHT, INTRINSICS, WORKSPACE, frame, looking_down
 
-FAST = GaussianConfig(iterations=300, densify_from=60, densify_every=30, reset_every=0.2)
-CONFIG = Config(scene=SceneConfig(max_splats=200), gaussians=FAST)
+FAST = GaussianSettings(iterations=300, densify_from=60, densify_every=30, reset_every=0.2)
+CONFIG = Config(scene=SceneConfig(max_splats=200))
 
 
 def frames() -> list[RgbdFrame]:
@@ -34,15 +35,17 @@ def checked() -> list[RgbdFrame]:
     return [replace(frame(), color=np.repeat(squares[:, :, None], 3, axis=2))]
 
 
-def fitted(config: Config = CONFIG, threads: int = 1, seed: int = 0) -> tuple[GaussianFitter, list[GaussianAuditRow]]:
+def fitted(
+    settings: GaussianSettings = FAST, threads: int = 1, seed: int = 0
+) -> tuple[GaussianFitter, list[GaussianAuditRow]]:
     rows: list[GaussianAuditRow] = []
-    fitter = GaussianFitter(config, WORKSPACE, frames(), seed=seed, threads=threads)
+    fitter = GaussianFitter(CONFIG, WORKSPACE, frames(), settings=settings, seed=seed, threads=threads)
     fitter.fit(rows.append)
     return fitter, rows
 
 
 def test_a_floor_is_reconstructed_in_colour_and_depth_from_a_view_not_trained_on() -> None:
-    fitter, rows = fitted(replace(CONFIG, gaussians=replace(FAST, reset_every=0.0)))
+    fitter, rows = fitted(replace(FAST, reset_every=0.0))
     view = render_gaussians(fitter.gaussians(), INTRINSICS, looking_down(0.03, -0.02))
     inside = (slice(8, 52), slice(10, 68))
     error = (view.color - frame(x=0.03, y=-0.02).color / 255.0)[inside]
@@ -56,14 +59,14 @@ def test_growing_shows_detail_that_the_seeds_cannot() -> None:
     psnr = {}
     for until in (0.0, 1.0):
         rules = replace(FAST, iterations=300, densify_until=until, reset_every=0.0, lr_color=0.05)
-        fitter = GaussianFitter(replace(CONFIG, gaussians=rules), WORKSPACE, checked(), threads=1)
+        fitter = GaussianFitter(CONFIG, WORKSPACE, checked(), settings=rules, threads=1)
         start, psnr[until] = len(fitter.arrays), fitter.fit().psnr or 0.0
         assert (len(fitter.arrays) > 2 * start) == (until > 0)
     assert psnr[1.0] > psnr[0.0] + 2.0
 
 
 def test_the_audit_adds_up_and_follows_the_schedule() -> None:
-    start = len(GaussianFitter(CONFIG, WORKSPACE, frames(), threads=1).arrays)
+    start = len(GaussianFitter(CONFIG, WORKSPACE, frames(), settings=FAST, threads=1).arrays)
     fitter, rows = fitted()
     assert start <= 200
     count = start
@@ -78,17 +81,17 @@ def test_the_audit_adds_up_and_follows_the_schedule() -> None:
 
 
 def test_the_degree_rises_with_the_iterations() -> None:
-    config = replace(CONFIG, gaussians=replace(FAST, iterations=50, degree_every=0.3))
-    fitter = GaussianFitter(config, WORKSPACE, frames(), threads=1)
+    rules = replace(FAST, iterations=50, degree_every=0.3)
+    fitter = GaussianFitter(CONFIG, WORKSPACE, frames(), settings=rules, threads=1)
     fitter.fit()
     assert fitter.degree == 3
     assert fitter.gaussians().harmonics.shape[1] == 16
-    assert GaussianFitter(config, WORKSPACE, frames(), threads=1).gaussians().harmonics.shape[1] == 1
+    assert GaussianFitter(CONFIG, WORKSPACE, frames(), threads=1).gaussians().harmonics.shape[1] == 1
 
 
 def test_the_number_of_gaussians_never_exceeds_its_limit() -> None:
-    config = replace(CONFIG, gaussians=replace(FAST, max_gaussians=220, iterations=150, densify_until=1.0))
-    fitter = GaussianFitter(config, WORKSPACE, checked(), threads=1)
+    rules = replace(FAST, max_gaussians=220, iterations=150, densify_until=1.0)
+    fitter = GaussianFitter(CONFIG, WORKSPACE, checked(), settings=rules, threads=1)
     rows: list[GaussianAuditRow] = []
     fitter.fit(rows.append)
     assert all(row.gaussians <= 220 for row in rows)
@@ -96,17 +99,16 @@ def test_the_number_of_gaussians_never_exceeds_its_limit() -> None:
 
 
 def test_same_seed_gives_the_same_bytes_at_any_thread_count() -> None:
-    config = replace(CONFIG, gaussians=replace(FAST, iterations=150))
-    results = [fitted(config, threads) for threads in (1, 2, 4)]
+    rules = replace(FAST, iterations=150)
+    results = [fitted(rules, threads) for threads in (1, 2, 4)]
     bytes_ = [fitter.arrays.parameters.tobytes() for fitter, _ in results]
     assert bytes_[0] == bytes_[1] == bytes_[2]
     assert results[0][1] == results[1][1] == results[2][1]
-    assert fitted(config, seed=1)[0].arrays.parameters.tobytes() != bytes_[0]
+    assert fitted(rules, seed=1)[0].arrays.parameters.tobytes() != bytes_[0]
 
 
 def test_seeds_are_those_that_an_empty_map_asks_for() -> None:
-    views = [make_view(f, f.depth > 0) for f in frames()]
-    seeds = first_seeds(views, CONFIG)
+    seeds = first_map(CONFIG, WORKSPACE, frames()).splats()
     assert 50 < len(seeds) <= 200
     assert np.abs(seeds.centers[:, 2]).max() < 1e-3
 
@@ -158,8 +160,8 @@ def test_parameters_and_sets_say_the_same() -> None:
 
 @pytest.mark.parametrize(("iterations", "rounds"), [(800, [200, 300]), (2300, [500, 600, 700, 800, 900, 1000, 1100])])
 def test_few_iterations_are_densified_in_the_second_quarter(iterations: int, rounds: list[int]) -> None:
-    rules = replace(GaussianConfig(), iterations=iterations)
-    fitter = GaussianFitter(replace(CONFIG, gaussians=rules), WORKSPACE, frames(), threads=1)
+    rules = GaussianSettings(iterations=iterations)
+    fitter = GaussianFitter(CONFIG, WORKSPACE, frames(), settings=rules, threads=1)
     rng, found = np.random.default_rng(0), []
     for done in range(1, iterations + 1):
         fitter.num_iterations = done

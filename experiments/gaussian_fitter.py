@@ -3,25 +3,43 @@
 It shares seeds, targets, loss and rasteriser with `SceneFitter`; what differs is the method.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.config import Config, GaussianConfig, SceneConfig
-from splatctrl_cli.errors import InputError
-from splatctrl_cli.kernels import num_threads
-from splatctrl_cli.kernels.gaussians import GaussianArrays, GaussianRasteriser, GaussianRates, gaussian_step
-from splatctrl_cli.kernels.raster import ImageLoss, LossTerms, empty_planes
-from splatctrl_cli.records import Box, Float32, GaussianSet, RgbdFrame
-from splatctrl_cli.scene.buffer import Seeds
-from splatctrl_cli.scene.densify import Densified, densify, fresh, reset_opacity
-from splatctrl_cli.scene.gaussians import gaussians_of, seeded
-from splatctrl_cli.scene.keyframes import View, make_view, seen_through
-from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
-from splatctrl_cli.scene.render import loss_weights, mean_loss, psnr_of
-from splatctrl_cli.scene.seeding import candidates, density_for, inside_workspace, seeds_at, world_points
+from experiments.densify import Densified, GaussianSettings, densify, fresh, reset_opacity
+from experiments.gaussian_step import (
+    CENTER,
+    HARMONICS,
+    LOG_SCALE,
+    LOGIT,
+    NUM_PARAMETERS,
+    QUAT,
+    GaussianArrays,
+    GaussianRates,
+    TrainingRasteriser,
+    gaussian_step,
+)
+from splatctrl_cli import Box, Config, InputError, Label
+from splatctrl_cli.blocks import (
+    Float32,
+    GaussianSet,
+    ImageLoss,
+    LossTerms,
+    RgbdFrame,
+    SceneFitter,
+    SplatSet,
+    View,
+    loss_weights,
+    mean_loss,
+    num_threads,
+    psnr_of,
+)
 
+SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant harmonic
+PER_CHANNEL = 16  # harmonics
 NOTHING_DONE = Densified(cloned=0, split=0, unmet=0, pruned=dict.fromkeys(("broken", "opacity", "screen", "size"), 0))
 
 
@@ -52,23 +70,32 @@ class GaussianFitter:
     """
 
     def __init__(
-        self, config: Config, workspace: Box, frames: Sequence[RgbdFrame], *, seed: int = 0, threads: int = 0
+        self,
+        config: Config,
+        workspace: Box,
+        frames: Sequence[RgbdFrame],
+        *,
+        settings: GaussianSettings | None = None,
+        seed: int = 0,
+        threads: int = 0,
     ) -> None:
-        self.config = config
+        self.config = config.scene
+        self.settings = settings or GaussianSettings()
         self.seed = seed
         self.num_threads = num_threads(threads)
-        self.views = _views(frames, workspace, config.occupancy.min_range)
-        self.background = _background(self.views, config.scene)
-        self.extent = scene_extent(frames)
-        seeds = first_seeds(self.views, config)
+        first = first_map(config, workspace, frames, seed=seed, threads=threads)
+        seeds = first.splats()
         if not len(seeds):
             raise InputError(
                 "no pixel of any view has a depth inside the workspace",
-                remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
+                remedy="give a box that holds what the cameras saw; 'splatctrl info' says where they stand",
             )
-        self.arrays: GaussianArrays = fresh(seeded(seeds, config.gaussians.initial_opacity))
+        self.views = first.window.newest
+        self.background = first.descent.background or (0.0, 0.0, 0.0)
+        self.extent = scene_extent(frames)
+        self.arrays: GaussianArrays = fresh(seeded(seeds, self.settings.initial_opacity))
         self.num_iterations = 0
-        self._raster = GaussianRasteriser(self.num_threads)
+        self._raster = TrainingRasteriser(self.num_threads)
         self._loss = ImageLoss(self.num_threads)
         self._terms: list[LossTerms] = []
         self._was_reset = False
@@ -76,12 +103,12 @@ class GaussianFitter:
     @property
     def degree(self) -> int:
         """Of the harmonics in use: it rises with the iterations."""
-        g = self.config.gaussians
+        g = self.settings
         return min(int(self.num_iterations / max(g.degree_every * g.iterations, 1.0)), g.max_degree)
 
     def fit(self, audit: Callable[[GaussianAuditRow], None] = lambda _: None) -> GaussianAuditRow:
         """Run all iterations; `audit` gets a row after each round of densification, and the last one, returned."""
-        g = self.config.gaussians
+        g = self.settings
         rng = np.random.default_rng([self.seed, 0])
         for view in _schedule(self.views, g.iterations, rng):
             self._iterate(view)
@@ -100,8 +127,8 @@ class GaussianFitter:
     def _iterate(self, view: View) -> None:
         self._raster.prepare(view.camera, self.arrays.parameters, self.degree)
         planes = self._raster.forward()
-        plane_gradients = empty_planes(*view.target.depth.shape)
-        weights = loss_weights(self.config.scene, self.background)
+        plane_gradients = np.empty_like(planes)
+        weights = loss_weights(self.config, self.background)
         self._terms.append(self._loss.evaluate(planes, view.target, weights, plane_gradients))
         gradients = self._raster.backward(planes, plane_gradients)
         gaussian_step(self._raster, gradients, self.arrays, self._rates())
@@ -109,7 +136,7 @@ class GaussianFitter:
 
     def _after_iteration(self, rng: np.random.Generator) -> GaussianAuditRow | None:
         """Densify and reset as the schedule says; the audit row of a round that did."""
-        g, done = self.config.gaussians, self.num_iterations
+        g, done = self.settings, self.num_iterations
         last = g.densify_until * g.iterations
         is_growing = done < last
         densifies = is_growing and done >= min(g.densify_from, last / 2) and done % g.densify_every == 0
@@ -126,7 +153,7 @@ class GaussianFitter:
         return self._row(what, opacity_reset=resets)
 
     def _rates(self) -> GaussianRates:
-        g = self.config.gaussians
+        g = self.settings
         return GaussianRates(
             center=self.extent * center_rate(g, self.num_iterations),
             log_scale=g.lr_log_scale,
@@ -134,17 +161,17 @@ class GaussianFitter:
             logit_opacity=g.lr_logit_opacity,
             color=g.lr_color,
             harmonics=g.lr_harmonics,
-            regulariser=self.config.scene.lambda_reg / max(len(self.arrays), 1),
+            regulariser=self.config.lambda_reg / max(len(self.arrays), 1),
         )
 
     def _evaluate(self, view: View) -> LossTerms:
         self._raster.prepare(view.camera, self.arrays.parameters, self.degree)
         planes = self._raster.forward()
-        weights = loss_weights(self.config.scene, self.background)
-        return self._loss.evaluate(planes, view.target, weights, empty_planes(*view.target.depth.shape))
+        weights = loss_weights(self.config, self.background)
+        return self._loss.evaluate(planes, view.target, weights, np.empty_like(planes))
 
     def _row(self, what: Densified, *, opacity_reset: bool) -> GaussianAuditRow:
-        loss, psnr = mean_loss(self._terms, self.config.scene), psnr_of(self._terms)
+        loss, psnr = mean_loss(self._terms, self.config), psnr_of(self._terms)
         self._terms = []
         return GaussianAuditRow(
             iteration=self.num_iterations,
@@ -160,10 +187,10 @@ class GaussianFitter:
         )
 
 
-def center_rate(config: GaussianConfig, iteration: int) -> float:
+def center_rate(settings: GaussianSettings, iteration: int) -> float:
     """The learning rate of centres, per metre of extent: from `lr_center` to `lr_center_final`, exponentially."""
-    done = min(iteration / max(config.iterations, 1), 1.0)
-    return float(config.lr_center ** (1.0 - done) * config.lr_center_final**done)
+    done = min(iteration / max(settings.iterations, 1), 1.0)
+    return float(settings.lr_center ** (1.0 - done) * settings.lr_center_final**done)
 
 
 def scene_extent(frames: Sequence[RgbdFrame]) -> float:
@@ -177,33 +204,41 @@ def scene_extent(frames: Sequence[RgbdFrame]) -> float:
     return max(spread, 0.5 * float(np.median(depths)) if len(depths) else 0.0)
 
 
-def first_seeds(views: Sequence[View], config: Config) -> Seeds:
-    """The seeds that the fixed-budget method takes for an empty map, at most `scene.max_splats`."""
-    sources = []
-    for view in views:
-        found = candidates(view.frame, view.mappable)
-        sources.append(found.select(~seen_through(found.points, views, config.occupancy.see_through)))
-    no_splats: Float32 = np.zeros((0, 3), np.float32)
-    if not any(len(source) for source in sources):
-        return Seeds(centers=no_splats, radii=np.zeros(0, np.float32), colors=no_splats)
-    density = density_for(sources, config.scene.max_splats, config.scene)
-    return seeds_at(sources, no_splats, density, config.scene)
+def first_map(
+    config: Config, workspace: Box, frames: Sequence[RgbdFrame], *, seed: int = 0, threads: int = 0
+) -> SceneFitter:
+    """The fixed-budget method after a time step without iterations: seeds for all of `scene.max_splats`, the views as
+    it takes them, and the background.
+    """
+    scene = config.scene.derived(first_iterations=0, fill=1.0, gap_reserve=0.0, max_gap=1e9)
+    fitter = SceneFitter(scene, config.occupancy, workspace, seed=seed, threads=threads)
+    fitter.step(frames)
+    return fitter
 
 
-def _views(frames: Sequence[RgbdFrame], workspace: Box, min_range: float) -> list[View]:
-    """The frames as the fixed-budget method takes them: without what is mounted on the camera."""
-    by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
-    mounted = {name: mounted_pixels(spread_views(own), min_range) for name, own in by_camera.items()}
-    return [
-        make_view(frame, inside_workspace(frame, world_points(frame), workspace, min_range), mounted[frame.camera])
-        for frame in frames
-    ]
+def seeded(seeds: SplatSet, opacity: float) -> Float32:
+    """Parameters (N, 59) of isotropic seeds as Gaussians of one colour."""
+    rows = np.zeros((len(seeds), NUM_PARAMETERS), np.float32)
+    rows[:, CENTER] = seeds.centers
+    rows[:, LOG_SCALE] = np.log(seeds.radii)[:, None]
+    rows[:, QUAT.start] = 1.0
+    rows[:, LOGIT] = np.log(opacity / (1.0 - opacity))
+    rows[:, HARMONICS.start :: PER_CHANNEL] = (seeds.colors - 0.5) / SH_C0
+    return rows
 
 
-def _background(views: Sequence[View], config: SceneConfig) -> tuple[float, float, float]:
-    if config.background == "black":
-        return (0.0, 0.0, 0.0)
-    return background_color([view.frame for view in views], [view.target.counted > 0 for view in views])
+def gaussians_of(parameters: Float32, degree: int) -> GaussianSet:
+    """The set that parameters (N, 59) describe, with harmonics up to `degree`; all are objects."""
+    quats = parameters[:, QUAT].astype(np.float64)
+    harmonics = parameters[:, HARMONICS].reshape(-1, 3, PER_CHANNEL)[:, :, : (degree + 1) ** 2]
+    return GaussianSet(
+        centers=parameters[:, CENTER].copy(),
+        scales=np.exp(parameters[:, LOG_SCALE]),
+        quats_wxyz=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        opacities=(1.0 / (1.0 + np.exp(-parameters[:, LOGIT].astype(np.float64)))).astype(np.float32),
+        harmonics=np.ascontiguousarray(np.moveaxis(harmonics, 1, 2)),
+        labels=np.full(len(parameters), Label.OBJECT, np.uint8),
+    )
 
 
 def _schedule(views: Sequence[View], num_iterations: int, rng: np.random.Generator) -> Iterator[View]:
