@@ -16,9 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from benchmarks.measure import SAMPLE, Limit, Options, Result, measured, medians
 from benchmarks.scenes import enlarged
-from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_writer import write_capture
-from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
 
@@ -40,26 +38,22 @@ def run(options: Options) -> Result:
         images = [data for pair in islice(_pairs(), NUM_IMAGES) for data in pair[:2]]
         capture = folder / "read.capture"
         write_capture(capture, open_source(files))
-        opened = CaptureSource(capture, SourceOptions())
-        numbers = np.random.default_rng(0).integers(0, num, 100).tolist()
         tasks: dict[str, Callable[[], object]] = {
             "kept": partial(_ingest, files, folder),
             "encoded": partial(_ingest, raw, folder),
             "decoded": partial(_read, files),
             "capture": partial(_read, capture),
             "decoding": partial(_decode, images, num),
-            "access": partial(_access, opened, numbers),
         }
         times = medians(tasks, options.rounds(5), clock=time.process_time)
         peaks = [_peak(write_log(folder / "log.mcap", length), folder / "out") for length in (num, 4 * num)]
-    ms = {name: 1e3 * value / (len(numbers) if name == "access" else num) for name, value in times.items()}
+    ms = {name: 1e3 * value / num for name, value in times.items()}
     rows = [
         ["ingest: JPEG and PNG kept as they are", "kept"],
         ["ingest: JPEG kept, raw depth written as PNG", "encoded"],
         ["records of the log, JPEG and PNG decoded", "decoded"],
         ["records of the capture, sha256 compared", "capture"],
         ["decoding alone (OpenCV)", "decoding"],
-        ["a frame of the capture by its number", "access"],
     ]
     return Result(
         title=f"ingest: pairs of 640x480 opening included ({num} pairs), processor time",
@@ -79,7 +73,6 @@ def run(options: Options) -> Result:
         limits=[
             Limit(figure="kept_pairs_per_s", bound=400, is_least=True),
             Limit(figure="decoded_over_decoding", bound=1.3),
-            Limit(figure="access_ms_per_pair", bound=15),
             Limit(figure="ingest_peak_mb", bound=400),
         ],
         notes=[f"peak of `splatctrl ingest`: {peaks[0]:.0f} MB of {num} pairs, {peaks[1]:.0f} MB of {4 * num}"],
@@ -185,12 +178,6 @@ def _read(path: Path) -> int:
 def _decode(images: list[bytes], num_pairs: int) -> None:
     for index in range(2 * num_pairs):
         cv2.imdecode(np.frombuffer(images[index % len(images)], np.uint8), cv2.IMREAD_UNCHANGED)
-
-
-def _access(capture: CaptureSource, numbers: list[int]) -> None:
-    for number in numbers:
-        stored = capture.stored_at(number)
-        assert stored is not None and stored.frame.depth.shape == (480, 640)
 
 
 def _peak(log: Path, out: Path) -> float:

@@ -98,14 +98,6 @@ class CaptureSource:
         """sha256 of SHA256SUMS, which covers every file, and what was applied to it."""
         return {f"{self.name}/SHA256SUMS": sha256(self._path / "SHA256SUMS"), **self._applied}
 
-    def __len__(self) -> int:
-        """Frames that `stored_at` knows."""
-        return len(self._rows)
-
-    def stored_at(self, number: int) -> StoredFrame | None:
-        """A frame by its number among those of `cameras`, without reading others; None where it is damaged."""
-        return self._stored_frame(self._rows[number])
-
     def _stored_frames(self) -> Iterator[StoredFrame]:
         for row in self._rows:
             stored = self._stored_frame(row)

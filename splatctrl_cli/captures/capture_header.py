@@ -9,10 +9,10 @@ import math
 import tempfile
 import weakref
 from array import array
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 
@@ -123,42 +123,43 @@ ROBOT = "robot_description.urdf"  # the URDF that the log itself brings, where i
 _FURTHER = ((), *((mask,) for mask in MASKS), MASKS)  # columns of frames.csv after COLUMNS
 _MOST_ROW = 1 << 16  # bytes of a row
 IN_MEMORY = 1 << 16  # [bytes] of the lines of one folder
+_UNREADABLE = (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError)
 
 
-class FrameRows(Sequence[Mapping[str, str]]):
-    """Rows of frames.csv of some cameras, in its order; each is read when it is asked for."""
+class FrameRows:
+    """Rows of frames.csv of some cameras, in its order, read each time that they are asked for."""
 
     def __init__(self, file: Path, cameras: Collection[str]) -> None:
         """Raises InputError for a row that cannot be read, or that names a file outside the capture."""
-        self._file = file
-        self._offsets = array("q")
+        self._file, self._cameras = file, cameras
         try:
-            with file.open("rb") as stream:
-                rows = _rows(stream, 0)
-                _, names = next(rows, (0, []))
-                self._names = tuple(names)
-                if self._names[: len(COLUMNS)] != COLUMNS or self._names[len(COLUMNS) :] not in _FURTHER:
-                    raise InputError(f"{file}: expected columns {', '.join(COLUMNS)}", remedy=AGAIN)
-                for offset, values in rows:
-                    if self._row(values)["camera"] in cameras:
-                        self._offsets.append(offset)
-        except (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError) as error:
+            self._num = sum(1 for _ in self._read())
+        except _UNREADABLE as error:
             raise InputError(f"{file}: cannot be read: {error}", remedy=AGAIN) from None
 
-    def __len__(self) -> int:
-        return len(self._offsets)
-
-    def __getitem__(self, number: int) -> Mapping[str, str]:  # type: ignore[override]
-        """A row by its number. Raises InputError where the file is no longer what it was."""
+    def __iter__(self) -> Iterator[Mapping[str, str]]:
+        """Raises InputError where the file is no longer what it was."""
+        num, changed = 0, InputError(f"{self._file}: changed while it was read", remedy="try again")
         try:
-            with self._file.open("rb") as stream:
-                _, values = next(_rows(stream, self._offsets[number]), (0, []))
-            return self._row(values)
-        except (UnicodeDecodeError, csv.Error, ValueError, TypeError):
-            raise InputError(f"{self._file}: changed while it was read", remedy="try again") from None
+            for row in self._read():
+                num += 1
+                yield row
+        except _UNREADABLE:
+            raise changed from None
+        if num != self._num:
+            raise changed
 
-    def _row(self, values: Sequence[str]) -> Mapping[str, str]:
-        return _checked(dict(zip(self._names, values, strict=True)))
+    def _read(self) -> Iterator[Mapping[str, str]]:
+        with self._file.open("rb") as stream:
+            lines = iter(lambda: stream.readline(_MOST_ROW), b"")
+            rows = csv.reader((line.decode("utf-8") for line in lines), strict=True)
+            names = tuple(next(rows, ()))
+            if names[: len(COLUMNS)] != COLUMNS or names[len(COLUMNS) :] not in _FURTHER:
+                raise InputError(f"{self._file}: expected columns {', '.join(COLUMNS)}", remedy=AGAIN)
+            for values in filter(None, rows):
+                row = _checked(dict(zip(names, values, strict=True)))
+                if row["camera"] in self._cameras:
+                    yield row
 
 
 def _checked(row: Mapping[str, str]) -> Mapping[str, str]:
@@ -171,24 +172,6 @@ def _checked(row: Mapping[str, str]) -> Mapping[str, str]:
         if path.is_absolute() or ".." in path.parts:
             raise ValueError(f"{name} lies outside the capture")
     return row
-
-
-def _rows(stream: BinaryIO, offset: int) -> Iterator[tuple[int, list[str]]]:
-    """Each row from the byte `offset` on, with the byte at which it begins."""
-    end = offset
-    stream.seek(offset)
-
-    def lines() -> Iterator[str]:
-        nonlocal end
-        while line := stream.readline(_MOST_ROW):
-            end += len(line)
-            yield line.decode("utf-8")
-
-    reader, start = csv.reader(lines(), strict=True), offset
-    for row in reader:
-        if row:
-            yield start, row
-        start = end
 
 
 class FileSums:

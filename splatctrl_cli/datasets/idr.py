@@ -73,7 +73,7 @@ def read_idr(
     return replace(found, files=(*found.files, path))
 
 
-def write_idr(root: Path, scan: str, views: Sequence[DtuView], *, with_depth: bool = True) -> Path:
+def write_idr(root: Path, scan: str, views: Sequence[DtuView]) -> Path:
     """Write views as the folder of one scan, with a mask for every view that has one; returns it.
 
     The sphere around the object is about the point that the cameras' axes come nearest to, and half as far from it as
@@ -91,9 +91,8 @@ def write_idr(root: Path, scan: str, views: Sequence[DtuView], *, with_depth: bo
         if view.mask is not None:
             (folder / "mask").mkdir(exist_ok=True)
             write_png(folder / "mask" / f"{number:03d}.png", np.where(view.mask, 255, 0).astype(np.uint8))
-        if with_depth:
-            (folder / "depth").mkdir(exist_ok=True)
-            write_pfm(folder / "depth" / f"depth_map_{number:04d}.pfm", view.depth * np.float32(MILLIMETRES))
+        (folder / "depth").mkdir(exist_ok=True)
+        write_pfm(folder / "depth" / f"depth_map_{number:04d}.pfm", view.depth * np.float32(MILLIMETRES))
     savez(folder / CAMERAS[0], matrices)
     return folder
 

@@ -61,16 +61,6 @@ def ssim_map(
     return np.asarray(luminance * structure)
 
 
-def ssim(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool | None = None) -> float:
-    """Mean of `ssim_map` over channels and the masked pixels; nan for an empty mask.
-
-    The mask selects from the map: a window near the mask's border also sees pixels outside it.
-    """
-    similarity = ssim_map(image, reference)
-    selected = similarity if mask is None else similarity[mask]
-    return float(selected.mean()) if selected.size else math.nan
-
-
 def filled(image: NDArray[np.floating], mask: Bool, fill: float) -> Float64:
     """The image (H, W, 3) with `fill` outside the mask (H, W)."""
     return np.where(mask[:, :, None], image, fill).astype(np.float64)

@@ -23,10 +23,9 @@ def scratch_folder() -> Path:
     return Path(tempfile.gettempdir()) if given or not os.access(on_disk, os.W_OK) else on_disk
 
 
-def ranges(num: int, size: int | None = None) -> Iterator[tuple[int, int]]:
-    """First and one past the last row of every block of `size` (default: BLOCK) of `num` rows."""
-    step = BLOCK if size is None else size
-    yield from ((first, min(first + step, num)) for first in range(0, num, step))
+def ranges(num: int) -> Iterator[tuple[int, int]]:
+    """First and one past the last row of every `BLOCK` of `num` rows."""
+    yield from ((first, min(first + BLOCK, num)) for first in range(0, num, BLOCK))
 
 
 class RowFile:

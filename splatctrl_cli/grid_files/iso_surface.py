@@ -1,4 +1,4 @@
-"""The surface on which a baked distance has one value, as a triangle mesh: ``.ply``, ``.obj``, ``.stl``.
+"""The surface on which a baked distance is 0, as a triangle mesh: ``.ply``, ``.obj``, ``.stl``.
 
 Marching cubes of scikit-image (Lewiner et al. 2003), a slab of the grid at a time; the slabs share a layer of cells,
 where their vertices are the same numbers and are joined.
@@ -30,15 +30,12 @@ class Surface:
     faces: NDArray[np.int64]
 
 
-def iso_surface(grid: DistanceGrid, level: float = 0.0, channel: str = "sdf") -> Surface:
-    """Where `channel` is `level` [m], linear between cell centres. Cubes with a corner that is NaN have no surface.
+def iso_surface(grid: DistanceGrid) -> Surface:
+    """Where `sdf` is 0, linear between cell centres. Cubes with a corner that is NaN have no surface.
 
-    Raises UsageError for a channel that is not there or no distance, NotEvaluableError where no cube crosses `level`.
+    Raises NotEvaluableError where no cube crosses 0.
     """
-    shape = check_grid(grid)
-    values = grid.channels.get(channel)
-    if values is None or values.ndim != 3 or values.dtype != np.float32:
-        raise UsageError(f"surface of {channel}: expected a distance of the grid: {', '.join(grid.channels)}")
+    shape, values = check_grid(grid), grid.channels["sdf"]
     if min(shape) < 2:
         raise NotEvaluableError(
             f"surface: expected at least 2 cells along each axis, got {shape}", remedy="bake a larger --box"
@@ -52,7 +49,7 @@ def iso_surface(grid: DistanceGrid, level: float = 0.0, channel: str = "sdf") ->
         if not is_known.any():
             continue
         lowest, highest = min(lowest, float(slab[is_known].min())), max(highest, float(slab[is_known].max()))
-        found = _marching_cubes(slab, is_known, level)
+        found = _marching_cubes(slab, is_known)
         if found is not None:
             vertices.append(found[0] + (start, 0.0, 0.0))
             faces.append(found[1].astype(np.int64) + count)
@@ -61,8 +58,8 @@ def iso_surface(grid: DistanceGrid, level: float = 0.0, channel: str = "sdf") ->
         is_any = lowest <= highest
         got = f"values from {lowest:.4g} to {highest:.4g} m" if is_any else "no cell that has a distance"
         raise NotEvaluableError(
-            f"surface: expected {channel} to cross {level:g} m, got {got}",
-            remedy="give a level between them, or bake with a smaller voxel",
+            f"surface: expected sdf to cross 0 m, got {got}",
+            remedy="bake with a smaller voxel",
         )
     return _joined(grid, np.concatenate(vertices), np.concatenate(faces))
 
@@ -84,15 +81,13 @@ def write_surface(path: Path, surface: Surface) -> None:
     path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
 
 
-def _marching_cubes(
-    slab: Float32, is_known: NDArray[np.bool_], level: float
-) -> tuple[Float64, NDArray[np.int32]] | None:
-    """Vertices [cells] and faces, None where no cube of eight known corners crosses `level`."""
+def _marching_cubes(slab: Float32, is_known: NDArray[np.bool_]) -> tuple[Float64, NDArray[np.int32]] | None:
+    """Vertices [cells] and faces, None where no cube of eight known corners crosses 0."""
     whole = np.ones([n - 1 for n in slab.shape], bool)
     for corner in np.ndindex(2, 2, 2):
         whole &= is_known[tuple(slice(i, n - 1 + i) for i, n in zip(corner, slab.shape, strict=True))]
     is_all = bool(whole.all())
-    is_above = np.where(is_known, slab, FURTHEST) > level
+    is_above = np.where(is_known, slab, FURTHEST) > 0.0
     if is_above.all() or not is_above.any():
         return None
     mask = None
@@ -102,9 +97,9 @@ def _marching_cubes(
         slab = np.where(is_known, slab, FURTHEST)
     try:
         vertices, faces, _, _ = marching_cubes(
-            slab, level, mask=mask, gradient_direction="descent", allow_degenerate=True
+            slab, 0.0, mask=mask, gradient_direction="descent", allow_degenerate=True
         )
-    except (RuntimeError, ValueError):  # which say that no cube crosses the level
+    except (RuntimeError, ValueError):  # which say that no cube crosses 0
         return None
     return vertices.astype(np.float64), faces
 

@@ -1,18 +1,14 @@
 """Baked grids for the planners of other programs: NVIDIA's cuRobo and MoveIt.
 
-A distance channel as the voxel grid of NVIDIA's cuRobo: ``field.curobo.npz``, which a few lines of its user load.
+The distance as the voxel grid of NVIDIA's cuRobo: ``field.curobo.npz``, which a few lines of its user load.
 
-Read in its source (NVlabs/curobo), not tried on it. Both generations flatten (x, y, z) with z fastest and place the
-grid by the pose of its middle, ``x y z qw qx qy qz``. They differ in the rest:
-
-- 0.7.5 to 0.7.7 (geom/types.py `VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu `compute_voxel_index`): positive
-  inside; ``1 + floor(dims / voxel)`` cells a side; the kernel truncates ``(x - pose + dims / 2) / voxel``: cell i
-  spans ``pose - dims / 2 + [i, i + 1] voxel``, so the pose is half a voxel below the middle of our cells. A sphere's
-  centre takes the value of the cell that it lies in. In the first three and last two cells of an axis, and outside,
-  all is free. (0.7.0 to 0.7.4 count cells otherwise, and add half a voxel to values.)
-- 0.8 (curobo/_src/geom/types.py, geom/data/data_voxel.py): positive outside, float16; ``round(dims / voxel)`` cells
-  a side, which the kernel truncates in float32; trilinear between centres, the pose in the middle of the cells.
-  Outside all is free.
+Read in its source (NVlabs/curobo, 0.7.5 to 0.7.7: geom/types.py `VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu
+`compute_voxel_index`), not tried on it. It flattens (x, y, z) with z fastest and places the grid by the pose of its
+middle, ``x y z qw qx qy qz``. Values are positive inside; ``1 + floor(dims / voxel)`` cells a side; the kernel
+truncates ``(x - pose + dims / 2) / voxel``: cell i spans ``pose - dims / 2 + [i, i + 1] voxel``, so the pose is half
+a voxel below the middle of our cells. A sphere's centre takes the value of the cell that it lies in. In the first
+three and last two cells of an axis, and outside, all is free. (0.7.0 to 0.7.4 count cells otherwise, and add half a
+voxel to values.)
 
 Occupied cells as the stream of MoveIt's distance field, which propagates distances from them itself.
 
@@ -24,14 +20,12 @@ first. The reader takes ``int(size * (1 / resolution))`` cells a side, and puts 
 import json
 import re
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, Pieces, has_arrays, read_arrays, savez
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.grid_files.grid_format import (
@@ -43,73 +37,37 @@ from splatctrl_cli.grid_files.grid_format import (
     header_text,
     slabs,
 )
-from splatctrl_cli.records import Bool, DistanceGrid, Float64
+from splatctrl_cli.records import Bool, DistanceGrid
 
-CuroboVersion = Literal["0.7", "0.8"]
-VERSIONS: tuple[str, ...] = get_args(CuroboVersion)
-DISTANCES = ("sdf", "bound", "hard", "se", "gpdf")
-CUROBO_MARGIN = (
-    1e-3  # [cells] by which 0.8 is given a longer side, so that float32 does not truncate it to a cell less
-)
+CUROBO = "0.7"  # the version that a file is for, as it says
 
 
-def write_curobo(path: Path, grid: DistanceGrid, *, version: str = "0.7", channel: str = "sdf") -> None:
-    """Write `channel`, a distance, for cuRobo of `version`: 0.7 (0.7.5 to 0.7.7) or 0.8.
-
-    With ``bound`` no sphere in a cell is nearer than the cell says, whatever the look-up. float16 (0.8) is rounded
-    towards less distance. Raises UsageError for another version or a channel that is no distance of the grid,
-    InputError for NaN.
-    """
-    shape = check_grid(grid)
-    if version not in VERSIONS:
-        raise UsageError(f"cuRobo version {version}: expected one of {', '.join(VERSIONS)}")
-    if channel not in DISTANCES or channel not in grid.channels:
-        have = [name for name in DISTANCES if name in grid.channels]
-        raise UsageError(f"cuRobo channel {channel}: expected a distance of the grid: {', '.join(have)}")
-    if any(np.isnan(layers).any() for layers in slabs(grid.channels[channel])):
+def write_curobo(path: Path, grid: DistanceGrid) -> None:
+    """Write ``sdf`` for cuRobo. Raises InputError for NaN."""
+    shape, distances = check_grid(grid), grid.channels["sdf"]
+    if any(np.isnan(layers).any() for layers in slabs(distances)):
         raise InputError(
-            f"grid to write for cuRobo: {channel}: expected distances, got NaN",
+            "grid to write for cuRobo: sdf: expected distances, got NaN",
             remedy="bake with field.unknown=obstacle or free",
         )
-    dims, center = _place(grid, np.array(shape, np.float64), version)
+    sides = np.array(shape, np.float64) - 1.0
+    center = grid.origin + 0.5 * grid.voxel * sides - 0.5 * grid.voxel
     features = Pieces(
-        dtype="<f4" if version == "0.7" else "<f2",
+        dtype="<f4",
         shape=(shape[0] * shape[1] * shape[2],),
-        make=lambda: _features(grid.channels[channel], version),
+        make=lambda: (-layers.astype(np.float32, copy=False) for layers in slabs(distances)),
     )
     arrays: dict[str, NDArray[np.generic] | Pieces] = {
         "features": features,
-        "dims": dims,
+        "dims": grid.voxel * sides,
         "voxel_size": np.asarray(grid.voxel, "<f8"),
         "pose": np.array([*center, 1.0, 0.0, 0.0, 0.0]),
         "shape": np.array(shape, "<i8"),
-        "curobo": np.asarray(version),
-        "channel": np.asarray(channel),
+        "curobo": np.asarray(CUROBO),
+        "channel": np.asarray("sdf"),
         "header": np.asarray(header_text(grid)),
     }
     savez(path, arrays, level=0)
-
-
-def _features(distances: NDArray[np.generic], version: str) -> Iterator[NDArray[np.generic]]:
-    for layers in slabs(distances):
-        values = layers.astype(np.float32, copy=False)
-        yield -values if version == "0.7" else round_down(values)
-
-
-def _place(grid: DistanceGrid, shape: Float64, version: str) -> tuple[Float64, Float64]:
-    """dims (3,) [m] and the position (3,) [m] of the pose."""
-    middle = grid.origin + 0.5 * grid.voxel * (shape - 1)
-    if version == "0.7":
-        return grid.voxel * (shape - 1.0), middle - 0.5 * grid.voxel
-    return grid.voxel * (shape + CUROBO_MARGIN), middle
-
-
-def round_down(values: NDArray[np.float32]) -> NDArray[np.float16]:
-    """float16 of values, the next one below where the nearest lies above."""
-    rounded = np.clip(values, -65504.0, 65504.0).astype(np.float16)
-    is_above = rounded.astype(np.float32) > values
-    rounded[is_above] = np.nextafter(rounded[is_above], np.float16(-np.inf))
-    return rounded
 
 
 def describe_curobo(path: Path, head: bytes) -> Summary | None:

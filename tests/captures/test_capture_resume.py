@@ -5,12 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_writer import JOURNAL, write_capture
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.logs import ros_log
-from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import StoredFrame
 from splatctrl_cli.sources.source import describe, open_source
 from tests.logs.make_log import LogRecipe, make_log
@@ -89,21 +87,6 @@ def test_frames_that_are_not_the_sources_are_refused(tmp_path: Path, monkeypatch
     moved = open_source(make_log(tmp_path / "moved.mcap", LogRecipe(tf_delay_ns=5_000_000)))
     with pytest.raises(UsageError, match=r"color/cam0/000001\.jpg: tx was 0\.1, is "):
         write_capture(partial, moved)
-
-
-def test_a_frame_is_read_by_its_number(tmp_path: Path) -> None:
-    folder = tmp_path / "x.capture"
-    write_capture(folder, open_source(make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))))
-    source = CaptureSource(folder, SourceOptions(cameras=("cam1",)))
-    frames = [stored for stored in source.stored() if isinstance(stored, StoredFrame)]
-    assert len(source) == len(frames) == 5
-    for number in (3, 0, 4):
-        alone = source.stored_at(number)
-        assert alone is not None
-        assert alone.color_file == frames[number].color_file
-        assert alone.origin == frames[number].origin
-    (folder / "depth/cam1/000003.png").unlink()
-    assert source.stored_at(3) is None
 
 
 def test_what_an_interrupted_ingest_left_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

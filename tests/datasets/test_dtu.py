@@ -1,5 +1,6 @@
 """DTU scans in MVSNet's and IDR's layouts: what is written reads back, damage is named, views become records."""
 
+import shutil
 import struct
 from collections.abc import Callable
 from dataclasses import replace
@@ -293,7 +294,7 @@ def test_a_missing_image_leaves_the_others_their_cameras_and_masks(idr: Path) ->
 
 
 def test_without_depth_a_view_of_idr_stays_and_depth_maps_may_lie_elsewhere(tmp_path: Path, scan: Path) -> None:
-    write_idr(tmp_path / "plain", "scan7", VIEWS, with_depth=False)
+    shutil.rmtree(write_idr(tmp_path / "plain", "scan7", VIEWS) / "depth")
     source = DtuSource(tmp_path / "plain")
     assert not source.has_depth
     assert len(frames_of(source)) == 4

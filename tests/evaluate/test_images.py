@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from splatctrl_cli.evaluate.images import depth_errors, psnr, published_ssim, ssim, ssim_map
+from splatctrl_cli.evaluate.images import depth_errors, psnr, published_ssim, ssim_map
 from splatctrl_cli.records import Float64
 from tests.reference.images import ssim_at
 
@@ -46,16 +46,6 @@ def test_ssim_map_equals_the_reference_window_by_window_and_at_the_border() -> N
         for channel in range(3):
             expected = ssim_at(x[..., channel], y[..., channel], row, column)
             assert similarity[row, column, channel] == pytest.approx(expected, abs=1e-12)
-
-
-def test_ssim_averages_only_masked_pixels() -> None:
-    x, y = noise(0), noise(1)
-    y[:, :15] = x[:, :15]
-    far_left = np.zeros((24, 31), dtype=bool)
-    far_left[:, :10] = True
-    assert ssim(x, y, far_left) == pytest.approx(1.0, abs=1e-12)
-    assert ssim(x, y) < 0.9
-    assert math.isnan(ssim(x, y, np.zeros((24, 31), dtype=bool)))
 
 
 def test_depth_errors_count_only_pixels_where_both_have_depth() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.files import arrays, spilled_rows
-from splatctrl_cli.files.spilled_rows import RowFile, Rows, ranges, scratch_folder, selected
+from splatctrl_cli.files.spilled_rows import RowFile, Rows, scratch_folder, selected
 from splatctrl_cli.logs import state_columns
 from splatctrl_cli.logs.state_columns import StateCollector
 from splatctrl_cli.logs.state_topics import checked_stamps
@@ -30,8 +30,8 @@ def block(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> in
 
 def filled(values: Float64) -> Rows:
     file = RowFile(values.shape[1:])
-    for first, last in ranges(len(values), 3):
-        file.append(values[first:last])
+    for first in range(0, len(values), 3):
+        file.append(values[first : first + 3])
     return Rows(file)
 
 

@@ -19,7 +19,9 @@ def mesh_of(surface: Surface) -> trimesh.Trimesh:
 
 @pytest.mark.parametrize(("level", "radius"), [(0.0, 0.3), (0.05, 0.35), (-0.1, 0.2)])
 def test_the_surface_of_a_ball_is_where_its_distance_says_and_faces_outwards(level: float, radius: float) -> None:
-    surface = iso_surface(ball_grid(), level)
+    grid = ball_grid()
+    grid.channels["sdf"] = grid.channels["sdf"] - np.float32(level)
+    surface = iso_surface(grid)
     mesh = mesh_of(surface)
     away = surface.vertices - MIDDLE
     # between two centres the distance is off its chord by at most voxel^2 / (8 r)
@@ -74,11 +76,13 @@ def test_every_suffix_reads_back_as_the_same_triangles(tmp_path: Path) -> None:
         write_surface(tmp_path / "field.off", surface)
 
 
-def test_a_level_that_the_grid_does_not_cross_is_told_with_its_range() -> None:
+def test_a_grid_without_a_surface_is_told_with_its_range() -> None:
+    far = ball_grid()
+    far.channels["sdf"] = far.channels["sdf"] + np.float32(1.0)
     with pytest.raises(
-        NotEvaluableError, match=r"expected sdf to cross 3 m, got values from -0.28\d+ to 0.\d+ m; give"
+        NotEvaluableError, match=r"expected sdf to cross 0 m, got values from 0.71\d+ to 1.\d+ m; bake"
     ):
-        iso_surface(ball_grid(), 3.0)
+        iso_surface(far)
     blank = ball_grid()
     blank.channels["sdf"] = np.full_like(blank.channels["sdf"], np.nan)
     with pytest.raises(NotEvaluableError, match="got no cell that has a distance"):
@@ -86,8 +90,6 @@ def test_a_level_that_the_grid_does_not_cross_is_told_with_its_range() -> None:
     thin = random_grid("sdf", shape=(1, 4, 4))
     with pytest.raises(NotEvaluableError, match="at least 2 cells along each axis"):
         iso_surface(thin)
-    with pytest.raises(UsageError, match="surface of observed: expected a distance"):
-        iso_surface(random_grid(), channel="observed")
 
 
 def test_only_cells_without_a_distance_between_the_sides_leave_no_surface() -> None:

@@ -44,7 +44,7 @@ def place(tmp_path_factory: pytest.TempPathFactory, views: list[DtuView]) -> Pat
     folder = tmp_path_factory.mktemp("protocol")
     write_dtu(folder / "mvsnet", "scan1", views)
     write_idr(folder / "idr", "scan1", views)
-    write_idr(folder / "blind", "scan1", views, with_depth=False)
+    shutil.rmtree(write_idr(folder / "blind", "scan1", views) / "depth")
     for number, view in enumerate(views):
         (folder / "masks").mkdir(exist_ok=True)
         assert view.mask is not None
