@@ -43,7 +43,6 @@ FAST = (
     "scene.refine_iterations=2",
     "scene.max_splats=300",
 )
-FAST_3DGS = ("gaussians.iterations=6", "gaussians.densify_from=2", "gaussians.densify_every=2")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,10 +114,9 @@ class Desk:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         log, quiet = folder / "log", ("--threads", "1", "-q")
-        self._made("simulate", "-o", log, "--duration", "0.6", "--width", "64", "--height", "48", "--dtu", "-q")
+        self._made("simulate", "-o", log, "--duration", "0.6", "--width", "64", "--height", "48", "-q")
         robot = ("--urdf", log / "robot.urdf", "--spheres", log / "robot_spheres.yaml")
         fast = [word for setting in FAST for word in ("--set", setting)]
-        fast_3dgs = [word for setting in (*FAST, *FAST_3DGS) for word in ("--set", setting)]
         made = ("reconstruct", log / "log.mcap", *robot, *quiet, *fast)
         self._made(*made, "-o", folder / "scene")
         drive = ("replay", log / "log.mcap", "--scene", folder / "scene", *robot, *quiet, "--mode", "closed-loop")
@@ -126,7 +124,6 @@ class Desk:
         coarse = ("--set", "field.max_loss=1", "--set", "field.voxel=0.05")
         self.commands: dict[str, tuple[object, ...]] = {
             **dict.fromkeys(("scene", "occupancy", "human"), made),
-            "gaussians": ("reconstruct", "--dtu", log / "dtu", "--method", "3dgs", *quiet, *fast_3dgs),
             "field": ("sdf-bake", folder / "scene", *quiet, *coarse, "--no-report"),
             **dict.fromkeys(("control", "verdict"), short),
             "planner": (*short, "--baseline", "birrt"),

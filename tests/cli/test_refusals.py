@@ -21,8 +21,6 @@ from tests.robot.shapes import BOX, arm_of, written
 ROBOT = "--urdf robot.urdf --spheres robot_spheres.yaml"
 REPLAY = f"replay states.mcap --scene scene {ROBOT}"
 DRIVE, ASK = f"{REPLAY} --mode closed-loop", f"{REPLAY} --mode open-loop"
-FIT = "score --dtu dtu --fit --fit-iterations 6 --fit-splats 400 --threads 1"
-GAUSSIANS = "reconstruct --method 3dgs --dtu dtu --holdout 2,5"
 BAKE = "sdf-bake splats.ply"
 Refusal = tuple[str, int, str]
 REFUSED: dict[str, list[Refusal]] = {
@@ -104,15 +102,6 @@ REFUSED: dict[str, list[Refusal]] = {
         ("log.mcap --set scene.max_splat=9", 2, "did you mean scene.max_splats?"),
         ("log.mcap --seed=-1", 2, "argument --seed: expected a whole number, 0 to 2147483647"),
     ],
-    GAUSSIANS: [
-        ("--device cuda:0", 2, "--device cuda:0: --method 3dgs computes on the processor; give --device cpu"),
-        ("--urdf robot.urdf", 2, "--urdf: does not apply"),
-        ("--resume", 2, "--resume: does not apply"),
-        ("--points cloud.ply", 2, "--points: does not apply"),
-        ("--box=50,50,50,51,51,51 -o new", 4, "no pixel of any view"),
-        ("--require relocated>=1", 2, "unknown metric"),
-    ],
-    "reconstruct --method 3dgs": [("log.mcap", 2, "has a clock")],
     "sdf-bake": [
         ("none", 4, "none: no such file or folder; give what reconstruct wrote"),
         ("scene --at -1", 5, "no snapshot at or before"),
@@ -182,13 +171,8 @@ REFUSED: dict[str, list[Refusal]] = {
         ("a --reference b --thread 3", 2, "--thread 3; did you mean --threads?"),
         ("a --refrence b", 2, "--refrence; did you mean --reference?"),
         ("a --reference b --snapshots fin", 2, "did you mean final?"),
-        ("--reference b", 2, "expected a SCENE, got none; give what reconstruct wrote, or --fit"),
+        ("--reference b", 2, "required: SCENE; see splatctrl score --help"),
         ("empty --reference log.mcap", 4, "expected a scene folder with splats.ply and run.json"),
-        (
-            f"--reference log.mcap {FIT.partition('dtu dtu ')[2]}",
-            2,
-            "expected scans (--dtu) or an image folder, got ",
-        ),
     ],
     "score scene --reference log.mcap": [
         ("--cameras cam9", 4, "log.mcap: no camera 'cam9'; use one of: cam0, cam1"),
@@ -199,20 +183,8 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--scan scan1", 2, "--scan scan1: only with --dtu"),
         ("--dtu root", 2, "not allowed with argument"),
         ("--images all", 2, "--images all: expected a folder for them; give -o"),
-        ("--seed 3", 2, "--seed: only with --fit"),
-        ("--device cuda", 2, "--device: only with --fit"),
-        ("--fit-iterations 3", 2, "--fit-iterations: only with --fit"),
         ("--cloud-unit 1", 2, "--cloud-unit: only with --cloud"),
         ("--cloud a.ply --cloud-max 0", 2, "--cloud-max: expected 1e-06 to 1000 m, got '0'"),
-    ],
-    FIT: [
-        ("scene", 2, "--fit: makes the scenes itself, got scene"),
-        ("--holdout 2", 2, "--fit: needs a protocol; give --protocol holdout:2"),
-        ("--fit-splats 0", 2, "--fit-splats: expected a whole number, 1 to 10000000"),
-        ("--scan scan1,scan9", 4, "no scan 'scan9'; scans: scan1"),
-        ("--require psnr_best>=1", 2, "unknown metric"),
-        ("--cloud .", 4, "expected the points of scan1, scan1.ply or stl001_total.ply, got neither"),
-        ("--set scene.nothing=1", 2, "scene.nothing"),
     ],
     "replay states.mcap --scene scene": [
         ("--urdf still.urdf", 4, "still.urdf: expected movable joints, got none"),

@@ -11,7 +11,6 @@ from tools.settings_fuzz import Case, cases, fault_of, section_of
 
 ABSENT = {
     "scene": ("reconstruct", "absent.mcap"),
-    "gaussians": ("reconstruct", "--method", "3dgs", "--dtu", "absent"),
     "occupancy": ("reconstruct", "absent.mcap"),
     "human": ("reconstruct", "absent.mcap"),
     "field": ("sdf-bake", "absent"),
