@@ -4,8 +4,8 @@
 NAME`` takes some. It ends with 1 where one survived. A test run that takes too long counts as killed.
 
 An entry is ``[room.what-is-wrong]`` with `file`, the name of a file below splatctrl_cli/ or experiments/, `old`,
-text that stands there once, `new`, what replaces it, and `tests`, names of test files. Names, not paths, so that files
-may move.
+text that stands there once, `new`, what replaces it, and `tests`, names of test files. They are names, not paths, so
+that files may move.
 """
 
 import argparse

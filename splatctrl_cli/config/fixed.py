@@ -108,6 +108,7 @@ MASK_SURE = 4.0  # of the sensor's error, beyond which a piece before the robot 
 CONTRADICTED = 0.1  # [m] behind what another camera measures on its ray, depth is of no surface there
 CONTRADICTING_COLUMNS = 128  # of blocks of pixels in an image, which are held against the other cameras
 CONTRADICTING_PIXELS = 4  # such blocks side by side; fewer are noise
+SEEN_THROUGH_PIXELS = 16  # side by side that another camera sees through: noise leaves up to 4, a shiny thing 29
 ASKED_REACH = 0.15  # [m] from the robot's spheres: why space is unseen is asked so far
 VOTE_SHARE = 0.15  # of the robot's pixels in a voxel, fewer of an object are none: a 6 mm rod has 0.4
 MASK_SIGMAS = 2.0  # of the sensor's error that the robot's surface may explain

@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import CONTRADICTED, CONTRADICTING_COLUMNS, CONTRADICTING_PIXELS, MASK_STEP
+from splatctrl_cli.config.fixed import (
+    CONTRADICTED,
+    CONTRADICTING_COLUMNS,
+    CONTRADICTING_PIXELS,
+    MASK_STEP,
+    SEEN_THROUGH_PIXELS,
+)
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Index, RgbdFrame
 from splatctrl_cli.scene.labels import Seen
@@ -81,8 +87,8 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
     All rays of a block and of those beside it run through a surface that another frame measures, and end more than
     `CONTRADICTED` [m] behind it, or return no depth: outside of a stereo shadow, within the range of depth of the
     frame. So does a ray to a robot, drawn by its own surface, that returns no depth. Fewer than
-    `CONTRADICTING_PIXELS` blocks side by side are noise. Which of the two is wrong is not known: a ray that measures
-    something proves no space free either where another runs through what it measures.
+    `CONTRADICTING_PIXELS` blocks side by side are noise. Which of the two is wrong is not known: a ray proves no
+    space free either where others run through `SEEN_THROUGH_PIXELS` blocks of what it measures.
     """
     surfaces = [_surface(*one) for one in seen]
     through = [np.zeros([size // _side(frame) for size in frame.depth.shape], np.float32) for frame, _ in seen]
@@ -96,11 +102,13 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
         robot = _blocks(mask.robot_depth, rays.side).min(axis=2)
         is_before = rays.is_blank & (robot > 0) & is_drawn
         depths[is_before] = robot[is_before]
-        until.append(_without_noise(depths))
+        until.append(_side_by_side(depths, CONTRADICTING_PIXELS))
     for (frame, _), end, passed in zip(seen, until, through, strict=True):
         side = _side(frame)
         is_blank = np.asarray((_blocks(frame.depth, side) <= 0).all(axis=2))
-        yield Contradicted(side=side, until=end, is_blank=is_blank, through=_without_noise(passed))
+        yield Contradicted(
+            side=side, until=end, is_blank=is_blank, through=_side_by_side(passed, SEEN_THROUGH_PIXELS)
+        )
 
 
 def without_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
@@ -167,9 +175,9 @@ class _Rays:
         return asked[is_behind]
 
 
-def _without_noise(depths: Float32) -> Float32:
-    """Depths (h, w) [m] of blocks and of their neighbours, where `CONTRADICTING_PIXELS` blocks are side by side."""
+def _side_by_side(depths: Float32, least: int) -> Float32:
+    """Depths (h, w) [m] of blocks and of their neighbours, where at least so many blocks are side by side."""
     wide = cv2.dilate(depths, BESIDE)
     num, piece = cv2.connectedComponents((wide > 0).view(np.uint8), connectivity=8)
     counts = np.bincount(piece[depths > 0], minlength=num)
-    return np.where((counts >= CONTRADICTING_PIXELS)[piece], wide, np.float32(0.0))
+    return np.where((counts >= least)[piece], wide, np.float32(0.0))

@@ -63,6 +63,15 @@ def test_a_ray_proves_nothing_free_where_another_camera_sees_through_what_it_mea
     assert beside.until.any() and beside.unproven(other) is other
 
 
+@pytest.mark.parametrize(("side", "is_noise"), [(5, True), (6, False)])
+def test_fewer_than_sixteen_pixels_seen_through_within_their_outline_are_noise(side: int, is_noise: bool) -> None:
+    """What lies beside their outline does not count."""
+    floating, other = frame(), frame(x=BESIDE, camera="cam1")
+    floating.depth[30 : 30 + side, 40 : 40 + side] = 0.6
+    found, _ = contradicted(masks_of(floating, other), is_drawn=False)
+    assert found.through.any() != is_noise
+
+
 def test_a_camera_without_depth_makes_no_surface_doubtful() -> None:
     dark, other = block_measured_at(0.0), frame(x=BESIDE, camera="cam1")
     _, beside = contradicted(masks_of(dark, other), is_drawn=False)
