@@ -21,7 +21,6 @@ from splatctrl_cli.files.output import PARTIAL, Parts
 from splatctrl_cli.records import Float64, GaussianSet, SplatSet
 from splatctrl_cli.scene_files.voxel_file import (
     read_known_occupancy,
-    read_known_states,
     read_occupancy,
     read_seen,
     read_states,
@@ -53,10 +52,6 @@ class Snapshot:
     def occupancy(self) -> OccupancyGrid | None:
         """The grid of that moment, as coarse as `write_states` keeps it; None in a scene of an older version."""
         return read_states(self._checked(self.occupancy_path)) if self._has_voxels else None
-
-    def known(self) -> KnownVoxels | None:
-        """What was known then of each voxel and when it was last seen; None in a scene of an older version."""
-        return read_known_states(self._checked(self.occupancy_path)) if self._has_voxels else None
 
     def seen(self) -> SeenVoxels | None:
         """When each voxel was last seen; None in a scene of an older version."""

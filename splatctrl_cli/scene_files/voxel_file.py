@@ -1,7 +1,7 @@
 """Voxel files of a scene: ``occupancy.npz`` and the states beside each snapshot, with the evidence behind them."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,9 @@ def read_states(path: Path) -> OccupancyGrid:
     """An occupancy grid with the states of `write_states`. Raises InputError for anything else, never unpickles."""
     with _refused(path, _STATES):
         arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
-        return _grid_of_states(arrays, json.loads(str(arrays["header"])))
+        header = json.loads(str(arrays["header"]))
+        states = _voxels(arrays["states"], "states", np.uint8, header)
+        return OccupancyGrid.from_states(np.array(header["origin"], np.float64), float(header["voxel"]), states)
 
 
 def read_seen(path: Path) -> SeenVoxels | None:
@@ -144,11 +146,6 @@ def _read_header(path: Path) -> dict[str, Any]:
     return header
 
 
-def read_known_states(path: Path) -> KnownVoxels | None:
-    """What `write_states` wrote, None where an older version did. Raises as `read_states`."""
-    return _read_known(path, ("states",), _grid_of_states, _STATES)
-
-
 def read_occupancy(path: Path) -> OccupancyGrid:
     """Read the grid of ``occupancy.npz``. Raises InputError for anything else, never unpickles."""
     with _refused(path, _OCCUPANCY):
@@ -158,7 +155,18 @@ def read_occupancy(path: Path) -> OccupancyGrid:
 
 def read_known_occupancy(path: Path) -> KnownVoxels | None:
     """All of ``occupancy.npz``, None where an older version wrote it. Raises as `read_occupancy`."""
-    return _read_known(path, tuple(_GRID), _grid_of, _OCCUPANCY)
+    with _refused(path, _OCCUPANCY):
+        header = _read_header(path)
+        if "step_stamps_ns" not in header:
+            return None
+        arrays = read_arrays(path, (*_GRID, *_EVIDENCE, *_edges_in(header)), most=22 * MOST_VOXELS + _MOST_EDGES)
+        grid = _grid_of(arrays, header)
+        stamps_ns = np.array(header["step_stamps_ns"], np.int64)
+        last_seen = _widened(_last_seen(arrays["last_seen"], header, len(stamps_ns)))
+        balls = _balls(arrays, grid.voxel)
+        return KnownVoxels(
+            grid=grid, last_seen=last_seen, step_stamps_ns=stamps_ns, unrepresented=balls, edges=_edges(arrays)
+        )
 
 
 def read_unrepresented(path: Path) -> Balls | None:
@@ -173,34 +181,12 @@ def read_unrepresented(path: Path) -> Balls | None:
         return _balls(read_arrays(path, _EVIDENCE[1:], most=13 * MOST_VOXELS), float(header["voxel"]))
 
 
-def _read_known(
-    path: Path, names: tuple[str, ...], grid_of: Callable[[Arrays, Mapping[str, Any]], OccupancyGrid], what: str
-) -> KnownVoxels | None:
-    with _refused(path, what):
-        header = _read_header(path)
-        if "step_stamps_ns" not in header:
-            return None
-        arrays = read_arrays(path, (*names, *_EVIDENCE, *_edges_in(header)), most=22 * MOST_VOXELS + _MOST_EDGES)
-        grid = grid_of(arrays, header)
-        stamps_ns = np.array(header["step_stamps_ns"], np.int64)
-        last_seen = _widened(_last_seen(arrays["last_seen"], header, len(stamps_ns)))
-        balls = _balls(arrays, grid.voxel)
-        return KnownVoxels(
-            grid=grid, last_seen=last_seen, step_stamps_ns=stamps_ns, unrepresented=balls, edges=_edges(arrays)
-        )
-
-
 def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
     return OccupancyGrid(
         origin=np.array(header["origin"], np.float64),
         voxel=float(header["voxel"]),
         **{name: _voxels(arrays[name], name, kind, header) for name, kind in _GRID.items()},
     )
-
-
-def _grid_of_states(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
-    states = _voxels(arrays["states"], "states", np.uint8, header)
-    return OccupancyGrid.from_states(np.array(header["origin"], np.float64), float(header["voxel"]), states)
 
 
 def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) -> NDArray[Any]:

@@ -56,7 +56,7 @@ def test_every_file_is_known_but_run_json_and_the_checkpoint(scene: Path) -> Non
         ("snapshots.csv", lambda scene: scene.snapshots),
         ("snapshots/000001.ply", lambda scene: scene.splats_at(SECOND)),
         ("snapshots/000001.npz", lambda scene: scene.snapshots[1].occupancy()),
-        ("snapshots/000001.npz", lambda scene: scene.snapshots[1].known()),
+        ("snapshots/000001.npz", lambda scene: scene.snapshots[1].seen()),
         ("snapshots/000001.npz", lambda scene: scene.unrepresented_at(SECOND)),
     ],
 )

@@ -17,10 +17,10 @@ from splatctrl_cli.scene_files.scene_folder import open_scene
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT, SceneWriter, read_checkpoint
 from splatctrl_cli.scene_files.voxel_file import (
     read_known_occupancy,
-    read_known_states,
     read_occupancy,
     read_seen,
     read_states,
+    read_unrepresented,
     write_occupancy,
     write_states,
 )
@@ -179,15 +179,16 @@ def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_pa
     wanted = [seen_ns, [free, free, *why]]
     write_states(tmp_path / "a.npz", want, want.grid.states(0.3, 0.7))
     write_occupancy(tmp_path / "b.npz", want)
-    for again in (read_known_states(tmp_path / "a.npz"), read_known_occupancy(tmp_path / "b.npz")):
-        assert again is not None
-        assert (again.last_seen == want.last_seen).all()
-        assert [each.tolist() for each in again.seen.look(points)] == wanted
-        assert again.unrepresented.centers.tolist() == want.unrepresented.centers.tolist()
-        assert again.unrepresented.labels.tolist() == [Label.HUMAN]
-        assert again.unrepresented.radius == pytest.approx(0.025 * 3**0.5)
-        assert again.unrepresented.volume == pytest.approx(0.05**3)
-        assert (again.edges.centers.tolist(), again.edges.radii.tolist()) == ([[0.0, 0.5, 1.0]], [0.25])
+    again = read_known_occupancy(tmp_path / "b.npz")
+    assert again is not None
+    assert (again.last_seen == want.last_seen).all()
+    assert [each.tolist() for each in again.seen.look(points)] == wanted
+    assert (again.edges.centers.tolist(), again.edges.radii.tolist()) == ([[0.0, 0.5, 1.0]], [0.25])
+    for balls in (again.unrepresented, *(read_unrepresented(tmp_path / name) for name in ("a.npz", "b.npz"))):
+        assert balls is not None and balls.centers.tolist() == want.unrepresented.centers.tolist()
+        assert balls.labels.tolist() == [Label.HUMAN]
+        assert balls.radius == pytest.approx(0.025 * 3**0.5)
+        assert balls.volume == pytest.approx(0.05**3)
     for name in ("a.npz", "b.npz"):
         seen = read_seen(tmp_path / name)
         assert seen is not None and seen.last_seen.dtype == (np.uint8 if num_steps < 240 else np.uint16)
@@ -211,7 +212,7 @@ def test_the_largest_number_of_an_older_file_is_looked_at_in_vain(tmp_path: Path
 def test_voxel_files_of_an_older_version_are_read_without_evidence(tmp_path: Path) -> None:
     header = {"origin": [0, 0, 0], "voxel": 0.1, "shape": [1, 1, 1]}
     np.savez(tmp_path / "a.npz", header=np.array(json.dumps(header)), states=np.full((1, 1, 1), 2, np.uint8))
-    assert read_known_states(tmp_path / "a.npz") is None and read_seen(tmp_path / "a.npz") is None
+    assert read_unrepresented(tmp_path / "a.npz") is None and read_seen(tmp_path / "a.npz") is None
     assert read_states(tmp_path / "a.npz").log_odds.item() == 20.0
 
 

@@ -14,7 +14,7 @@ from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.replays.known_scene import from_splats, splat_fields
 from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.scene_files.scene_folder import open_scene
-from splatctrl_cli.voxels import Balls, KnownVoxels
+from splatctrl_cli.voxels import Balls, OccupancyGrid
 from tests.cli.replay_desk import SECOND, splats_of, write_scene
 from tests.reference.unrepresented import unrepresented
 
@@ -81,13 +81,13 @@ def test_a_starved_budget_hides_nothing_that_arrives(sample_data: Path, tmp_path
     (visitor,) = (p for p in primitives if p["name"] == "visitor")
     num_looked_at = 0
     for snapshot in (s for s in scene.snapshots if visitor["from_ns"] < s.stamp_ns < visitor["to_ns"]):
-        known, splats = snapshot.known(), snapshot.splats()
-        assert known is not None
-        there = occupied_in(visitor, known)
+        grid, bare, splats = snapshot.occupancy(), snapshot.unrepresented(), snapshot.splats()
+        assert grid is not None and bare is not None
+        there = occupied_in(visitor, grid)
         num_looked_at += len(there) > 50
         others = splats.select(splats.labels != Label.ROBOT)
         is_bare = unrepresented(there, others.centers.astype(float), others.radii.astype(float), 0.028)
-        balls = known.unrepresented.centers.astype(float)
+        balls = bare.centers.astype(float)
         is_bare &= unrepresented(there, balls, np.zeros(len(balls)), 0.01)
         assert is_bare.sum() <= 0.1 * len(there)  # those hit once, which is not enough
     assert num_looked_at >= 9
@@ -97,9 +97,9 @@ def test_a_starved_budget_hides_nothing_that_arrives(sample_data: Path, tmp_path
     assert metrics["evicted"] > 0
 
 
-def occupied_in(visitor: dict[str, Any], known: KnownVoxels) -> Float64:
+def occupied_in(visitor: dict[str, Any], grid: OccupancyGrid) -> Float64:
     """Centres (K, 3) [m] of the occupied voxels on an upright cylinder, 3 cm above the table or more."""
-    centers = known.grid.origin + known.grid.voxel * np.argwhere(known.grid.log_odds > 0)
+    centers = grid.origin + grid.voxel * np.argwhere(grid.log_odds > 0)
     x, y, _ = np.array(visitor["T_world_shape"])[:3, 3]
     radius, height = visitor["size"]
     across = np.hypot(centers[:, 0] - x, centers[:, 1] - y)
