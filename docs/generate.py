@@ -40,10 +40,8 @@ HELP = ("help", "help_all")
 SIMPLE = ("int", "float", "str")  # types that a default shows
 TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n)((?:[|-].*\n)*)")
 WORDS = {  # of a name in the documentation, for those that it stands for
-    "METHOD": ("closed_loop", "log", "birrt_ik", "birrt", "standstill"),
     "FIELD": ("exact", "barrier", "certified"),
     "REGION": ("seen", "all", "masked"),
-    "FIT": ("3dgs", "ours"),
 }
 
 
