@@ -39,7 +39,7 @@ def test_a_study_with_a_shard_missing_is_not_whole_and_says_which_problem_lacks(
 ) -> None:
     _, part, _ = whole
     assert part.verdict.outcome is Outcome.NOT_EVALUABLE and not part.trials and not part.sections
-    assert "1 of 3 problems have no trials yet: merged-cubby-0000" in part.verdict.sentence
+    assert "1 of 3 problems have no trials yet: cubby-0000" in part.verdict.sentence
 
 
 def test_every_cell_has_a_trial_and_those_of_before_are_kept(whole: tuple[Path, StudyResult, StudyResult]) -> None:
@@ -87,7 +87,7 @@ def test_trials_made_elsewhere_come_to_the_same_table(
     shutil.copytree(out, unfinished)
     (unfinished / TRIALS).unlink()
     assert len(merged_study(replace(request(tmp_path / "again"), made=(unfinished,))).trials) == len(result.trials)
-    with pytest.raises(InputError, match=r"csv: cubby 0, 2 cameras, ours: is there twice"):
+    with pytest.raises(InputError, match=r"csv: tabletop 0, 2 cameras, ours: is there twice"):
         merged_study(replace(request(tmp_path / "twice"), made=(out, files[0])))
     with pytest.raises(InputError, match=rf"has no {TRIALS}"):
         merged_study(replace(request(tmp_path / "none"), made=(tmp_path / "table2" / "..",)))
