@@ -59,6 +59,13 @@ def pose_at(position: ArrayLike, R: ArrayLike | None = None) -> Float64:
     return T
 
 
+def compare_poses(T_world_a: Float64, T_world_b: Float64) -> tuple[float, float]:
+    """How far b is from a [m], and turned against it [degrees]."""
+    T = invert_transform(T_world_a) @ T_world_b
+    cosine = np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)
+    return float(np.linalg.norm(T[:3, 3])), float(np.degrees(np.arccos(cosine)))
+
+
 def turn_about_z(angle: float) -> Float64:
     """Rotation (3, 3) by an angle [rad] about z."""
     c, s = np.cos(angle), np.sin(angle)

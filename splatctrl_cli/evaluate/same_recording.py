@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config.fixed import SAME_LENS_PIXELS, SAME_PICTURE_LEVELS, SAME_POSE_DEGREES, SAME_POSE_METRES
-from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.records import Record, RgbdFrame, UInt8
 
 TILES = (6, 8)  # rows and columns of the picture that is kept of a first frame
@@ -93,9 +93,7 @@ def _differences(first: Mapping[str, Any], frame: RgbdFrame) -> list[str]:
         side = "after" if apart > 0 else "before"
         lines.append(f"{camera}: its nearest frame is {abs(apart):.3g} s {side} the one that trained")
     then_pose = np.array(first["T_world_camera"], np.float64).reshape(4, 4)
-    between = invert_transform(then_pose) @ frame.T_world_camera
-    metres = float(np.linalg.norm(between[:3, 3]))
-    degrees = float(np.degrees(np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1, 1))))
+    metres, degrees = compare_poses(then_pose, frame.T_world_camera)
     if metres > SAME_POSE_METRES or degrees > SAME_POSE_DEGREES:
         lines.append(f"{camera}: the pose differs by {1e3 * metres:.0f} mm and {degrees:.1f} degrees")
     levels = float(np.abs(np.array(first["tiles"]) - np.array(_tiles(frame.color))).max())

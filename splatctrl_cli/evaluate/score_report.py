@@ -23,7 +23,7 @@ from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS
 from splatctrl_cli.evaluate.score import metric_scales
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, noted, verdict_of
 from splatctrl_cli.evaluate.views import View
-from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.records import Bool, Float64
 
 PREFIX = "change_"
@@ -250,11 +250,8 @@ def _mask_doubt(mask: Bool) -> str:
 
 
 def _twin(view: View) -> list[str]:
-    T_camera_world = invert_transform(view.frame.T_world_camera)
     for other in view.training:
-        between = T_camera_world @ other.T_world_camera
-        metres = float(np.linalg.norm(between[:3, 3]))
-        degrees = float(np.degrees(np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1, 1))))
+        metres, degrees = compare_poses(view.frame.T_world_camera, other.T_world_camera)
         if metres <= SAME_PLACE_METRES and degrees <= SAME_PLACE_DEGREES:
             return [f"{view.name} stands {1e3 * metres:.1f} mm and {degrees:.2f} degrees from a training view"]
     return []

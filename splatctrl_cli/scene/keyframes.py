@@ -7,7 +7,7 @@ import numpy as np
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.config.fixed import NEAREST_REACH, SHRINK
-from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.kernels import points
 from splatctrl_cli.kernels.raster import TargetView
 from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame
@@ -128,12 +128,8 @@ class Window:
         self.newest = [v for v in self.newest if v.frame.camera not in fresh] + list(views)
 
     def _has_moved(self, a: RgbdFrame, b: RgbdFrame) -> bool:
-        T = invert_transform(a.T_world_camera) @ b.T_world_camera
-        cosine = np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
-        return bool(
-            np.linalg.norm(T[:3, 3]) > self.config.keyframe_distance
-            or np.degrees(np.arccos(cosine)) > self.config.keyframe_angle
-        )
+        metres, degrees = compare_poses(a.T_world_camera, b.T_world_camera)
+        return metres > self.config.keyframe_distance or degrees > self.config.keyframe_angle
 
     def schedule(self, num_iterations: int, rng: np.random.Generator) -> list[View]:
         """The view of each iteration: newest views and keyframes in turn, each round in random order.

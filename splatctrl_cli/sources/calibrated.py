@@ -16,7 +16,7 @@ from splatctrl_cli.config import fixed
 from splatctrl_cli.datasets.folder_views import HOLDOUT
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import sha256
-from splatctrl_cli.geometry import interpolate_transform, invert_transform, transform_from
+from splatctrl_cli.geometry import compare_poses, interpolate_transform, transform_from
 from splatctrl_cli.logs.messages import metres
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB, SourceOptions
@@ -243,10 +243,8 @@ def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_n
 
 
 def _same(T_a: Float64, T_b: Float64) -> bool:
-    T = invert_transform(T_a) @ T_b
-    cosine = float(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1))
-    is_near = float(np.linalg.norm(T[:3, 3])) < fixed.SAME_POSE_METRES
-    return is_near and float(np.degrees(np.arccos(cosine))) < fixed.SAME_POSE_DEGREES
+    distance, degrees = compare_poses(T_a, T_b)
+    return distance < fixed.SAME_POSE_METRES and degrees < fixed.SAME_POSE_DEGREES
 
 
 LIMITS = {"depth-noise": 1.0, "pose-error": 10.0, "pose-turn": 180.0, "seed": 2**31 - 1}  # m at 1 m, m, degrees
