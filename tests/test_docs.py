@@ -45,7 +45,6 @@ USERS_OWN = {  # what stands for a user's data in commands that are shown; the c
     *("scene", "scene/", "scenes/", "dtu/", "robot.urdf", "spheres.yaml", "panda.urdf"),
 }
 TOO_LONG = {  # for a test: minutes; the page has their figures
-    "simulate --human-arm near-pickup --seed 3 -o shared",
     "reconstruct docs/examples/apc_shelf.toml --root SCENE --max-splats 10000 -o shelf",
     "sweep demo_output/audit --over KEY=A:B",
     "study table2 --trials 20 -o out/table2",

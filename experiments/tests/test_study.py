@@ -89,8 +89,9 @@ def test_trials_made_elsewhere_come_to_the_same_table(
     assert len(merged_study(replace(request(tmp_path / "again"), made=(unfinished,))).trials) == len(result.trials)
     with pytest.raises(InputError, match=r"csv: tabletop 0, 2 cameras, ours: is there twice"):
         merged_study(replace(request(tmp_path / "twice"), made=(out, files[0])))
+    (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=rf"has no {TRIALS}"):
-        merged_study(replace(request(tmp_path / "none"), made=(tmp_path / "table2" / "..",)))
+        merged_study(replace(request(tmp_path / "none"), made=(tmp_path / "empty",)))
     with pytest.raises(UsageError, match="was begun with other settings"):
         merged_study(replace(request(out), made=files))
 
