@@ -86,5 +86,6 @@ def _audit(field: DistanceField) -> Callable[[], object]:
     def distance(points: Float64) -> Float64:
         return field.query(points)[0]
 
-    distances = {"field": distance}
-    return lambda: audit(sample_robot(), sample_states(), lambda stamp_ns: distances)
+    distances, states = {"field": distance}, sample_states()
+    stamps, positions = (np.array([getattr(s, name) for s in states]) for name in ("stamp_ns", "position"))
+    return lambda: audit(sample_robot(), stamps, positions, lambda stamp_ns: distances)

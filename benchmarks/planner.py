@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks.measure import Limit, Options, Result
 from benchmarks.ompl_planner import notes_beside_ompl
 from experiments.drawn_task import solids_of
+from experiments.paths import effector_length, joint_length, least_clearance
 from experiments.problems import Problem, panda, read_archive
 from experiments.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.config import ControlConfig, PlannerConfig
@@ -21,7 +22,7 @@ from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.planner.birrt import Plan, plan
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
-from splatctrl_cli.planner.path import TimedPath, effector_length, joint_length, least_clearance, resampled, timed
+from splatctrl_cli.planner.path import TimedPath, resampled, timed
 from splatctrl_cli.records import Bool, Float64
 
 FRAME = "panda_grasptarget"

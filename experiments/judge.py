@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.paths import least_clearance
 from experiments.problems import Problem, Views
 from splatctrl_cli import Config, ReplayRequest, Verdict
 from splatctrl_cli.blocks import (
@@ -26,7 +27,6 @@ from splatctrl_cli.blocks import (
     StateColumns,
     check_edges,
     closest_of,
-    least_clearance,
     measured_robot,
     metrics_of,
     pose_error,

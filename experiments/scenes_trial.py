@@ -13,6 +13,7 @@ import numpy as np
 from experiments import judge
 from experiments.drawn_task import solids_of
 from experiments.maps import Fitted, Map, splat_map, workspace_of
+from experiments.paths import effector_length, joint_length, least_clearance
 from experiments.pick_and_place import HELD, HOME, depth_cameras
 from experiments.problems import Problem, ProblemRequest, Views, recorded, room, solids_at
 from experiments.scenes import HAND, Scene, read_scene
@@ -28,10 +29,7 @@ from splatctrl_cli.blocks import (
     SceneFitter,
     Stopwatch,
     check_edges,
-    effector_length,
     goal_postures,
-    joint_length,
-    least_clearance,
     pose_at,
     posture_of,
     self_mask_metrics,

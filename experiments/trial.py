@@ -19,6 +19,7 @@ from experiments.maps import (
     splat_map,
     tsdf_map,
 )
+from experiments.paths import joint_length
 from experiments.problems import Problem, ProblemRequest, Views, read_problem, views_of
 from experiments.tracking import follow_joints
 from experiments.ways import Way, plain_ways
@@ -35,7 +36,6 @@ from splatctrl_cli.blocks import (
     ReplayTask,
     Stopwatch,
     closed_loop,
-    joint_length,
     planned_detours,
     planned_path,
 )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from experiments.paths import effector_length, joint_length
 from splatctrl_cli.blocks import (
     ArmModel,
     Bool,
@@ -16,10 +17,8 @@ from splatctrl_cli.blocks import (
     DistancesAt,
     Float64,
     Stamps,
-    audited,
-    effector_length,
+    audit,
     is_at_goal,
-    joint_length,
     pose_error,
     runs_of,
 )
@@ -85,7 +84,7 @@ class Yardstick:
 
     def figures(self, motion: Motion) -> MotionFigures:
         """The figures of a motion, in the scene known at each of its stamps."""
-        of_states = audited(self.model, motion.stamp_ns, motion.position, self.distances_at)
+        of_states = audit(self.model, motion.stamp_ns, motion.position, self.distances_at)
         clearance = {name: of.distance for name, of in of_states.clearance.items()}
         error = pose_error(self.model.frame_pose(motion.position[-1], self.frame), self.T_world_goal)
         has_arrived = is_at_goal(error, self.config)

@@ -6,7 +6,7 @@ The jobs and their requests are in `splatctrl_cli.api`; these names may change w
 from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
 from splatctrl_cli.config.fixed import START_ROOM
 from splatctrl_cli.control.arm import ArmModel, sphere_names
-from splatctrl_cli.control.audit import DistanceFunction, DistancesAt, audited
+from splatctrl_cli.control.audit import DistanceFunction, DistancesAt, audit
 from splatctrl_cli.control.events import runs_of
 from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, guided_goal, pose_error
 from splatctrl_cli.control.open_loop import is_shaped
@@ -66,7 +66,7 @@ from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.planner.birrt import plan
 from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, OnlyDistance
 from splatctrl_cli.planner.edges import check_edges
-from splatctrl_cli.planner.path import TimedPath, effector_length, joint_length, least_clearance, resampled
+from splatctrl_cli.planner.path import TimedPath, resampled
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     START_BLOCKED,
@@ -209,7 +209,7 @@ __all__ = [
     "arm_solids",
     "arm_spheres_yaml",
     "arm_urdf",
-    "audited",
+    "audit",
     "back_project",
     "box",
     "cameras",
@@ -221,7 +221,6 @@ __all__ = [
     "depth_box",
     "distance_to",
     "drawn_figure",
-    "effector_length",
     "field_splats",
     "fields_at",
     "fitted_to",
@@ -237,9 +236,7 @@ __all__ = [
     "is_at_goal",
     "is_installed",
     "is_shaped",
-    "joint_length",
     "known_space",
-    "least_clearance",
     "look_at",
     "loss_weights",
     "mean_loss",

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from experiments.paths import joint_length, least_clearance
 from experiments.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.planner.birrt import plan
-from splatctrl_cli.planner.path import joint_length, least_clearance, timed
+from splatctrl_cli.planner.path import timed
 from tests.control.fakes import Balls, PlanarArm
 from tests.planner.walls import clearance, one_wall, thin_post
 

@@ -1,15 +1,14 @@
 """The clearance of logged joint states: what each field says of every state, and how much of it is known space."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import pair_gaps
-from splatctrl_cli.records import Bool, Float64, JointState, Stamps
+from splatctrl_cli.records import Bool, Float64, Stamps
 
 Channel = NDArray[np.uint8]
 
@@ -70,34 +69,6 @@ class AuditTrace:
     of_spheres: Mapping[str, Float64] = field(default_factory=dict)
 
 
-def checked_states(model: ArmModel, states: Sequence[JointState]) -> tuple[Stamps, Float64]:
-    """Stamps (T,) [ns] and positions (T, J) [rad] of states in the model's joint order.
-
-    Raises InputError when there are none, a state is not finite or has other joints, or the stamps go back.
-    """
-    if not states:
-        raise InputError("joint states: expected at least one, got none", remedy="check the log's /joint_states")
-    J = len(model.joint_names)
-    for index, state in enumerate(states):
-        if np.shape(state.position) != (J,):
-            raise InputError(f"joint state {index}: expected {J} joints, got {np.size(state.position)}")
-    stamps = np.array([state.stamp_ns for state in states], dtype=np.int64)
-    positions = np.array([state.position for state in states], dtype=np.float64)
-    if np.any(np.diff(stamps) < 0):
-        index = int(np.argmax(np.diff(stamps) < 0)) + 1
-        raise InputError(
-            f"joint state {index}: expected a stamp not before {stamps[index - 1]} ns, got {stamps[index]} ns",
-            remedy="sort the states by stamp",
-        )
-    if not np.all(np.isfinite(positions)):
-        index, joint = (int(i[0]) for i in np.nonzero(~np.isfinite(positions)))
-        raise InputError(
-            f"joint state {index}: joint {model.joint_names[joint]} is {positions[index, joint]}, "
-            "expected a finite angle"
-        )
-    return stamps, positions
-
-
 def part_clearances(
     model: ArmModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Float64, Bool]:
@@ -139,14 +110,6 @@ def moving_clearance(
 
 
 def audit(
-    model: ArmModel, states: Sequence[JointState], distances_at: DistancesAt, *, observed: Observed | None = None
-) -> AuditTrace:
-    """The clearances of every logged state, each by the distances that were known at its stamp."""
-    stamps, positions = checked_states(model, states)
-    return audited(model, stamps, positions, distances_at, observed=observed)
-
-
-def audited(
     model: ArmModel,
     stamps: Stamps,
     positions: Float64,
@@ -154,7 +117,8 @@ def audited(
     *,
     observed: Observed | None = None,
 ) -> AuditTrace:
-    """`audit` of stamps (T,) [ns] that do not go back and finite positions (T, J); T >= 1.
+    """The clearances of states, each by the distances that were known at its stamp: stamps (T,) [ns] that do not go
+    back, finite positions (T, J); T >= 1.
 
     Of states of the same scene, the audit of some is that part of the audit of all, to the bit.
     """

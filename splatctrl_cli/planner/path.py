@@ -1,6 +1,6 @@
-"""A path of straight edges in joint space: its lengths, the clearance proved along it, and its timing.
+"""A path of straight edges in joint space, and its timing.
 
-W waypoints, J joints, K samples; a place on the path is the number of waypoints passed, with a fraction.
+W waypoints, J joints, K samples.
 """
 
 from dataclasses import dataclass
@@ -9,37 +9,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config.fixed import FRAME_SPACING, STILL_ROW
+from splatctrl_cli.config.fixed import FRAME_SPACING
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.goals import rotation_vector
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.edges import ROUNDING
 from splatctrl_cli.records import Float64
-
-MAX_PIECES = 200_000  # of a path, when its clearance is proved
-
-
-@dataclass(frozen=True, kw_only=True)
-class PathClearance:
-    """The least clearance of a whole path lies in [lower, upper] [m]; upper is that of a posture of the path."""
-
-    lower: float
-    upper: float
-    num_checks: int
-
-
-def joint_length(waypoints: Float64) -> float:
-    """Length [rad] of a path (W, J) in joint space."""
-    return float(np.sum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1)))
-
-
-def effector_length(model: ArmModel, postures: Float64, frame: str) -> tuple[float, float]:
-    """How far a frame goes [m] and turns [degrees] over postures (K, J), from each to the next."""
-    poses = [model.frame_pose(q, frame) for q in postures]
-    moved = sum(float(np.linalg.norm(b[:3, 3] - a[:3, 3])) for a, b in pairwise(poses))
-    turned = sum(float(np.linalg.norm(rotation_vector(b[:3, :3] @ a[:3, :3].T))) for a, b in pairwise(poses))
-    return moved, float(np.degrees(turned))
 
 
 def resampled(waypoints: Float64, spacing: float) -> Float64:
@@ -49,32 +22,6 @@ def resampled(waypoints: Float64, spacing: float) -> Float64:
         num = max(int(np.ceil(np.linalg.norm(b - a) / spacing)), 1)
         rows.append(a + np.arange(1, num + 1)[:, None] / num * (b - a))
     return np.concatenate(rows)
-
-
-def least_clearance(clearance: Clearance, waypoints: Float64, *, tolerance: float = 1e-3) -> PathClearance:
-    """The least clearance of the path, everywhere on it and not only at samples, to a tolerance [m].
-
-    Over half an interval no row loses more than half of what it can lose over the whole: the bound of conservative
-    advancement, here as branch and bound. Raises InputError where the tolerance asks for too many pieces.
-    """
-    motion = np.diff(waypoints, axis=0)
-    speeds = np.maximum(clearance.speeds(motion), STILL_ROW)
-    edge, low, high = np.arange(len(motion)), np.zeros(len(motion)), np.ones(len(motion))
-    upper, num_checks = float(np.min(clearance.at(waypoints))), len(waypoints)
-    lower = upper
-    while len(edge):
-        if num_checks > MAX_PIECES:
-            raise InputError(f"tolerance: expected one that {MAX_PIECES} pieces reach, got {tolerance:g} m")
-        middle = (low + high) / 2
-        rows = clearance.rows(waypoints[edge] + middle[:, None] * motion[edge]) - ROUNDING
-        num_checks += len(edge)
-        upper = min(upper, float(np.min(rows)))
-        bound = np.min(rows - (high - low)[:, None] / 2 * speeds[edge], axis=1)
-        is_open = bound < upper - tolerance
-        lower = min(lower, float(np.min(bound[~is_open], initial=np.inf)))
-        edge, low, middle, high = edge[is_open], low[is_open], middle[is_open], high[is_open]
-        edge, low, high = np.concatenate([edge, edge]), np.concatenate([low, middle]), np.concatenate([middle, high])
-    return PathClearance(lower=lower, upper=upper, num_checks=num_checks)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,6 @@ from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.signals import audit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep, Intervention, QpIkController, RowSlack
 from splatctrl_cli.control.terms import RowKind
-from splatctrl_cli.records import JointState
 from tests.control.fakes import Balls, PlanarArm, far_away
 
 STAMPS = np.arange(6, dtype=np.int64) * 100_000_000
@@ -72,11 +71,8 @@ def test_many_names_are_counted_and_not_all_listed() -> None:
 
 def test_a_clearance_below_the_margin_names_its_sphere_and_a_collision_lies_within_it() -> None:
     ball, arm = Balls([[0.9, 0.25, 0.0]], [0.1]), PlanarArm()
-    states = [
-        JointState(stamp_ns=int(t), position=np.array([angle, 0.0]), velocity=np.zeros(2))
-        for t, angle in zip(STAMPS, [-1.0, 0.05, 0.15, 0.25, 0.5, 3.0], strict=True)
-    ]
-    trace = audit(arm, states, lambda _: {"exact": lambda points: ball.query(points)[0]})
+    positions = np.array([[angle, 0.0] for angle in (-1.0, 0.05, 0.15, 0.25, 0.5, 3.0)])
+    trace = audit(arm, STAMPS, positions, lambda _: {"exact": lambda points: ball.query(points)[0]})
     names = ("base[0]", "upper[0]", "upper[1]", "fore[0]", "fore[1]")
     found = {e.kind: e for e in events_of(trace.stamp_ns, audit_signals(trace, 0.08, names, arm.joint_names))}
     below, collision, outside = (
@@ -90,8 +86,12 @@ def test_a_clearance_below_the_margin_names_its_sphere_and_a_collision_lies_with
 
 
 def test_a_state_without_a_distance_is_an_event_and_not_below_the_margin() -> None:
-    states = [JointState(stamp_ns=int(t), position=np.array([0.1, 0.1]), velocity=np.zeros(2)) for t in STAMPS]
-    trace = audit(PlanarArm(), states, lambda _: {"exact": lambda points: np.full(len(points), np.nan)})
+    trace = audit(
+        PlanarArm(),
+        STAMPS,
+        np.full((len(STAMPS), 2), 0.1),
+        lambda _: {"exact": lambda points: np.full(len(points), np.nan)},
+    )
     names = ("base[0]", "upper[0]", "upper[1]", "fore[0]", "fore[1]")
     (event,) = events_of(trace.stamp_ns, audit_signals(trace, 0.02, names, ("shoulder", "elbow")))
     assert event.kind is EventKind.WITHOUT_DISTANCE and event.num_states == 6

@@ -3,13 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.paths import joint_length
 from splatctrl_cli.config import PlannerConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.planner import birrt
 from splatctrl_cli.planner.birrt import PlanOutcome, plan, shortened
 from splatctrl_cli.planner.configuration_clearance import Clearance, OnlyDistance
 from splatctrl_cli.planner.edges import EdgeCheck, check_edges
-from splatctrl_cli.planner.path import joint_length, resampled
+from splatctrl_cli.planner.path import resampled
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, PlanarArm, Plane
 from tests.planner.walls import clearance, closed_ring, one_wall, thin_post

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.paths import least_clearance
 from experiments.problems import simulated_arm
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goals import pose_error
@@ -12,7 +13,6 @@ from splatctrl_cli.control.replay import ReplayTask, is_at_goal
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.birrt import plan
 from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.path import least_clearance
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     NO_POSTURE,

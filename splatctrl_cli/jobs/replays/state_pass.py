@@ -9,7 +9,7 @@ import numpy as np
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
 from splatctrl_cli.control.arm import sphere_names
-from splatctrl_cli.control.audit import AuditTrace, Clearance, audited, moving_clearance, part_clearances
+from splatctrl_cli.control.audit import AuditTrace, Clearance, audit, moving_clearance, part_clearances
 from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
 from splatctrl_cli.control.fixed_parts import FixedParts
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
@@ -115,9 +115,7 @@ class ReplayRecord:
     def measured(self, stamps: Stamps, positions: Float64, velocities: Float64) -> AuditTrace:
         """The audit of the next block of states (T, J), which see one scene."""
         scene, self._model = self._scene, self._robot.at(int(stamps[0]))
-        part = audited(
-            self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed
-        )
+        part = audit(self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed)
         part = self._look_at_self(self._without_expected(part))
         self.audit.add(part)
         self.newer_depth.add(stamps, positions, part.clearance["exact"].distance)

@@ -1,0 +1,63 @@
+"""What IV reports of a path of straight edges in joint space: its lengths, and the clearance proved along it.
+
+W waypoints, J joints, K samples.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from splatctrl_cli import InputError
+from splatctrl_cli.blocks import ArmModel, Clearance, Float64, fixed, pose_error
+
+MAX_PIECES = 200_000  # of a path, when its clearance is proved
+ROUNDING = 1e-9  # [m] taken off every clearance: far above the rounding of the distances
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathClearance:
+    """The least clearance of a whole path lies in [lower, upper] [m]; upper is that of a posture of the path."""
+
+    lower: float
+    upper: float
+    num_checks: int
+
+
+def joint_length(waypoints: Float64) -> float:
+    """Length [rad] of a path (W, J) in joint space."""
+    return float(np.sum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1)))
+
+
+def effector_length(model: ArmModel, postures: Float64, frame: str) -> tuple[float, float]:
+    """How far a frame goes [m] and turns [degrees] over postures (K, J), from each to the next."""
+    poses = [model.frame_pose(q, frame) for q in postures]
+    steps = [pose_error(a, b) for a, b in pairwise(poses)]
+    moved, turned = (sum(float(np.linalg.norm(step[part])) for step in steps) for part in (slice(3), slice(3, 6)))
+    return moved, float(np.degrees(turned))
+
+
+def least_clearance(clearance: Clearance, waypoints: Float64, *, tolerance: float = 1e-3) -> PathClearance:
+    """The least clearance of the path, everywhere on it and not only at samples, to a tolerance [m].
+
+    Over half an interval no row loses more than half of what it can lose over the whole: the bound of conservative
+    advancement, here as branch and bound. Raises InputError where the tolerance asks for too many pieces.
+    """
+    motion = np.diff(waypoints, axis=0)
+    speeds = np.maximum(clearance.speeds(motion), fixed.STILL_ROW)
+    edge, low, high = np.arange(len(motion)), np.zeros(len(motion)), np.ones(len(motion))
+    upper, num_checks = float(np.min(clearance.at(waypoints))), len(waypoints)
+    lower = upper
+    while len(edge):
+        if num_checks > MAX_PIECES:
+            raise InputError(f"tolerance: expected one that {MAX_PIECES} pieces reach, got {tolerance:g} m")
+        middle = (low + high) / 2
+        rows = clearance.rows(waypoints[edge] + middle[:, None] * motion[edge]) - ROUNDING
+        num_checks += len(edge)
+        upper = min(upper, float(np.min(rows)))
+        bound = np.min(rows - (high - low)[:, None] / 2 * speeds[edge], axis=1)
+        is_open = bound < upper - tolerance
+        lower = min(lower, float(np.min(bound[~is_open], initial=np.inf)))
+        edge, low, middle, high = edge[is_open], low[is_open], middle[is_open], high[is_open]
+        edge, low, high = np.concatenate([edge, edge]), np.concatenate([low, middle]), np.concatenate([middle, high])
+    return PathClearance(lower=lower, upper=upper, num_checks=num_checks)
