@@ -50,6 +50,15 @@ class Layout:
     docs: str = ""
 
 
+def marked(*alternatives: str) -> Callable[[Path], bool]:
+    """Whether a folder has all that one of the alternatives names: files, or folders where a name ends in /."""
+
+    def has(folder: Path, mark: str) -> bool:
+        return any(path.is_dir() if mark.endswith("/") else path.is_file() for path in folder.glob(mark))
+
+    return lambda folder: any(all(has(folder, mark) for mark in marks.split()) for marks in alternatives)
+
+
 class Lenses:
     """The different lenses of a layout's views, as cameras ``camera``, ``camera-1``, ``camera-2``, ..."""
 

@@ -42,6 +42,7 @@ from splatctrl_cli.datasets.layout import (
     described,
     image_size,
     images_of,
+    marked,
     paired_by_stamp,
     read_json,
 )
@@ -52,11 +53,6 @@ from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import MILLIMETRE, Float64
 
 TRAJECTORY = "lowres_wide.traj"
-
-
-def is_arkit(folder: Path) -> bool:
-    """Whether the folder is one video's, or holds its ``*_frames``."""
-    return _frames(folder) is not None
 
 
 def read_arkit(folder: Path, options: SourceOptions) -> Description:
@@ -140,11 +136,6 @@ ARKitScenes | `lowres_wide.traj`, `lowres_depth/`, also in `*_frames/` | world t
 FILE = "scene_camera.json"
 _REMEDY = "see BOP's format of datasets"
 COLOR_FOLDERS = ("rgb", "gray")
-
-
-def is_bop(folder: Path) -> bool:
-    """Whether the folder is a scene of BOP."""
-    return bool(_sensors(folder))
 
 
 def read_bop(folder: Path, options: SourceOptions) -> Description:
@@ -235,11 +226,6 @@ _NO_DEPTH = ("prob", "conf")  # in the names of maps beside depth
 _ESTIMATED = ("est", "mvsnet")  # in the names of folders with a network's depth, which stands behind a measured one
 
 
-def is_mvsnet(folder: Path) -> bool:
-    """Whether the folder is such a scene."""
-    return next(folder.glob(_CAMERAS), None) is not None
-
-
 def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
     """The folder as a description, a lens for each K; --depth-scale is metres per length of cameras and depth."""
     options.refuse(("intrinsics",), "an MVSNet scene", folder)
@@ -319,7 +305,13 @@ MVSNet scene: DTU's test set, BlendedMVS, Tanks and Temples, colmap2mvsnet | `ca
 """
 
 ENTRIES = (
-    Layout(name="ARKitScenes", order=7, matches=is_arkit, read=read_arkit, docs=_ARKIT_DOCS),
-    Layout(name="BOP scene", order=1, matches=is_bop, read=read_bop, docs=_BOP_DOCS),
-    Layout(name="MVSNet scene", order=10, matches=is_mvsnet, read=read_mvsnet, docs=_MVSNET_DOCS),
+    Layout(
+        name="ARKitScenes",
+        order=7,
+        matches=lambda folder: _frames(folder) is not None,
+        read=read_arkit,
+        docs=_ARKIT_DOCS,
+    ),
+    Layout(name="BOP scene", order=1, matches=lambda folder: bool(_sensors(folder)), read=read_bop, docs=_BOP_DOCS),
+    Layout(name="MVSNet scene", order=10, matches=marked(_CAMERAS), read=read_mvsnet, docs=_MVSNET_DOCS),
 )

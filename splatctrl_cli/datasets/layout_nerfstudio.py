@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.datasets.layout import Layout, Lenses, image_size
+from splatctrl_cli.datasets.layout import Layout, Lenses, image_size, marked
 from splatctrl_cli.datasets.poses import read_nerfstudio
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
@@ -32,11 +32,6 @@ _COEFFICIENTS = {
 SUPPLY = "add depth_file_path to each frame (16-bit PNG in mm, or .npy in m), or describe the files in a .toml"
 _DEPTHS = ("depth_file_path", "depth_path")
 _SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
-
-
-def matches(folder: Path) -> bool:
-    """Whether the folder has a transforms.json."""
-    return any((folder / name).is_file() for name in FILES)
 
 
 def read(folder: Path, options: SourceOptions) -> Description:
@@ -181,4 +176,4 @@ nerfstudio, instant-ngp, Blender | `transforms.json` or `transforms_train.json`,
     `transform_matrix`, without `applied_scale` | 1 mm, or `integer_depth_scale`; `.npy` too; of another size: nearest
     pixels | of the file or each frame; `mask_path` leaves pixels out
 """
-ENTRIES = (Layout(name="nerfstudio", order=4, matches=matches, read=read, docs=_DOCS),)
+ENTRIES = (Layout(name="nerfstudio", order=4, matches=marked(*FILES), read=read, docs=_DOCS),)

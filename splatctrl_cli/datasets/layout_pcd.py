@@ -25,7 +25,7 @@ from splatctrl_cli.datasets.folder_description import (
     ListedView,
     PosesTable,
 )
-from splatctrl_cli.datasets.layout import CAMERA, Layout, Pairs, by_numbers, described
+from splatctrl_cli.datasets.layout import CAMERA, Layout, Pairs, by_numbers, described, marked
 from splatctrl_cli.datasets.poses import stamp_of_text
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.image_file import MOST_PIXELS
@@ -101,11 +101,6 @@ def residual(points: Float64, camera: Intrinsics | None) -> float:
         return float("inf")
     v, u = np.nonzero(valid)
     return float(np.percentile(np.linalg.norm(project(camera, points[valid]) - np.stack([u, v], axis=1), axis=1), 95))
-
-
-def matches(folder: Path) -> bool:
-    """Whether the folder holds clouds."""
-    return next(folder.glob(f"*{SUFFIX}"), None) is not None
 
 
 def read(path: Path, options: SourceOptions) -> Description:
@@ -258,4 +253,4 @@ organised point clouds (extra `pcd`) | `X.pcd` of HEIGHT over 1, or a folder of 
     `VIEWPOINT` | z of the points in the camera; metres, or `--depth-scale` | fitted to the grid, to 0.5 px; so are
     `--intrinsics` checked
 """
-ENTRIES = (Layout(name="PCD clouds", order=12, matches=matches, read=read, suffix=SUFFIX, docs=_DOCS),)
+ENTRIES = (Layout(name="PCD clouds", order=12, matches=marked(f"*{SUFFIX}"), read=read, suffix=SUFFIX, docs=_DOCS),)

@@ -44,6 +44,7 @@ from splatctrl_cli.datasets.layout import (
     described,
     given_lens,
     images_of,
+    marked,
     own_depth_camera,
     paired_by_name,
     pinhole,
@@ -58,6 +59,7 @@ from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import MILLIMETRE, Float64
 
 INFO_NAMES = ("_info.txt", "info.txt")
+_IMAGES = "color/ depth/ pose/"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,12 +151,6 @@ def _lens(K: Float64, image: ImageFile, where: str) -> CameraTable:
     return lens
 
 
-def is_scannet(folder: Path) -> bool:
-    """Whether the folder is such an export."""
-    has_lenses = (folder / "intrinsic").is_dir() or (folder / "intrinsics_color.txt").is_file()
-    return has_lenses and all((folder / name).is_dir() for name in ("color", "depth", "pose"))
-
-
 def read_scannet(folder: Path, options: SourceOptions) -> Description:
     """The folder as a description; depth is registered to colour unless both are the same camera."""
     colors, depths = images_of(folder / "color"), images_of(folder / "depth")
@@ -200,11 +196,6 @@ class _Sens:
     depth_size: tuple[int, int]
     first: int
     num_frames: int
-
-
-def is_sens(folder: Path) -> bool:
-    """Whether the folder holds a sensor file."""
-    return next(folder.glob(f"*{SUFFIX}"), None) is not None
 
 
 def read_sens(path: Path, options: SourceOptions) -> Description:
@@ -340,6 +331,19 @@ ScanNet sensor file | `X.sens` of version 4, or a folder that holds one | camera
 """
 
 ENTRIES = (
-    Layout(name="ScanNet export", order=2, matches=is_scannet, read=read_scannet, docs=_SCANNET_DOCS),
-    Layout(name="ScanNet sensor file", order=11, matches=is_sens, read=read_sens, suffix=SUFFIX, docs=_SENS_DOCS),
+    Layout(
+        name="ScanNet export",
+        order=2,
+        matches=marked(f"{_IMAGES} intrinsic/", f"{_IMAGES} intrinsics_color.txt"),
+        read=read_scannet,
+        docs=_SCANNET_DOCS,
+    ),
+    Layout(
+        name="ScanNet sensor file",
+        order=11,
+        matches=marked(f"*{SUFFIX}"),
+        read=read_sens,
+        suffix=SUFFIX,
+        docs=_SENS_DOCS,
+    ),
 )

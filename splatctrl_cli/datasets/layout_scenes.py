@@ -53,6 +53,7 @@ from splatctrl_cli.datasets.layout import (
     given_lens,
     image_size,
     images_of,
+    marked,
     own_depth_camera,
     paired_by_name,
     pinhole,
@@ -96,11 +97,6 @@ class _Cameras:
     T_pose_color: Float64 = field(default_factory=lambda: np.eye(4))
     depth_scale: float = MILLIMETRE
     notes: tuple[str, ...] = ()
-
-
-def is_frames(folder: Path) -> bool:
-    """Whether the folder, or a sequence in it, has frames with a pose each."""
-    return any(next(folder.glob(f"{sequence}frame-*.pose.txt"), None) is not None for sequence in _SEQUENCES)
 
 
 def read_frames(folder: Path, options: SourceOptions) -> Description:
@@ -269,11 +265,6 @@ _FORMS = (  # trajectory, colour, depth
 )
 
 
-def is_replica(folder: Path) -> bool:
-    """Whether the folder has the trajectory and images of one of both."""
-    return _form(folder) is not None
-
-
 def read_replica(folder: Path, options: SourceOptions) -> Description:
     """The folder as a description."""
     form = _form(folder)
@@ -344,7 +335,19 @@ Replica of Semantic-NeRF | `traj_w_c.txt`, `rgb/rgb_*`, `depth/depth_*` | a matr
 """
 
 ENTRIES = (
-    Layout(name="7-Scenes", order=3, matches=is_frames, read=read_frames, docs=_FRAMES_DOCS),
+    Layout(
+        name="7-Scenes",
+        order=3,
+        matches=marked(*(f"{sequence}frame-*.pose.txt" for sequence in _SEQUENCES)),
+        read=read_frames,
+        docs=_FRAMES_DOCS,
+    ),
     Layout(name="Open3D scene", order=9, matches=is_redwood, read=read_redwood, docs=_REDWOOD_DOCS),
-    Layout(name="Replica", order=6, matches=is_replica, read=read_replica, docs=_REPLICA_DOCS),
+    Layout(
+        name="Replica",
+        order=6,
+        matches=lambda folder: _form(folder) is not None,
+        read=read_replica,
+        docs=_REPLICA_DOCS,
+    ),
 )

@@ -34,6 +34,7 @@ from splatctrl_cli.datasets.layout import (
     Layout,
     described,
     images_of,
+    marked,
     paired_by_name,
     paired_by_stamp,
     pinhole,
@@ -105,11 +106,6 @@ _BONN_NOTE = (
 )
 
 
-def is_tum(folder: Path) -> bool:
-    """Whether the folder lists its images in rgb.txt and depth.txt."""
-    return all((folder / name).is_file() for name in ("rgb.txt", "depth.txt"))
-
-
 def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
     """The folder as a description: pairs within the pairing tolerance, poses interpolated."""
     colors, depths = listed(folder / "rgb.txt"), listed(folder / "depth.txt")
@@ -179,12 +175,6 @@ def marker_to_camera(T_ground_truth: Float64) -> Float64:
     return np.asarray(_BONN_T_ROS.T @ T_ground_truth @ _BONN_T_ROS @ rigid(_BONN_T_M, "Bonn's T_m"))
 
 
-def is_icl(folder: Path) -> bool:
-    """Whether the folder is a sequence of ICL-NUIM."""
-    has_images = all((folder / name).is_dir() for name in ("rgb", "depth"))
-    return has_images and next(folder.glob(_TRAJECTORY), None) is not None
-
-
 def read_icl(folder: Path, options: SourceOptions) -> Description:
     """The folder as a description, right-handed."""
     colors, depths = images_of(folder / "rgb"), images_of(folder / "depth")
@@ -225,12 +215,6 @@ ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
 """
 
 
-def is_sun3d(folder: Path) -> bool:
-    """Whether the folder is such a sequence."""
-    has_folders = all((folder / name).is_dir() for name in ("image", "depth", "extrinsics"))
-    return has_folders and (folder / "intrinsics.txt").is_file()
-
-
 def read_sun3d(folder: Path, options: SourceOptions) -> Description:
     """The folder as a description; images within the pairing tolerance of a depth image."""
     colors, depths = _by_stamp(folder / "image"), _by_stamp(folder / "depth")
@@ -269,7 +253,13 @@ SUN3D | `image/`, `depth/`, `extrinsics/`, `intrinsics.txt` | the newest file of
 """
 
 ENTRIES = (
-    Layout(name="TUM RGB-D", order=0, matches=is_tum, read=read_tum_folder, docs=_TUM_DOCS),
-    Layout(name="ICL-NUIM", order=5, matches=is_icl, read=read_icl, docs=_ICL_DOCS),
-    Layout(name="SUN3D", order=8, matches=is_sun3d, read=read_sun3d, docs=_SUN3D_DOCS),
+    Layout(name="TUM RGB-D", order=0, matches=marked("rgb.txt depth.txt"), read=read_tum_folder, docs=_TUM_DOCS),
+    Layout(name="ICL-NUIM", order=5, matches=marked(f"rgb/ depth/ {_TRAJECTORY}"), read=read_icl, docs=_ICL_DOCS),
+    Layout(
+        name="SUN3D",
+        order=8,
+        matches=marked("image/ depth/ extrinsics/ intrinsics.txt"),
+        read=read_sun3d,
+        docs=_SUN3D_DOCS,
+    ),
 )
