@@ -121,12 +121,13 @@ class Desk:
         self._made(*made, "-o", folder / "scene")
         drive = ("replay", log / "log.mcap", "--scene", folder / "scene", *robot, *quiet, "--mode", "closed-loop")
         short = (*drive, "--set", "control.max_time=0.2", "--set", "planner.max_iterations=20")
+        stalling = [f"--set=control.{name}" for name in ("max_detours=1", "stall_time=0.02", "stall_speed=10")]
         coarse = ("--set", "field.max_loss=1", "--set", "field.voxel=0.05")
         self.commands: dict[str, tuple[object, ...]] = {
             **dict.fromkeys(("scene", "occupancy", "human"), made),
             "field": ("sdf-bake", folder / "scene", *quiet, *coarse, "--no-report"),
             **dict.fromkeys(("control", "verdict"), short),
-            "planner": (*short, "--baseline", "birrt"),
+            "planner": (*short, *stalling),
         }
 
     def ask(self, case: Case, limit: float = TIME_LIMIT) -> Outcome:
