@@ -47,16 +47,6 @@ USERS_OWN = {  # what stands for a user's data in commands that are shown; the c
 TOO_LONG = {  # for a test: minutes; the page has their figures
     "reconstruct docs/examples/apc_shelf.toml --root SCENE --max-splats 10000 -o shelf",
     "sweep demo_output/audit --over KEY=A:B",
-    "study table2 --trials 20 -o out/table2",
-    "study table2 --methods ours,tsdf,truth --shard 1/3",
-    "study table2 --made docs/table2.csv -o out/table2",
-    "study table2 --problem cubby-0007 -o out/one",
-    "study ablation --trials 12 -o out/ablation",
-    "study dtu --problems DTU -o out/dtu",
-    "study dtu -o out/dtu",
-    "study ablation --trials 12 --width 160 -o out/ablation",
-    "study scenes -o out/scenes",
-    "study shared-workspace -o out/shared",
     "score shelf --reference docs/examples/apc_shelf.toml --root SCENE",
 }
 RUN_BY_GOLDEN = ("README.md", "start.md")  # all their commands: tests/tools/test_golden.py
@@ -134,7 +124,7 @@ def test_every_option_that_a_page_names_is_one_that_a_command_takes(page: Path) 
     }
     assert len(taken) > 100
     left = {word for words in GONE for word in words.split() if word.startswith("--")}
-    more = {"CHANGELOG.md": left, "study.md": of_experiments()} | FOREIGN
+    more = {"CHANGELOG.md": left | of_experiments(), "study.md": of_experiments()} | FOREIGN
     assert options_in(page.read_text(encoding="utf-8")) <= taken | more.get(page.name, set())
 
 
@@ -248,7 +238,7 @@ def test_every_page_and_heading_that_the_code_names_is_there() -> None:
         for path in ROOT.glob(f"{folder}/**/*.py")
         for found in re.findall(r"\bdocs/([a-z]+\.md|\w+\.csv)(?:, ([A-Z]\w+))?", path.read_text(encoding="utf-8"))
     ]
-    assert len(named) > 30
+    assert len(named) > 20
     for path, page, heading in named:
         assert (ROOT / "docs" / page).is_file(), f"{path}: {page}"
         assert not heading or heading.lower() in anchors_on(ROOT / "docs" / page), f"{path}: {page}, {heading}"
