@@ -1,5 +1,7 @@
 """The barrier rows of III-E: of the moving spheres against the scene, and of the pairs of spheres of the arm."""
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,8 +44,8 @@ class SceneRows(BarrierTerm):
 
     def in_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
         """The same rows in another field, which is of `balls` (None: links' surfaces are not measured)."""
-        other = object.__new__(SceneRows)
-        other.__dict__.update(self.__dict__, _field=field, _balls=balls)
+        other = copy(self)
+        other._field, other._balls = field, balls
         return other
 
     def by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:

@@ -6,6 +6,7 @@ slack per external row, of either sign, and ``x - J v`` the paper's delta_x, whi
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -99,8 +100,8 @@ class RowBuilder:
 
     def with_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
         """The same rows in another field; see `SceneRows.in_field`."""
-        other = object.__new__(RowBuilder)
-        other.__dict__.update(self.__dict__, scene=self.scene.in_field(field, balls))
+        other = copy(self)
+        other.scene = self.scene.in_field(field, balls)
         return other
 
     def at(self, state: State) -> Rows:

@@ -1,6 +1,7 @@
 """One step of the QP-IK controller of III-E: query the field, build the rows, solve, look at the field again."""
 
 from collections.abc import Collection, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -143,8 +144,8 @@ class QpIkController:
 
     def with_field(self, field: DistanceField, balls: BallDistance | None = None) -> "QpIkController":
         """The same controller on another field (a newer scene); see `SceneRows.in_field`."""
-        other = object.__new__(QpIkController)
-        other.__dict__.update(self.__dict__, _builder=self._builder.with_field(field, balls))
+        other = copy(self)
+        other._builder = self._builder.with_field(field, balls)
         return other
 
     def step(

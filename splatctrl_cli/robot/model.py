@@ -5,6 +5,7 @@ Only the kinematics of the URDF is built (Pinocchio), so meshes need not be ther
 
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import copy
 from functools import partial
 from pathlib import Path
 
@@ -214,8 +215,8 @@ class RobotModel:
         return np.zeros(len(self.self_pairs())) if self._allowance is None else self._allowance
 
     def _changed(self, **attributes: object) -> "RobotModel":
-        other = object.__new__(RobotModel)
-        other.__dict__.update(self.__dict__, **attributes)
+        other = copy(self)
+        other.__dict__.update(attributes)
         return other
 
     @property
