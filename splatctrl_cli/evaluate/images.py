@@ -61,11 +61,6 @@ def ssim_map(
     return np.asarray(luminance * structure)
 
 
-def filled(image: NDArray[np.floating], mask: Bool, fill: float) -> Float64:
-    """The image (H, W, 3) with `fill` outside the mask (H, W)."""
-    return np.where(mask[:, :, None], image, fill).astype(np.float64)
-
-
 def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool, fill: float) -> float:
     """SSIM of images (H, W, 3) in [0, 1] that are `fill` outside the mask (H, W), as NeRF's papers print it.
 
@@ -76,7 +71,7 @@ def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating],
     """
     if min(mask.shape) < SSIM_BOX or not mask.any():
         return math.nan
-    x, y = (filled(picture, mask, fill) for picture in (image, reference))
+    x, y = (np.where(mask[:, :, None], picture, fill).astype(np.float64) for picture in (image, reference))
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = (
         uniform_filter(picture, size=(SSIM_BOX, SSIM_BOX, 1)) for picture in (x, y, x * x, y * y, x * y)
     )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.grid_files.grid_format import CHUNK, GridFormat, check_grid
 from splatctrl_cli.libraries import trimesh
@@ -65,12 +65,7 @@ def iso_surface(grid: DistanceGrid) -> Surface:
 
 
 def write_surface(path: Path, surface: Surface) -> None:
-    """Write by the suffix: ``.ply`` and ``.obj`` with normals at the vertices, ``.stl`` with those of the faces.
-
-    Raises UsageError for another suffix.
-    """
-    if path.suffix not in SUFFIXES:
-        raise UsageError(f"{path}: expected a suffix of {', '.join(SUFFIXES)}, got {path.suffix}")
+    """Write by the suffix: ``.ply`` and ``.obj`` with normals at the vertices, ``.stl`` with those of the faces."""
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     options: dict[str, dict[str, object]] = {
         ".ply": {"vertex_normal": True},
