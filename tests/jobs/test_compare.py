@@ -58,6 +58,12 @@ def compared(*runs: Path, **more: Path) -> CompareResult:
     return compare(CompareRequest(runs=runs, **more))
 
 
+def test_figures_of_an_older_run_that_left_are_not_compared(audit: Path, tmp_path: Path) -> None:
+    before = edited(audit, tmp_path / "before", birrt_success=1, standstill_stopped_s=0.0)
+    result = compared(before, audit)
+    assert (result.verdict.exit_code, result.figures) == (0, ())
+
+
 def test_a_run_beside_itself_is_no_regression(audit: Path) -> None:
     result = compared(audit, audit)
     assert (result.verdict.exit_code, result.verdict.label) == (0, "no regression")

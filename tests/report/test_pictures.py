@@ -28,7 +28,6 @@ from splatctrl_cli.report.replay_pictures import (
     column,
     commands_picture,
     envelope,
-    methods_picture,
     open_loop_picture,
     spans,
 )
@@ -100,13 +99,6 @@ def draw_reliability(path: Path) -> None:
     reliability_picture(path, {"calibrated": curve, "paper": curve})
 
 
-def draw_methods(path: Path) -> None:
-    gap = np.linspace(0.1, 0.02, 50)
-    gap[10:20] = np.nan
-    curves = {"one": np.linspace(0.05, 0.08, 80), "two": gap, "three": np.full(30, 0.06), "none": np.full(30, np.nan)}
-    methods_picture(path, curves, 0.01, 0.02)
-
-
 NUM = 6000  # states: more than a picture has columns
 SECONDS = np.linspace(0, 5, NUM)
 EVENTS = {"below-margin": [(1.0, 2.0), (4.0, 4.0)], "unknown-space": [(0.0, 5.0)], "stale-map": []}
@@ -138,7 +130,7 @@ def draw_open_loop(path: Path) -> None:
 
 DRAWN = (
     *(draw_comparison, draw_slice, draw_slices, draw_slices_of_nothing, draw_gradient),
-    *(draw_gradient_of_nothing_outside, draw_probability, draw_large_slice, draw_reliability, draw_methods),
+    *(draw_gradient_of_nothing_outside, draw_probability, draw_large_slice, draw_reliability),
     *(draw_clearance, draw_quiet_clearance, draw_commands, draw_open_loop),
 )
 
