@@ -127,31 +127,8 @@ def other_scans(protocol: Mapping[str, Any], scans: Sequence[str]) -> list[str]:
 
 def score_verdict(report: Mapping[str, Any], require: Sequence[str], *, is_damaged: bool) -> Verdict:
     """The verdict on a report: that there are views, what speaks against its figures, and each gate."""
-    metrics = report["metrics"]
-    num_scans = metrics.get("num_scans")
-    of_scans = "" if num_scans is None else f" of {counted(num_scans, 'scan')}"
-    return judged(
-        dict.fromkeys(NAMES_WITH_CHANGES, None) | metrics,
-        report["warnings"],
-        require,
-        num_views=metrics["num_views"],
-        counts=counts_of(report),
-        scope=f"{counted(metrics['num_views'], 'view')}{of_scans}",
-        is_damaged=is_damaged,
-    )
-
-
-def judged(
-    metrics: Mapping[str, float | None],
-    warnings: Sequence[str],
-    require: Sequence[str],
-    *,
-    num_views: float,
-    counts: Mapping[str, int],
-    scope: str,
-    is_damaged: bool = False,
-) -> Verdict:
-    """The verdict on figures over `num_views` views; counts: how many views each figure rests on."""
+    metrics, counts = report["metrics"], counts_of(report)
+    num_views, num_scans = metrics["num_views"], metrics.get("num_scans")
     compared = Reason(
         criterion="views",
         outcome=Outcome.PASSED if num_views else Outcome.NOT_EVALUABLE,
@@ -160,8 +137,10 @@ def judged(
         threshold=1.0,
         count=int(num_views),
     )
-    reasons = [compared, *(noted("score", line) for line in warnings), *gate_reasons(require, metrics, counts)]
-    return verdict_of("score", reasons, scope=scope, is_damaged=is_damaged, counts=counts)
+    notes = [noted("score", line) for line in report["warnings"]]
+    gates = gate_reasons(require, dict.fromkeys(NAMES_WITH_CHANGES, None) | metrics, counts)
+    scope = counted(num_views, "view") + ("" if num_scans is None else f" of {counted(num_scans, 'scan')}")
+    return verdict_of("score", [compared, *notes, *gates], scope=scope, is_damaged=is_damaged, counts=counts)
 
 
 def counts_of(report: Mapping[str, Any]) -> dict[str, int]:

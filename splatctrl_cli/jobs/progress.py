@@ -48,20 +48,20 @@ class Wait:
     def step(self) -> None:
         self.at(self._done + 1)
 
-    def at(self, done: int, more: str = "", *, is_told: bool = False) -> None:
-        """`done` steps are; it is said with `more` where the last line is `TELL_S` ago, or `is_told` asks for it."""
+    def at(self, done: int) -> None:
+        """`done` steps are; it is said where the last line is `TELL_S` ago."""
         self._done, now = done, time.monotonic()
         self._first = self._first or ((now, done) if done else None)
         if self._total is not None and done > self._total:
             return  # of what comes after it
-        if not is_told and now - self._told < TELL_S:
+        if now - self._told < TELL_S:
             return
         self._told, left = now, ""
         if self._total is not None and self._first is not None and done > self._first[1]:
             begun, before = self._first
             left = f", about {duration((now - begun) * (self._total - done) / (done - before))} left"
         of = "" if self._total is None else f" of {self._total}"
-        self._progress.log(f"{self._what}: {done}{of} {self._unit}{more}{left if done != self._total else ''}")
+        self._progress.log(f"{self._what}: {done}{of} {self._unit}{left if done != self._total else ''}")
 
 
 def duration(seconds: float) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -94,10 +94,20 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
             learned=[part.words(fitted.rows[0].stamp_ns) for part in learned],
         )
         verdict = reconstruct_verdict(made, request.require)
-        resolved = replace(request, config=fitted.config)
-        written = written_run(partial, resolved, inputs, made.metrics, verdict, stopwatch)
+        write_run(
+            partial,
+            command="reconstruct",
+            config=fitted.config.as_dict(),
+            inputs=inputs,
+            metrics=made.metrics,
+            stopwatch=stopwatch,
+            seed=request.seed,
+            verdict=verdict.as_dict(),
+        )
     removed = {name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed}
-    return replace(written, removed=removed)
+    return ReconstructResult(
+        out=request.out, metrics=made.metrics, verdict=verdict, removed=removed, seconds=stopwatch.seconds
+    )
 
 
 def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[str, Any]:
@@ -127,28 +137,6 @@ def _learned(
     if robot.self_model is not None:
         savez(folder / SELF_MODEL, robot.self_model.arrays())
     return robot
-
-
-def written_run(
-    folder: Path,
-    request: ReconstructRequest,
-    inputs: Mapping[str, str],
-    metrics: Mapping[str, Any],
-    verdict: Verdict,
-    stopwatch: Stopwatch,
-) -> ReconstructResult:
-    """Write ``run.json``, and return what it says."""
-    write_run(
-        folder,
-        command="reconstruct",
-        config=request.config.as_dict(),
-        inputs=inputs,
-        metrics=metrics,
-        stopwatch=stopwatch,
-        seed=request.seed,
-        verdict=verdict.as_dict(),
-    )
-    return ReconstructResult(out=request.out, metrics=metrics, verdict=verdict, removed={}, seconds=stopwatch.seconds)
 
 
 def declarations_of(path: Path | None, robot: RobotModel | None) -> Declarations:

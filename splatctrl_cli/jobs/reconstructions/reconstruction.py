@@ -46,14 +46,6 @@ def training_cameras(source: RecordSource) -> list[str]:
     return cameras
 
 
-def no_frame(source: RecordSource, cameras: Sequence[str]) -> InputError:
-    """For a recording without a frame to train on."""
-    return InputError(
-        f"{source.name}: no frame with colour, depth and pose from camera {', '.join(cameras)}",
-        remedy="'splatctrl info' says what the input lacks",
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class ReconstructRequest(RunOptions):
     """One reconstruction of `source` into the folder `out`.
@@ -145,7 +137,10 @@ class Reconstruction:
         if self.fitter is None and self._early is not None:
             self._workspace(self._early)  # says that there is no depth
         if self.fitter is None:
-            raise no_frame(self.source, self.cameras)
+            raise InputError(
+                f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
+                remedy="'splatctrl info' says what the input lacks",
+            )
         if not any(row.alive for row in self.rows):
             raise InputError(
                 f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",

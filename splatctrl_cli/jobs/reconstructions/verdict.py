@@ -60,7 +60,7 @@ def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
             *reasons,
             *_held(metrics),
             *_unbent(metrics),
-            *loss_notes(made.loss),
+            *_loss_notes(made.loss),
             *gate_reasons(require, {name: metrics[name] for name in GATED}, counts),
         ],
         scope=f"{metrics['time_steps']} time steps of {', '.join(metrics['cameras'])}, {metrics['splats']} splats",
@@ -96,7 +96,7 @@ def _unbent(metrics: Mapping[str, Any]) -> Iterator[Reason]:
         yield noted("depth", f"{camera}: freed of a bend of at most {100 * bend['largest']:.1f} % of the depth")
 
 
-def loss_notes(loss: LossReport) -> Iterator[Reason]:
+def _loss_notes(loss: LossReport) -> Iterator[Reason]:
     """What the input lost."""
     if loss.invalid_depth:
         yield noted("input", f"{loss.invalid_depth} pixels of depth NaN, infinite, negative or 65535: taken as none")
@@ -104,10 +104,13 @@ def loss_notes(loss: LossReport) -> Iterator[Reason]:
         yield noted("input", text)
 
 
-def map_reason(num_splats: int, num_balls: int = 0) -> Reason:
-    """Whether a map holds anything that a distance could be taken to."""
-    is_empty = num_splats + num_balls == 0
-    return Reason(
+def _map(made: Reconstructed) -> Iterator[Reason]:
+    """Whether there is anything that a distance could be taken to: splats, and occupied voxels without one."""
+    metrics, scene = made.metrics, made.config.scene
+    num = metrics["unrepresented_voxels"]
+    num_splats = metrics["splats"] - metrics["robot_splats"]
+    is_empty = num_splats + num == 0
+    yield Reason(
         criterion="map",
         outcome=Outcome.NOT_EVALUABLE if is_empty else Outcome.PASSED,
         sentence="it is empty: no splat of an object is left" if is_empty else f"{num_splats} splats of objects",
@@ -116,15 +119,8 @@ def map_reason(num_splats: int, num_balls: int = 0) -> Reason:
         remedy="give a --box that holds what the cameras saw, and check the depth with 'splatctrl check'"
         if is_empty
         else "",
-        count=num_splats + num_balls,
+        count=num_splats + num,
     )
-
-
-def _map(made: Reconstructed) -> Iterator[Reason]:
-    """Splats, and the voxels that are occupied and have none."""
-    metrics, scene = made.metrics, made.config.scene
-    num = metrics["unrepresented_voxels"]
-    yield map_reason(metrics["splats"] - metrics["robot_splats"], num)
     if num:
         yield note(
             criterion="represented space",
