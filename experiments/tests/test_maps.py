@@ -1,18 +1,20 @@
 """Maps of one simulated problem, and which of their ways a planner takes."""
 
-from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from experiments import judge, maps, trial
+from experiments.densify import GaussianSettings
+from experiments.gaussian_fitter import GaussianFitter
 from experiments.maps import Map
 from experiments.problems import Problem, Views, read_problem, views_of
 from experiments.trial import Rig
 from experiments.ways import Way, Ways
 from splatctrl_cli.config import Config
 from splatctrl_cli.files.output import Stopwatch
-from splatctrl_cli.jobs.replays.compare import Certified
+from splatctrl_cli.jobs.replays.detours import Certified
 from splatctrl_cli.records import SplatSet
 from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.scene.self_mask import self_mask
@@ -74,9 +76,12 @@ def test_a_controller_keeps_from_the_map_but_where_the_arm_stands_and_is_to_go(p
     np.testing.assert_allclose(distance[1:], [0.0, -0.02], atol=1e-5)
 
 
-def test_the_gaussians_of_the_baseline_lie_on_the_things_and_not_on_the_arm(problem: Problem, views: Views) -> None:
-    config = replace(Config(), gaussians=replace(Config().gaussians, iterations=60))
-    made = maps.gaussian_map(problem, views, config, threads=1)
+def test_the_gaussians_of_the_baseline_lie_on_the_things_and_not_on_the_arm(
+    problem: Problem, views: Views, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quick = partial(GaussianFitter, settings=GaussianSettings(iterations=60))
+    monkeypatch.setattr(maps, "GaussianFitter", quick)
+    made = maps.gaussian_map(problem, views, Config(), threads=1)
     on_table = np.array([[0.6, y, 0.0] for y in np.linspace(-0.6, 0.6, 41)])
     others = [p for p in problem.things if p.name != "table_0"]
     clear = on_table[distance_to(others, on_table, 0) > 0.1]
