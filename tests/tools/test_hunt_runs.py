@@ -98,6 +98,7 @@ FOUND = {  # runs that were once called safe, by what was wrong with that
     "a-thing-in-the-hand-that-a-wide-tolerance-took-for-the-robot": (101, 359),
     "a-thing-that-came-and-went-between-two-maps": (109, 283),
     "a-voxel-without-an-answer-whose-face-is-nearer-than-its-centre": (47, 6),
+    "a-shiny-cylinder-that-every-camera-measures-behind-its-place": (505, 45),
 }
 
 
