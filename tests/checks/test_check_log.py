@@ -366,6 +366,7 @@ def test_one_camera_of_three_with_another_clock_is_found(tmp_path: Path) -> None
     report = checked(broken_log(tmp_path / "log.mcap", edited("/cam1/", shifted(-100_000_000)), CAMERAS_3))
     found = [f for f in report.findings if f.code == "clock-offset"]
     assert [(f.where.split("/")[1:3], f.value) for f in found] == [(["cam1", "color"], 100), (["cam1", "depth"], 100)]
+    assert all("stamps are 100 ms before those of the other cameras' images" in f.what for f in found)
 
 
 def test_files_that_were_logged_far_apart_are_found() -> None:

@@ -133,6 +133,9 @@ def test_degrees_are_refused_and_radians_are_not(model: RobotModel) -> None:
     check_angles(model, states(q + 1.0), "log")  # beyond limits is for the audit to say
     check_angles(model, states(q[:, ::-1]), "log")  # another joint order
     check_angles(model, states(np.degrees(q) * 100), "log")  # degrees of no posture of this robot either
+    one = np.degrees(q) * 100
+    one[:, 0] = np.degrees(q[:, 0])
+    check_angles(model, states(one), "log")  # a joint that fits does not make degrees of the others
     with pytest.raises(InputError, match=r"log: joint .* which would fit as degrees") as caught:
         check_angles(model, states(np.degrees(q)), "log")
     assert 'unit = "deg"' in caught.value.remedy

@@ -4,6 +4,8 @@ stalls.
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,7 +13,8 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.goals import Detour
-from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
+from splatctrl_cli.control.replay import Outcome, ReplayTask, Waypoint, _Course, closed_loop
+from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.path import timed
@@ -157,6 +160,18 @@ def test_an_arm_that_stalls_goes_on_by_the_planned_way() -> None:
     np.testing.assert_array_equal(goal, TASK.T_world_goal)
     assert min(step.clearance for step in trace.steps) >= WITH_DETOURS.margin - 1e-3
     assert np.min(trace.position[:, 1]) < 0.9 * FOLDED
+
+
+def test_a_waypoint_that_is_reached_begins_the_time_of_a_stall_anew() -> None:
+    config = ControlConfig()
+    still, num_back = np.array([0.3, 0.4]), round(config.stall_time / config.period)
+    via = (Waypoint(T_world_goal=ARM.frame_pose(still, "tip"), posture=None),)
+    course = _Course(ARM, config, replace(TASK, via=via), None)
+    arrived = cast("ControlStep", SimpleNamespace(pose_error=np.zeros(6)))
+    assert not any(course.has_stalled(0, index, still) for index in range(num_back))
+    assert not course.has_ended(0, num_back, arrived)
+    assert not any(course.has_stalled(0, num_back + index, still) for index in range(num_back))
+    assert course.has_stalled(0, 2 * num_back, still)
 
 
 @pytest.mark.parametrize("ways", [0, 2])

@@ -9,6 +9,7 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import MULTIPLIER
 from splatctrl_cli.control import barriers
 from splatctrl_cli.control.fallbacks import Rung, is_usable
+from splatctrl_cli.control.open_loop import is_shaped
 from splatctrl_cli.control.preconditions import static_violations
 from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, unsolved
 from splatctrl_cli.control.step import QpIkController
@@ -162,6 +163,7 @@ def test_a_step_that_turns_out_worse_than_promised_is_scaled_back() -> None:
     assert reach > 0
     step = controller(Cliff(tip + 0.3 * reach)).step(q, target)
     assert step.scale == 0.25
+    assert is_shaped(step) and not is_shaped(free)
     np.testing.assert_allclose(step.velocity, 0.25 * free.velocity, atol=1e-5)
     blocked = controller(Cliff(tip + 1e-9)).step(q, target)
     assert blocked.rung is Rung.HOLD and np.all(blocked.velocity == 0.0)

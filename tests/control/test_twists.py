@@ -76,6 +76,20 @@ def test_axes_of_a_link_turn_with_it() -> None:
         np.testing.assert_allclose(velocity, expected, atol=2e-3)
 
 
+def test_angular_twists_turn_with_the_link_too() -> None:
+    """The link's x axis is the world's y, its y the world's z."""
+    R = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+
+    class Turned(PlanarArm):
+        def frame_pose(self, q: Float64, frame: str) -> Float64:
+            T = np.eye(4)
+            T[:3, :3] = R
+            return T
+
+    found = track([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], axes="tip").asked(Turned(), START, 0, 0.5)
+    np.testing.assert_allclose(found, [0.3, 0.1, 0.2, 0.6, 0.4, 0.5])
+
+
 @pytest.mark.parametrize("asked", [[-0.1, 0.0, 0, 0, 0, 0], [0.0, 0.1, 0, 0, 0, 0]])
 def test_open_loop_asks_for_the_twist_and_not_for_what_was_done(asked: list[float]) -> None:
     num = 5

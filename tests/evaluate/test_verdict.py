@@ -121,6 +121,14 @@ def test_a_gate_is_held_to_its_last_digit_and_strict_is_strict(gate: str, value:
     assert (found.value, found.threshold) == (value, float(gate.lstrip("<>=")))
 
 
+@pytest.mark.parametrize("gates", [["a>=5", "b>=1"], ["b>=1", "a>=5"]])
+def test_a_gate_that_holds_hides_none_that_fails(gates: list[str]) -> None:
+    reasons = gate_reasons(gates, {"a": 1.0, "b": 2.0}, {"a": 1, "b": 1})
+    found = verdict_of("replay", reasons, scope="")
+    assert (found.outcome, found.exit_code, found.exit_code_of(("--require",))) == (Outcome.FAILED, 1, 1)
+    assert [reason.criterion for reason in found.decisive] == ["--require a>=5"]
+
+
 def test_the_first_time_is_that_of_a_broken_gate_alone() -> None:
     asked: list[str] = []
 

@@ -68,7 +68,7 @@ def test_statistics_count_what_the_grid_holds() -> None:
     sdf[0], sdf[1, 0, 0] = np.nan, -0.1
     gradient = np.zeros((*shape, 3), np.float32)
     gradient[..., 2] = np.where(np.isnan(sdf), np.nan, 1.0)
-    gradient[2, 0, 0] = (0.0, 0.3, 0.4)
+    gradient[2, 0, 0] = (0.0, 0.294, 0.392)
     gradient[2, 0, 1] = (0.0, 0.0, 7.0)
     observed = np.zeros(shape, np.uint8)
     observed[1] = 1
@@ -87,9 +87,9 @@ def test_statistics_count_what_the_grid_holds() -> None:
     assert found.excess["se"].largest == pytest.approx(0.25)
     assert found.gradient is not None
     histogram = {index: count for index, count in enumerate(found.gradient.histogram) if count}
-    assert histogram == {10: 1, 20: 6, 40: 1}, "lengths 0.5, 1, and 7 in the last"
+    assert histogram == {10: 1, 20: 6, 40: 1}, "lengths 0.49, 1, and 7 in the last"
     assert found.gradient.largest == 7.0
-    assert found.gradient.mean == pytest.approx((0.5 + 6 + 7) / 8)
+    assert found.gradient.mean == pytest.approx((0.49 + 6 + 7) / 8)
     assert found.gradient.share_near_one == pytest.approx(6 / 8)
 
 

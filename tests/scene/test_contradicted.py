@@ -132,3 +132,11 @@ def test_a_fitted_scene_knows_it(depth: float, kind: EvidenceClass) -> None:
     fitter.step([block_measured_at(depth), frame(x=BESIDE, y=0.3, camera="cam1")])
     _, classes = fitter.known_voxels().seen.look(np.array([[0.0, 0.0, 0.4]]))
     assert classes.tolist() == [kind]
+
+
+def test_a_fitted_scene_proves_nothing_free_by_a_ray_whose_end_another_camera_sees_through() -> None:
+    fitter = SceneFitter(SceneConfig(max_splats=300, first_iterations=1, iterations_per_step=1), CONFIG, WORKSPACE)
+    fitter.step([block_measured_at(0.7), frame(x=BESIDE, y=0.3, camera="cam1")])
+    before = np.array([[0.0, 0.045, 0.58], [0.0, -0.045, 0.58]])  # on rays to the block; the other sees past one end
+    _, classes = fitter.known_voxels().seen.look(before)
+    assert classes.tolist() == [EvidenceClass.CONTRADICTED, EvidenceClass.FREE]

@@ -16,7 +16,7 @@ from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.labels import human_splats, relabel, robot_splats, shown_kinds
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
-from splatctrl_cli.scene.self_mask import PixelKind, self_mask
+from splatctrl_cli.scene.self_mask import PixelKind, object_mask, self_mask
 from splatctrl_cli.voxels import SOLID, SWEPT
 from tests.scene.wall import WORKSPACE, frame
 
@@ -227,6 +227,17 @@ def test_a_splat_is_what_the_pixel_shows_whose_depth_it_explains() -> None:
     points = np.float32([[0.0, 0.0, 0.4], [0.0, 0.0, 0.38], [0.0, 0.0, 0.0], [0.3, 0.2, 0.0], [0.3, 0.2, 0.1]])
     kinds = shown_kinds(points, [(view, mask)], OccupancyConfig())
     assert kinds.tolist() == [PixelKind.ROBOT, *[PixelKind.NOTHING] * 2, PixelKind.OBJECT, PixelKind.NOTHING]
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_of_two_cameras_the_one_that_explains_a_splat_best_says_what_it_is(is_first: bool) -> None:
+    """The pixel of the robot explains it to 1 mm, that of an object in the other image to 15 mm."""
+    config, shape = OccupancyConfig(), frame().depth.shape
+    ours, other = (replace(frame(), depth=np.full(shape, depth, np.float32)) for depth in (1.001, 1.015))
+    robot = replace(object_mask(ours), kinds=np.full(shape, PixelKind.ROBOT, np.uint8))
+    seen = [(ours, robot), (other, object_mask(other))]
+    kinds = shown_kinds(np.float32([[0.0, 0.0, 0.0]]), seen if is_first else seen[::-1], config)
+    assert kinds.tolist() == [PixelKind.ROBOT]
 
 
 def test_what_the_robot_hides_keeps_its_label_and_what_it_shows_is_its_own() -> None:
