@@ -23,7 +23,7 @@ from tests.conftest import ROOT
 from tests.logs.make_log import LogRecipe, make_log
 
 NO_OUTPUT = (  # or one where it goes on
-    *("info", "check", "batch", "sweep", "study", "compare", "config", "completion", "help"),
+    *("info", "check", "batch", "sweep", "compare", "config", "completion", "help"),
 )
 WRITERS = [command for command in COMMANDS if command not in NO_OUTPUT]
 HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "trimesh", "mcap", "clarabel")
@@ -127,9 +127,8 @@ print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
     ("command", "word"),
     [
         *(("replay", option) for option in ("--evidence", "--controller", "--junit")),
-        *((command, "--junit") for command in ("check", "reconstruct", "score", "batch", "compare", "study", "demo")),
+        *((command, "--junit") for command in ("check", "reconstruct", "score", "batch", "compare", "demo")),
         *((command, "--holdout") for command in ("ingest", "reconstruct", "score", "check")),
-        *(("study", name) for name in ("table2", "scenes", "shared-workspace", "dtu", "ablation")),
     ],
 )
 def test_what_people_look_for_is_in_the_short_help(
