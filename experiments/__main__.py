@@ -43,7 +43,7 @@ def main(words: Sequence[str] | None = None) -> int:
     try:
         return EXPERIMENTS[args.experiment].run(args)
     except SplatCtrlError as error:
-        print(f"experiments: {error}" + (f"; {error.remedy}" if error.remedy else ""), file=sys.stderr)
+        print(f"experiments: {error}", file=sys.stderr)
         return error.exit_code
 
 
@@ -51,11 +51,11 @@ def add_study_options(parser: argparse.ArgumentParser) -> None:
     """Add what every study takes."""
     add = parser.add_argument
     add("-o", "--out", type=Path, help="folder of the study, in which it goes on (default: its name)")
-    add("--trials", type=int, help="problems of each kind (default: as many as the paper's)")
+    add("--trials", type=_count, help="problems of each kind (default: as many as the paper's)")
     add("--methods", type=_names, default=(), help="some of the study's: A,B (default: all that are installed)")
     add("--problems", type=Path, help="folder of MotionBenchMaker's problems (table2), or of DTU scans (dtu)")
-    add("--width", type=int, help="width of the images [px]")
-    add("--workers", type=int, default=os.cpu_count() or 1, help="problems that run at once")
+    add("--width", type=_count, help="width of the images [px]")
+    add("--workers", type=_count, default=os.cpu_count() or 1, help="problems that run at once")
     add("--shard", type=_shard, default=(1, 1), help="I/N: only every N-th problem, from the I-th on")
     add("--made", type=Path, action="append", default=[], help="merge these trials instead of running any")
     add("--problem", help="run one problem alone, such as cubby-0007")
@@ -107,6 +107,12 @@ def _concluded(verdict: Verdict) -> int:
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(text.split(","))
+
+
+def _count(text: str) -> int:
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text}")
+    return int(text)
 
 
 def _shard(text: str) -> tuple[int, int]:

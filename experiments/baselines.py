@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
         with stopwatch.stage("closed loop"):
             result = replay(replace(request, out=folder / CLOSED_LOOP))
         with stopwatch.stage("baselines"):
-            found = beside(result, request, args.methods, zone, args.human, folder)
+            found = side_by_side(result, request, args.methods, zone, args.human, folder)
         write_json(folder / "methods.json", found.document())
         found.draw(folder / "methods.png", request.config.control.margin)
         write_run(
@@ -131,7 +131,7 @@ def run(args: argparse.Namespace) -> int:
     return result.exit_code()
 
 
-def beside(
+def side_by_side(
     closed: ReplayResult,
     request: ReplayRequest,
     names: Sequence[str],
@@ -139,10 +139,10 @@ def beside(
     human: Sequence[str],
     folder: Path,
 ) -> SideBySide:
-    """Every method beside the closed loop and the log, each in the scene as it was known at its time. A standstill is
-    held by `zone`; our controller, in place of the user's, leaves a replay of its own in `folder`.
+    """Run every method and measure it, with the closed loop and the log, in the scene known at each time.
 
-    Planned paths are those of the scene known at the start; they begin there and then, as if planning took no time.
+    A standstill is held by `zone`. Our controller, in place of the user's, leaves a replay of its own in `folder`.
+    Paths are planned in the scene known at the start, and begin there as if planning took no time.
     """
     control, task = request.config.control, _task(request, closed)
     people = {} if zone is None else separations(closed, zone, human)
@@ -174,7 +174,7 @@ def _key(name: str) -> str:
 
 
 def _task(request: ReplayRequest, closed: ReplayResult) -> ReplayTask:
-    """What the closed loop was asked for; without a posture the logged one at the end is where goals are sought."""
+    """Return the closed loop's task. Without a goal posture, the logged one at the end is where the search begins."""
     model, logged_end = closed.inputs.model, closed.inputs.motion().position[-1]
     stamps, positions, _ = _trace(closed)
     frame = request.frame or model.frame_names[-1]

@@ -60,7 +60,7 @@ METHODS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """How the table shows a figure of a score: its title, the factor to its unit, and the format."""
+    """A column of the table: its title, the factor to its unit, and the format."""
 
     title: str
     form: str
@@ -190,7 +190,7 @@ def fit_scans(request: FitRequest) -> dict[str, Any]:
         else:
             folder = stack.enter_context(output_path(out, force=request.force, is_folder=True))
         for scan in scans:
-            recording = _of_scan(request.recording, scan)
+            recording = _with_scan(request.recording, scan)
             scenes = {name: _fit(request, recording, name, folder / scan / name / "scene") for name in METHODS}
             # scored after both were fitted: what scoring leaves in memory then counts for neither
             for name, (scene, memory) in scenes.items():
@@ -216,7 +216,7 @@ def _scans(recording: RecordingRequest) -> list[str]:
     return wanted
 
 
-def _of_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
+def _with_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
     if not recording.is_dtu:
         return recording
     masks = recording.masks

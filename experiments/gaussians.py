@@ -102,7 +102,7 @@ def _auditor(path: Path, rows: list[GaussianAuditRow], progress: Progress) -> Ca
 
 
 def _views(frames: Sequence[RgbdFrame]) -> dict[str, object]:
-    """What ``run.json`` says of the views."""
+    """Return the views' entry of ``run.json``."""
     return {
         "method": "3dgs",
         "cameras": list(dict.fromkeys(frame.camera for frame in frames)),

@@ -1,4 +1,4 @@
-"""What IV reports of a path of straight edges in joint space: its lengths, and the clearance proved along it.
+"""Figures of a path of straight edges in joint space (IV): its lengths, and the clearance proved along it.
 
 W waypoints, J joints, K samples.
 """
@@ -30,7 +30,7 @@ def joint_length(waypoints: Float64) -> float:
 
 
 def effector_length(model: ArmModel, postures: Float64, frame: str) -> tuple[float, float]:
-    """How far a frame goes [m] and turns [degrees] over postures (K, J), from each to the next."""
+    """Return the length [m] and the turn [degrees] of a frame's path over postures (K, J)."""
     poses = [model.frame_pose(q, frame) for q in postures]
     steps = [pose_error(a, b) for a, b in pairwise(poses)]
     moved, turned = (sum(float(np.linalg.norm(step[part])) for step in steps) for part in (slice(3), slice(3, 6)))

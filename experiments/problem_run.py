@@ -53,7 +53,9 @@ R = TypeVar("R", bound=Row)
 
 
 def verdict_on_trials(trials: Sequence[Row]) -> Verdict:
-    """Failed where one that was judged safe touched something: a study may find failures, and no false green."""
+    """Fail where a trial that was judged safe touched something. Without a trial nothing is judged."""
+    if not trials:
+        return verdict_of("study", [])
     judged = [trial for trial in trials if trial.verdict]
     reasons = [
         Reason(

@@ -28,8 +28,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Record it."""
     is_shared = args.scene in shared_workspace.PLACES
+    usual = shared_workspace.DURATION_S if is_shared else ENVIRONMENT_S
     options = RecordingOptions(
-        duration_s=args.duration or (shared_workspace.DURATION_S if is_shared else ENVIRONMENT_S),
+        duration_s=usual if args.duration is None else args.duration,
         width=args.width,
         height=args.height,
         noise=args.noise,

@@ -43,7 +43,7 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionFigures:
-    """What IV reports of a motion.
+    """The figures of a motion (IV).
 
     has_arrived: at its end the frame is at the goal's pose; is_success: and no state is in collision by the
     controller's field, or where it has no distance. joint_path [rad], effector_path [m], effector_turn [degrees];

@@ -55,7 +55,7 @@ def test_the_reference_gradient_is_that_of_finite_differences() -> None:
     weight = torch.tensor(np.random.default_rng(2).normal(size=(3, 7)))
 
     def smooth(p: torch.Tensor) -> torch.Tensor:
-        """Everything that depends on the parameters before pixels, which have cut-offs."""
+        """The parts of the loss that come before pixels: pixels have cut-offs, which differences do not meet."""
         points = p[:, :3] @ view[6:15].reshape(3, 3).T + view[15:18]
         covariance = reference.covariances(view, points, torch.exp(p[:, 3:6]), p[:, 6:10])
         shades = reference.colors(view, p[:, :3], p[:, 11:].reshape(-1, 3, 16), 3)

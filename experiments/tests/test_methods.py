@@ -1,4 +1,4 @@
-"""What methods are shown by, side by side."""
+"""The picture of methods side by side."""
 
 from pathlib import Path
 

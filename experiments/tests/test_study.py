@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from experiments.__main__ import main
 from experiments.environments import ENVIRONMENTS
-from experiments.problem_run import TRIALS, read_trials
+from experiments.problem_run import TRIALS, read_trials, verdict_on_trials
 from experiments.problems import archive_of
 from experiments.study import StudyRequest, StudyResult, merged_study, run_study
 from experiments.trial import CAMERAS, OURS, TRUTH, Trial
@@ -102,3 +103,19 @@ def test_a_method_and_an_archive_that_are_none_are_refused_by_name(tmp_path: Pat
     with pytest.raises(InputError, match=r"has no problems\.tar\.bz2"):
         archive_of(tmp_path)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("words", [("--trials", "0"), ("--workers", "0"), ("--width", "-1"), ("--shard", "3/2")])
+def test_counts_that_make_no_study_are_refused(words: tuple[str, str], tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["table2", *words, "-o", str(tmp_path / "out")])
+    assert left.value.code == 2 and not (tmp_path / "out").exists()
+
+
+def test_without_a_trial_nothing_is_judged() -> None:
+    assert verdict_on_trials([]).outcome is Outcome.NOT_EVALUABLE
+
+
+def test_an_error_is_one_line_with_its_remedy_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["table2", "--made", str(tmp_path / "none"), "-o", str(tmp_path / "out")]) == 4
+    assert capsys.readouterr().err.count("check the path") == 1

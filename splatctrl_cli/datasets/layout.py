@@ -51,7 +51,7 @@ class Layout:
 
 
 def marked(*alternatives: str) -> Callable[[Path], bool]:
-    """Whether a folder has all that one of the alternatives names: files, or folders where a name ends in /."""
+    """Return a test of a folder: it has every name of one alternative (a name that ends in / is a folder)."""
 
     def has(folder: Path, mark: str) -> bool:
         return any(path.is_dir() if mark.endswith("/") else path.is_file() for path in folder.glob(mark))
