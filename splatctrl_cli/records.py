@@ -4,7 +4,7 @@ Shapes: N splats, Q queries, S spheres, J joints, (X, Y, Z) voxels, (H, W) pixel
 """
 
 import heapq
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from operator import attrgetter
@@ -22,6 +22,7 @@ UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 Index = NDArray[np.int64]
 Stamps = NDArray[np.int64]  # (T,) [ns]
+Posture = Callable[[int], Float64 | None]  # joint positions (J,) at a time [ns]; None where there are none
 SECOND_NS = 1_000_000_000
 MILLIMETRE, MILLIMETRES = 0.001, 1000.0  # [m] of one, and how many a metre has
 

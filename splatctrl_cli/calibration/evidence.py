@@ -19,8 +19,7 @@ from splatctrl_cli.calibration.views import (
 )
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import back_project, invert_transform, pose_at, transform_points
-from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.records import Bool, Float32, Float64, Index, Intrinsics, RgbdFrame, spread
+from splatctrl_cli.records import Bool, Float32, Float64, Index, Intrinsics, Posture, RgbdFrame, spread
 from splatctrl_cli.robot.model import RobotModel
 
 POSE, DEPTH = 6, 2  # unknowns of a camera: a turn and a move in its own frame, the scale and bias of its depths
@@ -130,12 +129,12 @@ class ArmRows:
 
 
 class Arm:
-    """A robot with the joint states of a recording, in the model's order of joints."""
+    """A robot with the joint positions of a recording, in the model's order of joints."""
 
-    def __init__(self, model: RobotModel, states: StateColumns) -> None:
+    def __init__(self, model: RobotModel, posture: Posture) -> None:
         self.model = model
         self.surface = model.surface
-        self._posture = states.postures(fixed.STATES_CLOSE_NS)
+        self._posture = posture
         self._vague = np.array(sorted(self.surface.vague), dtype=np.int64)
         self.surface_poses = lru_cache(maxsize=REMEMBERED)(self._surface_poses)
 

@@ -176,7 +176,8 @@ def _arm(model: RobotModel, source: FrameSource) -> Arm:
             f"{model.urdf.path}: expected collision geometry, got spheres alone, which enclose the surface",
             remedy="give the URDF with its meshes (--packages DIR where they are in packages)",
         )
-    return Arm(model, source.states.of_log(*model.joint_columns(source.joint_names)))
+    states = source.states.of_log(*model.joint_columns(source.joint_names))
+    return Arm(model, states.postures(fixed.STATES_CLOSE_NS))
 
 
 def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tuple[list[RgbdFrame], list[Sighting]]:

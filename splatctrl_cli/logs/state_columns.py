@@ -10,10 +10,9 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, blocks_of, of_columns, ranges, selected
-from splatctrl_cli.records import Float64, Index, JointState, Stamps
+from splatctrl_cli.records import Float64, Index, JointState, Posture, Stamps
 
 OF_JOINTS = ("position", "velocity", "commanded_velocity")
-Posture = Callable[[int], Float64 | None]  # joint positions (J,) at a time [ns]; None where there are none
 COLUMNS = (*OF_JOINTS, "T_base_ee", "T_world_ee")
 
 
