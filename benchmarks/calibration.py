@@ -25,7 +25,8 @@ from splatctrl_cli.cli.common import table
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.geometry import invert_transform, look_at
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
-from splatctrl_cli.logs.mcap_writer import mcap_log
+from splatctrl_cli.recording.container.mcap_writer import mcap_log
+from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import Float64, JointState, Record, RgbdFrame, by_stamp
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import tabletop
@@ -41,7 +42,6 @@ from splatctrl_cli.simulate.recording import (
     Transform,
 )
 from splatctrl_cli.simulate.render import Renderer
-from splatctrl_cli.sources.source import open_source
 
 PLAIN = ROOT / "tests" / "data" / "tabletop"  # the arm of primitive shapes
 ARM = {"urdf": PLAIN / "robot.urdf", "spheres": PLAIN / "robot_spheres.yaml"}

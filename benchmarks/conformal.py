@@ -31,8 +31,8 @@ from splatctrl_cli.jobs.replays.inputs import open_log, read_states
 from splatctrl_cli.jobs.replays.lockstep import from_log
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.state_pass import ReplayRecord
-from splatctrl_cli.logs.mcap_writer import mcap_log
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.container.mcap_writer import mcap_log
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, JointState
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep

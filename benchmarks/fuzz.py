@@ -167,8 +167,8 @@ def _run(arguments: list[str], box: Path) -> None:
 
 def _states(path: Path) -> int:
     """What `replay` reads of a log."""
-    from splatctrl_cli.logs.source_options import SourceOptions
-    from splatctrl_cli.states.state_source import open_states
+    from splatctrl_cli.recording.source_options import SourceOptions
+    from splatctrl_cli.recording.state.state_source import open_states
 
     try:
         source = open_states(path, SourceOptions(), JOINTS)

@@ -17,12 +17,12 @@ from benchmarks.measure import Limit, Options, Result, medians
 from benchmarks.scenes import wall_problem
 from splatctrl_cli.config import Config
 from splatctrl_cli.geometry import look_at
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Box, RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.simulate.render import Renderer
 from splatctrl_cli.simulate.tabletop import cameras, furniture, things
-from splatctrl_cli.states.state_source import open_states
 from tests.plain import plain_frame
 
 NUM_VIEWS = (8, 16, 31)

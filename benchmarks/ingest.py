@@ -16,9 +16,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from benchmarks.measure import SAMPLE, Limit, Options, Result, measured, medians
 from benchmarks.scenes import enlarged
-from splatctrl_cli.captures.capture_writer import write_capture
+from splatctrl_cli.recording.capture.capture_writer import write_capture
+from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.sources.source import open_source
 
 NUM_IMAGES = 12  # that differ; a log repeats them
 PERIOD_NS = 33_333_333

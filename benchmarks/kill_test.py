@@ -29,7 +29,7 @@ from splatctrl_cli.cli.common import table
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.files.output import partial_path
-from splatctrl_cli.sources.source import describe, open_source
+from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.splat_files.splats import FORMATS
 from tests.splat_files.test_gaussian_ply import gaussian_set
 

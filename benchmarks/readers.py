@@ -14,13 +14,6 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin
 
 from benchmarks.fuzz_samples import ROBOT, capture_of, plain_log
-from splatctrl_cli.captures.capture import CaptureSource
-from splatctrl_cli.containers.bag_logs import Bag1Log, Db3Log
-from splatctrl_cli.containers.foxglove import MessageTypes
-from splatctrl_cli.containers.mcap_log import McapLog
-from splatctrl_cli.containers.raw_log import Damage
-from splatctrl_cli.datasets.folder_description import read_description
-from splatctrl_cli.datasets.poses import read_nerfstudio, read_trajectory_log, read_tum
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of, read_arrays, savez
 from splatctrl_cli.files.image_file import image_head, read_pfm, write_pfm
@@ -28,18 +21,25 @@ from splatctrl_cli.grid_files.grid_formats import write_grid
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.grid_files.nrrd import read_nrrd_head
 from splatctrl_cli.grid_files.vti import read_vti
-from splatctrl_cli.logs.decoder import IMAGE, UndecodableMessageError
-from splatctrl_cli.logs.messages import decode_rvl, read_image
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.capture.capture import CaptureSource
+from splatctrl_cli.recording.container.bag_logs import Bag1Log, Db3Log
+from splatctrl_cli.recording.container.foxglove import MessageTypes
+from splatctrl_cli.recording.container.mcap_log import McapLog
+from splatctrl_cli.recording.container.raw_log import Damage
+from splatctrl_cli.recording.folder.folder_description import read_description
+from splatctrl_cli.recording.folder.poses import read_nerfstudio, read_trajectory_log, read_tum
+from splatctrl_cli.recording.log.decoder import IMAGE, UndecodableMessageError
+from splatctrl_cli.recording.log.messages import decode_rvl, read_image
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.splat_files.splats import FORMATS
-from tests.containers.test_foxglove import descriptor_set
-from tests.containers.test_log_formats import as_ros1_bag, as_ros2_folder
-from tests.datasets.make_layout import make_nerfstudio, make_redwood, make_tum
 from tests.grid_files.make_grid import random_grid
-from tests.logs.make_log import LogRecipe, make_log
-from tests.logs.test_decoder import encoded_rvl
+from tests.recording.container.test_foxglove import descriptor_set
+from tests.recording.container.test_log_formats import as_ros1_bag, as_ros2_folder
+from tests.recording.folder.make_layout import make_nerfstudio, make_redwood, make_tum
+from tests.recording.log.make_log import LogRecipe, make_log
+from tests.recording.log.test_decoder import encoded_rvl
 from tests.splat_files.test_gaussian_ply import gaussian_set
 
 Read = Callable[[bytes], object]

@@ -9,6 +9,7 @@ import numpy as np
 from benchmarks.measure import SAMPLE
 from splatctrl_cli.config import Config
 from splatctrl_cli.kernels.raster import TargetView
+from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, Label, RgbdFrame, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.fitter import SceneFitter
@@ -16,7 +17,6 @@ from splatctrl_cli.scene.keyframes import make_view
 from splatctrl_cli.scene.render import camera_array
 from splatctrl_cli.scene.seeding import inside_workspace, world_points
 from splatctrl_cli.scene.time_steps import time_steps
-from splatctrl_cli.sources.source import open_source
 from tests.plain import plain_splats
 
 TRAINING = ("cam0", "cam1", "cam2")

@@ -14,10 +14,10 @@ from pathlib import Path
 from benchmarks.measure import SAMPLE, Limit, Options, Result, measured
 from benchmarks.scenes import enlarged, sample_robot
 from splatctrl_cli.config import load_config
+from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.time_steps import time_steps
-from splatctrl_cli.sources.source import open_source
 
 CAMERAS = ("cam0", "cam1")
 SETTINGS = ("scene.iterations_per_step=5",)

@@ -19,8 +19,6 @@ from splatctrl_cli.cli.commands import COMMANDS, EXIT_CODES, build_parser
 from splatctrl_cli.cli.parser import Parser, invocation
 from splatctrl_cli.config.load import type_name
 from splatctrl_cli.config.ranges import OneOf, Section
-from splatctrl_cli.datasets.layout import Layout
-from splatctrl_cli.datasets.layouts import LAYOUTS
 from splatctrl_cli.evaluate.metrics import Better, Scale
 from splatctrl_cli.evaluate.verdict import Criterion
 from splatctrl_cli.grid_files.grid_format import GridFormat
@@ -29,6 +27,8 @@ from splatctrl_cli.jobs.judged_runs import scales
 from splatctrl_cli.jobs.replays.criteria_input import Judged
 from splatctrl_cli.jobs.replays.evidence_criteria import LIMITS, PROOF, Limit
 from splatctrl_cli.jobs.replays.verdict import CRITERIA
+from splatctrl_cli.recording.folder.layout import Layout
+from splatctrl_cli.recording.folder.layouts import LAYOUTS
 from splatctrl_cli.splat_files.splat_format import SplatFormat
 from splatctrl_cli.splat_files.splats import FORMATS as SPLAT_FORMATS
 

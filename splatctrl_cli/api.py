@@ -28,7 +28,7 @@ from splatctrl_cli.jobs.report import (
     write_report,
 )
 from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Box, Label
 
 __all__ = [

@@ -14,8 +14,6 @@ from splatctrl_cli.control.replay import Outcome as MotionOutcome
 from splatctrl_cli.control.replay import ReplayTask, closed_loop, is_at_goal
 from splatctrl_cli.control.scene_field import SceneStep, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController
-from splatctrl_cli.datasets.dtu import scan_folders
-from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.evaluate.protocols import SURFACE_SCANS
 from splatctrl_cli.evaluate.verdict import verdict_of
 from splatctrl_cli.field.baker import Baker, Planes
@@ -62,7 +60,6 @@ from splatctrl_cli.kernels import gaussians as gaussian_kernels
 from splatctrl_cli.kernels import native, num_threads
 from splatctrl_cli.kernels.raster import ImageLoss, LossTerms
 from splatctrl_cli.libraries import is_installed, mpl, of_extra
-from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.planner.birrt import plan
 from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, OnlyDistance
 from splatctrl_cli.planner.edges import check_edges
@@ -76,6 +73,10 @@ from splatctrl_cli.planner.planned import (
     planned_path,
 )
 from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Rod, Solid, Solids
+from splatctrl_cli.recording.calibrated import Perturbation
+from splatctrl_cli.recording.folder.dtu import scan_folders
+from splatctrl_cli.recording.folder.idr import idr_scans
+from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.records import (
     Bool,
     DistanceField,
@@ -110,7 +111,6 @@ from splatctrl_cli.simulate.recording import START_NS, Recording, RecordingOptio
 from splatctrl_cli.simulate.render import Camera, Renderer
 from splatctrl_cli.simulate.tabletop import PALETTE, arm_solids, cameras, furniture, texture
 from splatctrl_cli.simulate.truth import closest_of, distance_to
-from splatctrl_cli.sources.calibrated import Perturbation
 from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
 from splatctrl_cli.splat_files.splats import nearest_splats
 from splatctrl_cli.voxels import Balls, OccupancyGrid, SeenVoxels, VoxelState

@@ -3,30 +3,49 @@
 import ast
 from pathlib import Path
 
+import pytest
+
 PACKAGE = Path(__file__).parent.parent / "splatctrl_cli"
 ROOMS = [  # a room imports those of the rows above its own
     ["records", "geometry", "config", "errors", "kernels", "libraries", "mesh_distance", "voxels"],
     ["robot", "files"],
-    ["containers", "splat_files", "grid_files", "report"],
-    ["logs", "scene_files"],
-    ["captures", "scene", "field", "control", "simulate", "evaluate", "calibration"],
-    ["datasets", "planner"],
-    ["sources"],
-    ["states", "checks"],
+    ["splat_files", "grid_files", "report"],
+    ["scene_files"],
+    ["scene", "field", "control", "simulate", "evaluate", "calibration"],
+    ["recording", "planner"],
+    ["checks"],
     ["jobs"],
     ["api"],
     ["cli"],
 ]
-RANK = {room: rank for rank, rooms in enumerate(ROOMS) for room in rooms}
+INSIDE = {  # of a room, its folders and the modules beside them, likewise
+    "recording": [
+        ["source_options"],
+        ["container"],
+        ["log"],
+        ["capture"],
+        ["folder"],
+        ["describe_file", "calibrated"],
+        ["source"],
+        ["state"],
+    ],
+}
+
+
+def ranks(floors: list[list[str]]) -> dict[str, int]:
+    return {name: rank for rank, names in enumerate(floors) for name in names}
+
+
+RANK = ranks(ROOMS)
 HOMES = {
     "torch": {"scene"},
     "pinocchio": {"robot"},
     "coal": {"robot"},
     "clarabel": {"control"},
     "daqp": {"control"},
-    "rosbags": {"containers", "logs"},
-    "mcap": {"containers", "logs"},
-    "google": {"containers"},
+    "rosbags": {"recording"},
+    "mcap": {"recording"},
+    "google": {"recording"},
     "pxr": {"splat_files"},
     "matplotlib": {"libraries"},
 }
@@ -59,6 +78,19 @@ def test_imports_go_down_only() -> None:
             if parts[0] != "splatctrl_cli" or len(parts) < 2 or parts[1] == here:
                 continue
             if here == "kernels" or (RANK[parts[1]] >= RANK[here] and RANK[here] > 0):
+                offences.append(f"{path.relative_to(PACKAGE)} imports {name}")
+    assert not offences, offences
+
+
+@pytest.mark.parametrize("room", INSIDE)
+def test_the_folders_of_a_room_import_lower_ones_only(room: str) -> None:
+    rank, offences = ranks(INSIDE[room]), []
+    for path in (PACKAGE / room).rglob("*.py"):
+        here = path.relative_to(PACKAGE / room).parts[0].removesuffix(".py")
+        for name in imports(path):
+            parts = name.split(".")
+            is_own = parts[:2] == ["splatctrl_cli", room] and len(parts) > 2
+            if is_own and parts[2] != here and rank[parts[2]] >= rank[here]:
                 offences.append(f"{path.relative_to(PACKAGE)} imports {name}")
     assert not offences, offences
 

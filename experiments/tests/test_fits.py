@@ -16,10 +16,10 @@ from splatctrl_cli import (
     ScoreResult,
 )
 from splatctrl_cli.config import Config
-from splatctrl_cli.datasets.dtu import read_dtu
-from splatctrl_cli.datasets.idr import write_idr
 from splatctrl_cli.evaluate.verdict import noted, verdict_of
-from tests.datasets.make_layout import half_size
+from splatctrl_cli.recording.folder.dtu import read_dtu
+from splatctrl_cli.recording.folder.idr import write_idr
+from tests.recording.folder.make_layout import half_size
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "dtu"
 QUICK = ("--iterations", "6", "--splats", "400", "--threads", "1")

@@ -14,7 +14,7 @@ from splatctrl_cli.checks.check_views import rescaled
 from splatctrl_cli.checks.clock_offset import ClockOffset, ImageMotion, estimate_clock_offset, states_asked
 from splatctrl_cli.checks.finding import Finding, note, warning
 from splatctrl_cli.geometry import strided_lens
-from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.records import Float64, Posture, RgbdFrame, spread
 from splatctrl_cli.robot.model import RobotModel
 

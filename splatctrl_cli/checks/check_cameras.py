@@ -9,11 +9,11 @@ import numpy as np
 from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.config.fixed import TF_GAP_NS
-from splatctrl_cli.logs.decoder import CAMERA_INFO
-from splatctrl_cli.logs.registration import DISTORTION_MODELS, is_distorted, lens_model
-from splatctrl_cli.logs.rig import Camera, ImageLens, image_lens, intrinsics_of, nearest_gap_ns
-from splatctrl_cli.logs.source_options import NUM_COEFFICIENTS, CameraTopics, SourceOptions
-from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey, pair_by_stamp
+from splatctrl_cli.recording.log.decoder import CAMERA_INFO
+from splatctrl_cli.recording.log.registration import DISTORTION_MODELS, is_distorted, lens_model
+from splatctrl_cli.recording.log.rig import Camera, ImageLens, image_lens, intrinsics_of, nearest_gap_ns
+from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey, pair_by_stamp
+from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics, SourceOptions
 from splatctrl_cli.records import Float64, Intrinsics
 
 _DONE = {

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.calibration.gray_views import BandRatios, band_ratios
-from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.check_arm import motion_findings
 from splatctrl_cli.checks.check_cameras import lens_findings, pose_findings
@@ -28,16 +27,17 @@ from splatctrl_cli.checks.finding import (
     warning,
 )
 from splatctrl_cli.config.fixed import SCALE_DEPTH
-from splatctrl_cli.datasets.image_folder import ImageFolderSource
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import strided_lens
-from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
-from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.recording.capture.capture_header import is_capture
+from splatctrl_cli.recording.folder.image_folder import ImageFolderSource
+from splatctrl_cli.recording.log.state_columns import StateCollector, StateColumns
+from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, Intrinsics, JointState, RgbdFrame, spread
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.scale import RecordedDepth
-from splatctrl_cli.sources.source import open_source
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,16 +18,16 @@ from splatctrl_cli.checks.check_times import (
 )
 from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, note, warning
 from splatctrl_cli.checks.log_pass import LogWatch, checked_camera, image_motion, ready
-from splatctrl_cli.containers.raw_log import RawLog
-from splatctrl_cli.logs.cameras import image_topics
-from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
-from splatctrl_cli.logs.messages import COLOR_CONVERSIONS, DEPTH_ENCODINGS
-from splatctrl_cli.logs.rig import camera_topics, check_mask_topics, missing
-from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions, refuse_unknown_cameras
-from splatctrl_cli.logs.state_messages import STATE_TYPES
-from splatctrl_cli.logs.survey import Survey, survey
+from splatctrl_cli.recording.calibrated import correction_of
+from splatctrl_cli.recording.container.raw_log import RawLog
+from splatctrl_cli.recording.log.cameras import image_topics
+from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
+from splatctrl_cli.recording.log.messages import COLOR_CONVERSIONS, DEPTH_ENCODINGS
+from splatctrl_cli.recording.log.rig import camera_topics, check_mask_topics, missing
+from splatctrl_cli.recording.log.state_messages import STATE_TYPES
+from splatctrl_cli.recording.log.survey import Survey, survey
+from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions, refuse_unknown_cameras
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.sources.calibrated import correction_of
 
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
 SAID = (" are never closer than ", " images as ", "distortion model ", " says rectified")  # other findings name them

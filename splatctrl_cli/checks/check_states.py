@@ -13,11 +13,11 @@ from splatctrl_cli.config.fixed import STATES_STILL
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.spilled_rows import blocks_of, ranges
 from splatctrl_cli.geometry import invert_transform, pose_at
-from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.logs.state_messages import STATE_TYPES, JointStream
-from splatctrl_cli.logs.state_topics import joint_records, refuse_contradiction, state_topics
-from splatctrl_cli.logs.survey import Survey
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.recording.log.state_messages import STATE_TYPES, JointStream
+from splatctrl_cli.recording.log.state_topics import joint_records, refuse_contradiction, state_topics
+from splatctrl_cli.recording.log.survey import Survey
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, Index, JointState, LossReport, spread
 from splatctrl_cli.robot.model import RobotModel
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from splatctrl_cli.checks.check_images import ImageWatch, Kept, thumbnail_lens
 from splatctrl_cli.checks.check_times import TimesWatch
 from splatctrl_cli.checks.clock_offset import ImageMotion
-from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import strided_lens
-from splatctrl_cli.logs.decoder import (
+from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.recording.log.decoder import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
@@ -25,11 +25,11 @@ from splatctrl_cli.logs.decoder import (
     is_ros,
     stamp_ns,
 )
-from splatctrl_cli.logs.messages import color_of, depth_of, num_invalid, read_image
-from splatctrl_cli.logs.registration import DepthToColor, TfTree
-from splatctrl_cli.logs.rig import Camera, build_cameras
-from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
-from splatctrl_cli.logs.survey import Survey
+from splatctrl_cli.recording.log.messages import color_of, depth_of, num_invalid, read_image
+from splatctrl_cli.recording.log.registration import DepthToColor, TfTree
+from splatctrl_cli.recording.log.rig import Camera, build_cameras
+from splatctrl_cli.recording.log.survey import Survey
+from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
 
 _HEADED = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu")

@@ -10,7 +10,7 @@ from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.errors import DAMAGED
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.check import CheckRequest, check
-from splatctrl_cli.sources.source import describe
+from splatctrl_cli.recording.source import describe
 
 WIDTH = 118  # columns of text
 FEW = 3  # rows that no command reads, which are all printed

@@ -21,11 +21,11 @@ from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.jobs.check import posed_robot
 from splatctrl_cli.jobs.logged_robot import RobotOptions
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.recording.source import open_session
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame, spread
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.sources.source import open_session
 
 BASE = "the robot's base"
 

@@ -13,11 +13,11 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.logged_robot import TAKE, differs, logged_urdf
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source import open_logs
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
-from splatctrl_cli.sources.source import open_logs
 
 NEVER = "never"
 _ALLOWING = {  # the options that take an error on

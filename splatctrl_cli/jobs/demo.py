@@ -30,13 +30,13 @@ from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source import describe, open_source
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.render import render
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, open_scene
-from splatctrl_cli.sources.source import describe, open_source
 
 TRAINING, SCORING = ("cam0", "cam1", "cam2"), ("cam3",)
 CLOSED_LOOP_START = 1.8  # [s]: the visitor appears ahead of the driven arm; started earlier, right where it is

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.containers.foxglove_writer import FoxgloveLog, foxglove_log
 from splatctrl_cli.control.events import INTERVENTIONS, SHOWN
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.reports.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, open_run
 from splatctrl_cli.jobs.reports.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
+from splatctrl_cli.recording.container.foxglove_writer import FoxgloveLog, foxglove_log
 from splatctrl_cli.scene_files.scene_folder import Snapshot, open_scene
 
 FREE_BELOW, OCCUPIED_ABOVE = 0.3, 0.7  # of snapshots, whose log-odds say nothing finer

@@ -7,16 +7,16 @@ from pathlib import Path
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, read_arrays
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.logs.survey import NAME, RobotDescription
+from splatctrl_cli.recording.calibrated import LOGGED
+from splatctrl_cli.recording.log.survey import NAME, RobotDescription
+from splatctrl_cli.recording.source import logged_descriptions
+from splatctrl_cli.recording.state.state_source import StateSource
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.model_difference import model_difference
 from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 from splatctrl_cli.scene_files.scene_folder import SELF_MODEL
-from splatctrl_cli.sources.calibrated import LOGGED
-from splatctrl_cli.sources.source import logged_descriptions
-from splatctrl_cli.states.state_source import StateSource
 
 NO_SELF_MODEL = Path("none")  # as --self-model: neither learned nor taken from the scene
 LARGEST_SELF_MODEL = 2**30  # bytes

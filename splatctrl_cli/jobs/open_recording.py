@@ -5,24 +5,24 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 
-from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.checks.check_views import are_far, check_views, rescaled
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import POSE_JUMP
-from splatctrl_cli.datasets.dtu_source import DtuSource, view_numbers
-from splatctrl_cli.datasets.image_folder import ImageFolderSource
-from splatctrl_cli.datasets.layouts import has_views
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.recording.calibrated import LOGGED
+from splatctrl_cli.recording.capture.capture_header import is_capture
+from splatctrl_cli.recording.folder.dtu_source import DtuSource, view_numbers
+from splatctrl_cli.recording.folder.image_folder import ImageFolderSource
+from splatctrl_cli.recording.folder.layouts import has_views
+from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements, largest_jump
 from splatctrl_cli.scene.time_steps import TimeStep
-from splatctrl_cli.sources.calibrated import LOGGED
-from splatctrl_cli.sources.source import open_source
 
 
 @dataclass(frozen=True, kw_only=True)

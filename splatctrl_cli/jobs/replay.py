@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatctrl_cli.captures.capture_header import ROBOT
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names
@@ -41,6 +40,7 @@ from splatctrl_cli.jobs.replays.request import MODES, ReplayInputs, ReplayReques
 from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.jobs.replays.truth import with_agreement, with_truth
 from splatctrl_cli.jobs.replays.verdict import ASKED, replay_verdict
+from splatctrl_cli.recording.capture.capture_header import ROBOT
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_folder import open_scene

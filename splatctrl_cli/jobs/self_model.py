@@ -14,13 +14,13 @@ from splatctrl_cli.jobs.calibrate import depth_frame, frames_nearest, stamps_by_
 from splatctrl_cli.jobs.logged_robot import RobotOptions
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstructions.reconstruction import training_cameras
-from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame, SphereSet, spread
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_fusion import REACH, choose_moments, learn
 from splatctrl_cli.robot.self_model import SelfModel
-from splatctrl_cli.sources.source import open_source
 
 MOST_MOMENTS = 2000  # of a recording, among which those are chosen that are read
 

@@ -14,11 +14,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
-from splatctrl_cli.sources.source import open_source
 from tests.cases.case import Case, Run
-from tests.logs.make_log import START_NS, T, encoded, header, write_raw
+from tests.recording.log.make_log import START_NS, T, encoded, header, write_raw
 
 WIDTH, HEIGHT = 64, 48
 BARREL = (-0.25, 0.06, 0.0, 0.0, 0.0)

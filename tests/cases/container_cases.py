@@ -14,15 +14,25 @@ import cv2
 import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from splatctrl_cli.captures.capture_header import read_capture_header
-from splatctrl_cli.containers.log_formats import open_raw_log
-from splatctrl_cli.containers.raw_log import RawMessage
-from splatctrl_cli.logs.survey import survey
+from splatctrl_cli.recording.capture.capture_header import read_capture_header
+from splatctrl_cli.recording.container.log_formats import open_raw_log
+from splatctrl_cli.recording.container.raw_log import RawMessage
+from splatctrl_cli.recording.log.survey import survey
+from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import Float32, Float64, RgbdFrame
-from splatctrl_cli.sources.source import open_source
 from tests.cases.case import Case, Run
-from tests.logs.make_log import STORE, LogRecipe, T, broken_log, encoded, header, make_log, messages_of, write_raw
-from tests.logs.make_rvl import encoded_rvl
+from tests.recording.log.make_log import (
+    STORE,
+    LogRecipe,
+    T,
+    broken_log,
+    encoded,
+    header,
+    make_log,
+    messages_of,
+    write_raw,
+)
+from tests.recording.log.make_rvl import encoded_rvl
 
 
 def recorded(folder: Path, recipe: LogRecipe | None = None) -> list[RawMessage]:

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.geometry import quat_from_rotation, strided_lens
-from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
 from tests.calibration.scan import views_of
 from tests.cases.case import Case, Run
 from tests.conftest import ROOT

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.states.state_source import open_states
 from tests.cases.case import Case, Run
-from tests.logs.make_log import START_NS, T, encoded, header, write_raw
+from tests.recording.log.make_log import START_NS, T, encoded, header, write_raw
 
 PERIOD_NS = 20_000_000
 State = tuple[int, str, Sequence[str], Float64, Float64]  # stamp [ns], topic, names, positions, velocities

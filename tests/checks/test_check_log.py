@@ -12,13 +12,13 @@ import pytest
 from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.checks.check_times import file_findings
 from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Severity
-from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.container.log_formats import open_raw_log
+from splatctrl_cli.recording.source import open_logs
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.sources.source import open_logs
-from tests.logs.make_log import (
+from tests.recording.log.make_log import (
     FRAME_NS,
     START_NS,
     WIDTH,

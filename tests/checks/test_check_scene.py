@@ -17,12 +17,12 @@ from splatctrl_cli.checks.check_states import log_states
 from splatctrl_cli.checks.check_views import ViewsCheck, check_views
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import Finding, Severity
-from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
-from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.logs.survey import survey
+from splatctrl_cli.recording.container.log_formats import open_raw_log
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.recording.log.survey import survey
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 

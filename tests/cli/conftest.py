@@ -9,12 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from splatctrl_cli.jobs.replays import files, inputs, lockstep
+from splatctrl_cli.recording.state import state_source
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot import coverage
 from splatctrl_cli.robot.link_meshes import Solid
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
-from splatctrl_cli.states import state_source
 from tests.cli.replay_desk import Desk, FakeSource, logged
 
 Solids = Mapping[str, Sequence[Solid]]

@@ -15,7 +15,7 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.files.output import part_digests
 from splatctrl_cli.grid_files.npz_grid import write_npz
-from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
+from splatctrl_cli.recording.log.state_columns import StateCollector, StateColumns
 from splatctrl_cli.records import Box, Float64, JointState, LossReport, Record, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_writer import SceneWriter

@@ -9,7 +9,7 @@ from junitparser import JUnitXml
 
 from splatctrl_cli.cli.main import main
 from tests.conftest import ROOT
-from tests.logs.make_log import LogRecipe, make_log
+from tests.recording.log.make_log import LogRecipe, make_log
 
 LOG = ROOT / "sample_data/tabletop/log.mcap"
 SUITE = f"""

@@ -11,7 +11,7 @@ import pytest
 
 from splatctrl_cli.checks.finding import CHECKS
 from tests.cli.test_ingest import run
-from tests.logs.make_log import (
+from tests.recording.log.make_log import (
     STORE,
     LogRecipe,
     Message,

@@ -20,7 +20,7 @@ from splatctrl_cli.cli.commands import COMMANDS, Command, build_parser, function
 from splatctrl_cli.cli.main import main
 from tests.cli import here
 from tests.conftest import ROOT
-from tests.logs.make_log import LogRecipe, make_log
+from tests.recording.log.make_log import LogRecipe, make_log
 
 NO_OUTPUT = (  # or one where it goes on
     *("info", "check", "batch", "sweep", "compare", "config", "completion", "help"),

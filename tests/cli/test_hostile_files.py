@@ -23,9 +23,9 @@ from splatctrl_cli.files.arrays import npy_of
 from splatctrl_cli.robot.link_meshes import mesh_path
 from splatctrl_cli.robot.urdf import MeshShape
 from splatctrl_cli.splat_files.splats import FORMATS
-from tests.datasets.make_layout import make_tum
 from tests.files.make_npz import write_zeros
-from tests.logs.make_log import LogRecipe, make_log
+from tests.recording.folder.make_layout import make_tum
+from tests.recording.log.make_log import LogRecipe, make_log
 from tests.splat_files.test_gaussian_ply import gaussian_set
 
 CAMERA = "[camera]\nwidth = 8\nheight = 6\nfx = 10\nfy = 10\ncx = 4.0\ncy = 3.0\n"
@@ -133,7 +133,7 @@ CODES = {"grid announced": {0, 4}, "splats announced": {0, 4}, "states of 16 GiB
 RUN = """
 import resource, sys
 from splatctrl_cli.cli.main import main
-import splatctrl_cli.cli.recordings, cv2, numpy, splatctrl_cli.sources.source, splatctrl_cli.sources.source
+import splatctrl_cli.cli.recordings, cv2, numpy, splatctrl_cli.recording.source, splatctrl_cli.recording.source
 pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + 2**30
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.cli.main import build_parser, main
-from splatctrl_cli.sources.source import open_source
-from tests.datasets.test_image_folder import described
-from tests.logs.make_log import LogRecipe, make_log
+from splatctrl_cli.recording.source import open_source
+from tests.recording.folder.test_image_folder import described
+from tests.recording.log.make_log import LogRecipe, make_log
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:

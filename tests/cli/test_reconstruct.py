@@ -12,7 +12,7 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.records import Label, RgbdFrame
 from splatctrl_cli.scene_files.scene_folder import open_scene
-from tests.logs.make_log import LogRecipe, make_log
+from tests.recording.log.make_log import LogRecipe, make_log
 from tests.scene.wall import INTRINSICS, frame
 
 FAST = ["--max-splats", "800", "--set", "scene.first_iterations=30", "--set", "scene.iterations_per_step=5", "-q"]

@@ -13,8 +13,8 @@ from splatctrl_cli.splat_files.splats import write_ply
 from tests.cli import here
 from tests.cli.replay_desk import BALL, START, splats_of, write_scene
 from tests.jobs.export_scene import ball
-from tests.logs.make_log import LogRecipe, make_log
-from tests.logs.make_states import START_NS, states_of, write_mcap
+from tests.recording.log.make_log import LogRecipe, make_log
+from tests.recording.log.make_states import START_NS, states_of, write_mcap
 from tests.robot.shapes import BALL as SPHERE
 from tests.robot.shapes import BOX, arm_of, written
 

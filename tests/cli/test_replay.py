@@ -26,8 +26,8 @@ from tests.cli.replay_desk import (
     write_scene,
 )
 from tests.evaluate.test_worst_frames import frame
-from tests.logs.make_states import START_NS, states_of, write_mcap
-from tests.states.test_twists import stamped
+from tests.recording.log.make_states import START_NS, states_of, write_mcap
+from tests.recording.state.test_twists import stamped
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

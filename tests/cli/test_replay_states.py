@@ -10,14 +10,14 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Box, Float64, JointState
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.sources.source import open_source
-from splatctrl_cli.states.state_source import open_states
 from tests.cli.replay_desk import BALL, START, Desk, splats_of, write_field, write_scene
-from tests.logs.make_log import LogRecipe, encoded, make_log, messages_of, write_raw
-from tests.logs.make_states import (
+from tests.recording.log.make_log import LogRecipe, encoded, make_log, messages_of, write_raw
+from tests.recording.log.make_states import (
     NEW_CONTROLLER,
     START_NS,
     Message,

@@ -17,7 +17,7 @@ from splatctrl_cli.cli.commands import COMMANDS
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
 from splatctrl_cli.jobs.demo import DemoRequest, DemoResult, Told
 from tests.cli.here import splatctrl
-from tests.logs.make_log import LogRecipe, make_log
+from tests.recording.log.make_log import LogRecipe, make_log
 
 CLI = Path(check.__file__).parent
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.datasets.dtu import read_dtu
-from splatctrl_cli.datasets.idr import write_idr
 from splatctrl_cli.evaluate.score_report import other_scans
+from splatctrl_cli.recording.folder.dtu import read_dtu
+from splatctrl_cli.recording.folder.idr import write_idr
 from splatctrl_cli.records import LossReport
 from tests.cli import here
-from tests.datasets.make_layout import half_size
 from tests.jobs.scores.wall import FRAMES, FakeScene, FakeSource, set_up, write_scene
+from tests.recording.folder.make_layout import half_size
 
 
 @pytest.fixture

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.datasets.idr import read_idr
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, NpzFile, read_arrays, savez
 from splatctrl_cli.grid_files.npz_grid import MOST_PACKED, read_npz
+from splatctrl_cli.recording.folder.idr import read_idr
+from splatctrl_cli.recording.source import describe
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT, read_checkpoint
 from splatctrl_cli.scene_files.voxel_file import read_occupancy, read_states
-from splatctrl_cli.sources.source import describe
 from tests.files.make_npz import write_zeros
 
 GIB4 = (1 << 14, 1 << 9, 1 << 9)  # of bytes

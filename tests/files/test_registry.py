@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.datasets.layouts import LAYOUTS
 from splatctrl_cli.files.summary import files_below, names_in
 from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
 from splatctrl_cli.libraries import entries_of
-from splatctrl_cli.sources.source import describe
+from splatctrl_cli.recording.folder.layouts import LAYOUTS
+from splatctrl_cli.recording.source import describe
 from splatctrl_cli.splat_files.splats import FORMATS as SPLAT_FORMATS
 
 

@@ -7,15 +7,15 @@ import pytest
 
 from splatctrl_cli.files import arrays, spilled_rows
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, scratch_folder, selected
-from splatctrl_cli.logs import state_columns
-from splatctrl_cli.logs.state_columns import StateCollector
-from splatctrl_cli.logs.state_topics import checked_stamps
-from splatctrl_cli.logs.state_track import RawTrack, cleaned, differentiated, smoothed_seconds
+from splatctrl_cli.recording.log import state_columns
+from splatctrl_cli.recording.log.state_columns import StateCollector
+from splatctrl_cli.recording.log.state_topics import checked_stamps
+from splatctrl_cli.recording.log.state_track import RawTrack, cleaned, differentiated, smoothed_seconds
+from splatctrl_cli.recording.source import SourceOptions
+from splatctrl_cli.recording.state import state_csv
+from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Float64, JointState, LossReport
-from splatctrl_cli.sources.source import SourceOptions
-from splatctrl_cli.states import state_csv
-from splatctrl_cli.states.state_source import open_states
-from tests.logs.make_states import START_NS, STEP_NS, states_of, write_mcap
+from tests.recording.log.make_states import START_NS, STEP_NS, states_of, write_mcap
 
 JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 

@@ -6,8 +6,8 @@ import pytest
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.grid_files.grid_format import GridFormat, SlabPlan, start_slabs
 from splatctrl_cli.grid_files.grid_formats import FORMATS, check_formats, write_grid
+from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import DistanceGrid
-from splatctrl_cli.sources.source import describe
 from tests.grid_files.make_grid import HEADER, ball_grid, random_grid
 
 PLACE = {"shape": [21, 22, 23], "voxel": 0.04}

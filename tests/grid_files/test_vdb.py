@@ -10,7 +10,7 @@ import pytest
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.grid_files.npz_grid import write_npz
 from splatctrl_cli.grid_files.vdb import openvdb, read_vdb_head, write_vdb
-from splatctrl_cli.sources.source import describe
+from splatctrl_cli.recording.source import describe
 from tests.grid_files.make_grid import random_grid, with_unknown
 
 ROOT = Path(__file__).parents[2]

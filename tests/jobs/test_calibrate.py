@@ -12,17 +12,17 @@ from benchmarks.calibration import T_HAND_WRIST, WRIST, SetUp, errors
 from splatctrl_cli.calibration.calibration_file import read_calibration
 from splatctrl_cli.calibration.evidence import transform_of, twist_between
 from splatctrl_cli.checks import check_log
-from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 from splatctrl_cli.jobs.ingest import IngestRequest, ingest
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.container.log_formats import open_raw_log
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.simulate.arm import HAND
 from splatctrl_cli.simulate.recording import RecordingOptions, Scene
-from splatctrl_cli.sources.source import open_source
-from splatctrl_cli.states.state_source import open_states
 from tests.calibration.scan import calibrated, robot_in
 
 SMALL = RecordingOptions(duration_s=3.0, fps=2.0, width=160, height=120, color_rays=0)

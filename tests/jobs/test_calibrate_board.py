@@ -14,7 +14,7 @@ from splatctrl_cli.calibration.evidence import transform_of, twist_between
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.geometry import invert_transform, look_at
 from splatctrl_cli.jobs.calibrate import CalibrateResult
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.simulate.arm import HAND, Motion
 from splatctrl_cli.simulate.recording import RecordingOptions, Scene

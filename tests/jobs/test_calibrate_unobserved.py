@@ -10,7 +10,7 @@ import pytest
 from benchmarks.calibration import SetUp
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.geometry import back_project, invert_transform, look_at, pose_at, transform_points
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Bool, Float64, RgbdFrame
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.primitives import Primitive

@@ -14,10 +14,10 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.containers.foxglove import read_foxglove
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.export_run import ExportRunRequest, export_run
+from splatctrl_cli.recording.container.foxglove import read_foxglove
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_folder import open_scene
 from splatctrl_cli.voxels import VoxelState

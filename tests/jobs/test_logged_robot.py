@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.containers.raw_log import RawMessage
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.jobs.ingest import IngestRequest, ingest
@@ -21,14 +19,25 @@ from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replays.inputs import open_log
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.reports.spaces import space_of
+from splatctrl_cli.recording.capture.capture_header import is_capture
+from splatctrl_cli.recording.container.raw_log import RawMessage
+from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.robot.urdf import read_urdf
-from splatctrl_cli.sources.source import describe, open_source
 from tests.jobs.bakes.baked import Said
 from tests.jobs.stage import Stage
-from tests.logs.make_log import START_NS, STORE, LogRecipe, encoded, make_log, messages_of, write_bag, write_raw
-from tests.logs.make_states import joint_state
+from tests.recording.log.make_log import (
+    START_NS,
+    STORE,
+    LogRecipe,
+    encoded,
+    make_log,
+    messages_of,
+    write_bag,
+    write_raw,
+)
+from tests.recording.log.make_states import joint_state
+from tests.recording.state.test_state_files import lerobot
 from tests.robot.shapes import written
-from tests.states.test_state_files import lerobot
 
 BALL = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
 

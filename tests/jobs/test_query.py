@@ -21,7 +21,7 @@ from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.cli.replay_desk import splats_of, write_scene
 from tests.jobs.bakes.baked import baked
-from tests.logs.make_states import START_NS
+from tests.recording.log.make_states import START_NS
 
 BALLS = (((0.0, 0.0, 0.0), 0.10), ((0.5, 0.0, 0.0), 0.05))
 POINTS = np.array([[0.0, 0.0, 0.25], [0.5, 0.0, 0.2], [0.0, 0.0, 0.02], [0.25, 0.3, -0.2], [9.0, 0.0, 0.0]])

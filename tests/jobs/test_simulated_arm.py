@@ -13,15 +13,15 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.progress import Silent
 from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
-from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.mesh_distance import MeshDistance, load_mesh
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.truth import distance_to, load_truth
-from splatctrl_cli.sources.source import open_source
 from tests.robot.shapes import collada, coverage_deficit, written
 
 OPTIONS = RecordingOptions(duration_s=3.0, fps=1.0, width=64, height=48, noise="none", color_rays=0)

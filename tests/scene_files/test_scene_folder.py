@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.arrays import read_arrays, savez
 from splatctrl_cli.files.output import write_json
+from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.scene_files.scene_folder import open_scene
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT, SceneWriter, read_checkpoint
@@ -24,7 +25,6 @@ from splatctrl_cli.scene_files.voxel_file import (
     write_occupancy,
     write_states,
 )
-from splatctrl_cli.sources.source import describe
 from splatctrl_cli.voxels import SWEPT, EvidenceClass, LostEdges, OccupancyGrid, Unseen
 from tests.plain import known, plain_grid, plain_splats
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import GaussianSet, SplatSet
-from splatctrl_cli.sources.source import describe
 from splatctrl_cli.splat_files import usd
 from splatctrl_cli.splat_files.gaussian_ply import REFERENCE_PLY, write_gaussian_ply
 from splatctrl_cli.splat_files.splat_format import SplatFormat, differences

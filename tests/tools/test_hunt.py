@@ -11,11 +11,11 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.replays.state_pass import NEAR_COLUMNS
+from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import Capsule, Motion
 from splatctrl_cli.simulate.primitives import Primitive, Texture, signed_distance
-from splatctrl_cli.sources.source import open_source
 from tools.hunt.clearance import TrueArm, interpolated, least_clearance
 from tools.hunt.families import CAMERAS, FAMILIES, Draft
 from tools.hunt.faults import Fault

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
-from splatctrl_cli.logs.mcap_writer import mcap_log
+from splatctrl_cli.recording.container.mcap_writer import mcap_log
 from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import Block, Capsule, link_shape

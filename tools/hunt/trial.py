@@ -18,7 +18,8 @@ from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays import files, inputs
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Box, Float64, Intrinsics, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, coverage_of_solids
 from splatctrl_cli.robot.link_meshes import Solid
@@ -27,7 +28,6 @@ from splatctrl_cli.robot.urdf import UrdfFile
 from splatctrl_cli.simulate.arm import Motion, arm_spheres_yaml, arm_urdf
 from splatctrl_cli.simulate.primitives import Primitive, Track
 from splatctrl_cli.simulate.render import Camera
-from splatctrl_cli.sources.source import open_source
 from tools.hunt.body import draw_body
 from tools.hunt.clearance import TOLERANCE, Positions, TrueArm, interpolated, least_clearance
 from tools.hunt.families import FAMILIES, LATER, NEWEST, ORDER, Draft

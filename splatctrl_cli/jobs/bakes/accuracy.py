@@ -23,10 +23,10 @@ from splatctrl_cli.field.clustered_splats import Spheres
 from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.field.probability import probabilities
 from splatctrl_cli.jobs.bakes.request import BakeRequest, BakeSource
+from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import DistanceGrid, Float64, JointState, RecordSource, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
-from splatctrl_cli.sources.source import open_source
 
 POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 

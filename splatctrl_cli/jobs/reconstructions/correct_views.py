@@ -16,9 +16,9 @@ from splatctrl_cli.calibration.pose_refinement import (
     unbent,
 )
 from splatctrl_cli.config import fixed
-from splatctrl_cli.datasets.folder_views import HOLDOUT
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.recording.folder.folder_views import HOLDOUT
 from splatctrl_cli.records import Float64, RecordSource, RgbdFrame
 from splatctrl_cli.scene.scale import RecordedDepth
 from splatctrl_cli.scene_files.scene_folder import ViewCorrection

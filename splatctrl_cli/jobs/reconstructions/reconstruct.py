@@ -19,13 +19,13 @@ from splatctrl_cli.jobs.reconstructions.reconstruction import Reconstruction, Re
 from splatctrl_cli.jobs.reconstructions.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
 from splatctrl_cli.jobs.reconstructions.verdict import GATED, Reconstructed, reconstruct_verdict
 from splatctrl_cli.jobs.self_model import learn_from
+from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.declared_contact import Declarations, read_declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
 from splatctrl_cli.scene_files.scene_folder import SELF_MODEL
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT
-from splatctrl_cli.sources.calibrated import LOGGED
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,12 +26,12 @@ from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.reconstructions.reconstruction import training_cameras
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.state_store import StoredAudit
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame, Stamps
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep, time_steps
 from splatctrl_cli.scene_files.scene_folder import open_scene
-from splatctrl_cli.states.state_source import open_states
 
 EVERY = "held_out_every"  # the metric of a scene in lockstep that says which frame sets did not train it
 

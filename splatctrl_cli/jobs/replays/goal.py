@@ -27,9 +27,9 @@ from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.replays.result import OutsideRun
+from splatctrl_cli.recording.state.twists import read_twists
 from splatctrl_cli.records import Float64, FloatRows, Stamps
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.states.twists import read_twists
 
 WORLD = "world"
 TWIST_FIGURES = {

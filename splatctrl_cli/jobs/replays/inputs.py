@@ -22,8 +22,9 @@ from splatctrl_cli.geometry import transform_from, transform_points
 from splatctrl_cli.jobs.logged_robot import other_frame, urdf_of, with_self_model
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.logs.stored_frame import FrameSource
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.recording.log.stored_frame import FrameSource
+from splatctrl_cli.recording.state.state_source import StateSource, open_states
 from splatctrl_cli.records import Box, Float64, RecordSource
 from splatctrl_cli.robot.coverage import LinkCoverage, coverage_of_solids
 from splatctrl_cli.robot.declared_contact import ExpectedContact
@@ -38,7 +39,6 @@ from splatctrl_cli.robot.self_margins import (
     with_kept_margins,
 )
 from splatctrl_cli.robot.self_model import ALWAYS
-from splatctrl_cli.states.state_source import StateSource, open_states
 
 MAX_NOTES = 10  # printed
 GRASPING = 1.0  # [s] before a thing is held, and after, in which the hand may touch it

@@ -31,14 +31,14 @@ from splatctrl_cli.jobs.replays.known_scene import (
     splat_fields,
 )
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.logs.stored_frame import FrameSource
+from splatctrl_cli.recording.calibrated import LOGGED
+from splatctrl_cli.recording.log.stored_frame import FrameSource
+from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Float64, RecordSource, RgbdFrame, UInt8
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.voxel_file import read_seen, read_unrepresented
-from splatctrl_cli.sources.calibrated import LOGGED
 from splatctrl_cli.splat_files.splats import read_ply
-from splatctrl_cli.states.state_source import open_states
 
 FOLDER = "scene"  # within the replay's
 

@@ -23,7 +23,7 @@ from splatctrl_cli.jobs.replays.request import FIRST_MAP, ReplayInputs, ReplayRe
 from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.jobs.replays.state_pass import ReplayRecord
 from splatctrl_cli.jobs.replays.state_store import Figures, StoredLoop, StoredOpenLoop
-from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.model import RobotModel
 

@@ -17,8 +17,8 @@ from splatctrl_cli.config.fixed import (
     SAME_MOTION_STATES,
 )
 from splatctrl_cli.evaluate.same_recording import changed_files, differences
-from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB
-from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB
 from splatctrl_cli.records import RecordSource, Stamps
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.unrepresented import agreement_with_grid

@@ -11,8 +11,8 @@ from splatctrl_cli.jobs.device import RunOptions
 from splatctrl_cli.jobs.logged_robot import RobotOptions
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.jobs.replays.provenance import Mismatch
-from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel

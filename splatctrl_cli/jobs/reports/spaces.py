@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.captures.capture_header import ROBOT
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.output import sha256
@@ -17,6 +16,7 @@ from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.grid_files.iso_surface import iso_surface
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.reports.run_folder import REPLAY, RunFolder, States, open_run
+from splatctrl_cli.recording.capture.capture_header import ROBOT
 from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
 from splatctrl_cli.report.page import Deciding, Motion, Space, SplatsAt, Surface, bodies_of, coarsened
 from splatctrl_cli.robot.model import RobotModel

@@ -5,16 +5,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.datasets.dtu_source import DtuSource
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.evaluate.same_recording import changed_files, differences
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_dtu, open_held_out, refuse_scan_options
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.folder.dtu_source import DtuSource
+from splatctrl_cli.recording.source import lacks_depth, open_session, open_source
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Bool, RecordSource, RgbdFrame
 from splatctrl_cli.scene_files.scene_folder import SceneFolder
-from splatctrl_cli.sources.source import lacks_depth, open_session, open_source
 
 Mask = Callable[[RgbdFrame], Bool | None]
 """A frame -> the pixels (H, W) that the mask rule selects."""

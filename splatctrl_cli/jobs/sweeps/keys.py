@@ -14,7 +14,7 @@ from splatctrl_cli.files.output import sha256
 from splatctrl_cli.jobs.batches.graph import CommandLine
 from splatctrl_cli.jobs.batches.suite import Job
 from splatctrl_cli.jobs.reports.run_folder import REPLAY, RunFolder, open_run
-from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB
+from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB
 from splatctrl_cli.simulate.tabletop import VISITOR
 
 SIMULATE, FIT, BAKE = "simulate", "reconstruct", "sdf-bake"

@@ -14,14 +14,14 @@ from splatctrl_cli.jobs.reconstructions import reconstruct
 from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructRequest
 from splatctrl_cli.jobs.replays.inputs import grasp_contacts, open_log, read_states
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_model import ALWAYS, SelfModel, surface_digest
 from splatctrl_cli.scene_files.scene_folder import SELF_MODEL
 from splatctrl_cli.scene_files.scene_writer import SceneWriter, read_checkpoint
-from splatctrl_cli.sources.source import open_source
 from tests.jobs.bakes.baked import Said
 from tests.robot.shapes import held_part
 

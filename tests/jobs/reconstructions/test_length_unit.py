@@ -17,11 +17,11 @@ from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstructions.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
+from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.sources.source import open_source
 from tests.calibration.scan import views_of
-from tests.datasets.make_layout import OPENGL_FROM_OPTICAL
 from tests.jobs.bakes.baked import Said
+from tests.recording.folder.make_layout import OPENGL_FROM_OPTICAL
 
 CONFIG = Config(scene=SceneConfig(max_splats=600, first_iterations=20, refine_iterations=20))
 DEPTH_ONLY = {"poses": 1.0, "depths": 1000.0}

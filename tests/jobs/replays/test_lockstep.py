@@ -13,8 +13,6 @@ import pytest
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, load_config
-from splatctrl_cli.containers.mcap_log import McapLog
-from splatctrl_cli.containers.raw_log import Damage, RawMessage
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.jobs import replay as job
 from splatctrl_cli.jobs.progress import SILENT, Progress
@@ -22,7 +20,9 @@ from splatctrl_cli.jobs.replays import known_scene
 from splatctrl_cli.jobs.replays.known_scene import KnownFields, from_splats
 from splatctrl_cli.jobs.replays.lockstep import check_lockstep, from_log
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.container.mcap_log import McapLog
+from splatctrl_cli.recording.container.raw_log import Damage, RawMessage
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene
 from tests.jobs.bakes.baked import Said

@@ -19,7 +19,7 @@ from splatctrl_cli.jobs.replays import evidence
 from splatctrl_cli.jobs.replays.evidence import apart_from_robot, held_out, open_evidence, trained
 from splatctrl_cli.jobs.replays.lockstep import from_log
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, Intrinsics, Record, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import time_steps

@@ -17,8 +17,8 @@ from splatctrl_cli.splat_files.splats import read_ply, write_ply
 from splatctrl_cli.voxels import VoxelState
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
 from tests.jobs.stage import FAR, Stage, decisive, states_on
-from tests.logs.make_states import states_of, write_mcap
 from tests.plain import known
+from tests.recording.log.make_states import states_of, write_mcap
 
 pytestmark = pytest.mark.usefixtures("without_plots")
 

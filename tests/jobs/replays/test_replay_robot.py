@@ -18,7 +18,7 @@ from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.jobs.replays import files, state_pass, state_store
 from splatctrl_cli.jobs.replays.inputs import MeasuredRobot, doubts_of, measured_robot
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.logs import state_columns
+from splatctrl_cli.recording.log import state_columns
 from splatctrl_cli.records import Float64, JointState, SphereSet
 from splatctrl_cli.robot import self_margins
 from splatctrl_cli.robot.coverage import refined

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatctrl_cli.datasets.dtu import DtuView, write_dtu
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.jobs.open_recording import RecordingRequest
 from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.folder.dtu import DtuView, write_dtu
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Label, RgbdFrame
 from tests.jobs.scores.wall import (
     AWAY,

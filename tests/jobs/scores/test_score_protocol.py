@@ -12,9 +12,6 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.score import lines_of
-from splatctrl_cli.datasets.dtu import DtuView, read_dtu, write_dtu
-from splatctrl_cli.datasets.dtu_source import DtuSource
-from splatctrl_cli.datasets.idr import write_idr
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.held_out_depth import spaced
 from splatctrl_cli.evaluate.protocols import score_protocol
@@ -23,10 +20,13 @@ from splatctrl_cli.jobs.open_recording import RecordingRequest, is_folder_of_vie
 from splatctrl_cli.jobs.scores.reference import missing_views
 from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.scores.views import CloudSettings
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, write_dtu
+from splatctrl_cli.recording.folder.dtu_source import DtuSource
+from splatctrl_cli.recording.folder.idr import write_idr
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
-from tests.datasets.make_layout import half_size
 from tests.evaluate.make_observed_space import write_observed
+from tests.recording.folder.make_layout import half_size
 
 QUICK = ("-q", "--max-splats", "600", "--set", "scene.first_iterations=8", "--set", "scene.refine_iterations=4")
 HOLDOUT = "holdout:every4"

@@ -6,17 +6,17 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.containers.raw_log import RawMessage
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.jobs.open_recording import RecordingRequest
 from splatctrl_cli.jobs.scores import score as score_job
 from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.recording.container.raw_log import RawMessage
+from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.sources.source import open_source
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.jobs.scores.wall import FakeScene, FakeSnapshot, wall
-from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, make_log, messages_of, write_raw
+from tests.recording.log.make_log import FRAME_NS, START_NS, LogRecipe, make_log, messages_of, write_raw
 
 Keep = Callable[[RawMessage], bool]
 

@@ -1,0 +1,361 @@
+"""A recording with the poses, depths and clock that a calibration says it should have; and one whose depth is noisier
+and whose cameras stand elsewhere than recorded: its frames as they are read.
+"""
+
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.calibration.calibration_file import CalibratedCamera, Calibration, read_calibration
+from splatctrl_cli.config import fixed
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.geometry import compare_poses, interpolate_transform, transform_from
+from splatctrl_cli.recording.capture.capture import CaptureSource
+from splatctrl_cli.recording.folder.folder_views import HOLDOUT
+from splatctrl_cli.recording.log.messages import metres
+from splatctrl_cli.recording.log.ros_log import RosLogSource
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.recording.log.stored_frame import FrameSource, JointTopics, StoredFrame, decoded
+from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB, SourceOptions
+from splatctrl_cli.records import SECOND_NS, Float32, Float64, JointState, LossReport, Record, RgbdFrame, by_stamp
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correction:
+    """A calibration as it is applied to the recording `where`."""
+
+    file: Path
+    calibration: Calibration
+    where: str
+
+    @property
+    def clock_ns(self) -> int:
+        """By how much the stamps of joint states are late against those of frames [ns], to be added to them."""
+        return round((self.calibration.clock or 0.0) * SECOND_NS)
+
+    def camera(self, name: str) -> CalibratedCamera:
+        """A camera of the recording. Raises InputError for one that was not calibrated."""
+        cameras = self.calibration.cameras
+        if name == HOLDOUT and len(cameras) == 1:  # views of the one camera, held out
+            return next(iter(cameras.values()))
+        if name not in cameras:
+            raise InputError(
+                f"{self.where}: camera {name} is not in {self.file}, which has {', '.join(cameras)}",
+                remedy=f"calibrate it too, or leave it out with --cameras {','.join(cameras)}",
+            )
+        return cameras[name]
+
+    def pose(self, name: str, T_recorded: Float64) -> Float64:
+        """T_world_camera (4, 4) of what is recorded as such. Raises InputError where the calibration is not of it."""
+        camera = self.camera(name)
+        if camera.recorded is None:
+            return T_recorded @ camera.T
+        if _same(T_recorded, camera.recorded):
+            return camera.T
+        if _same(T_recorded, camera.T):
+            raise InputError(
+                f"{self.where}: camera {name} is already where {self.file} puts it", remedy="leave --calibration out"
+            )
+        off = 1e3 * float(np.linalg.norm(T_recorded[:3, 3] - camera.recorded[:3, 3]))
+        raise InputError(
+            f"{self.where}: camera {name} is not recorded where {self.calibration.recording}, which was calibrated,"
+            f" has it ({off:.1f} mm apart)",
+            remedy="calibrate this recording: the camera was moved, or its pose was set anew",
+        )
+
+    def late_ns(self, name: str) -> int:
+        """By how much a camera's frames are stamped late against its recorded poses [ns]: 0 where it stands still."""
+        return self.clock_ns if self.clock_ns and self.camera(name).moves else 0
+
+    def depth(self, name: str, depth: Float32) -> Float32:
+        """A depth image [m] as it should be."""
+        camera = self.camera(name)
+        if (camera.scale, camera.bias) == (1.0, 0.0):
+            return depth
+        return np.maximum(np.where(depth > 0, camera.scale * depth + camera.bias, 0.0), 0.0).astype(np.float32)
+
+    def states(self, states: StateColumns) -> StateColumns:
+        """Joint states on the clock of the frames."""
+        return replace(states, stamp_ns=states.stamp_ns + self.clock_ns) if self.clock_ns else states
+
+    def frame(self, frame: RgbdFrame) -> RgbdFrame:
+        """A frame whose pose is already that of its own time by the robot's clock."""
+        T = self.pose(frame.camera, frame.T_world_camera)
+        return replace(frame, T_world_camera=T, depth=self.depth(frame.camera, frame.depth))
+
+    def notes(self, digests: Sequence[str]) -> list[str]:
+        """What a report says of it; digests: sha256 of the recording's files."""
+        text = f"poses, depths and clock are those of {self.file.name}"
+        if set(digests) == set(self.calibration.digests.values()):
+            return [text]
+        return [f"{text}, which was found of another recording ({self.calibration.recording})"]
+
+
+def correction_of(options: SourceOptions, where: str) -> Correction | None:
+    """What the options' calibration comes to; None where there is none. Raises InputError for a file that is none."""
+    if options.calibration is None:
+        return None
+    return Correction(file=options.calibration, calibration=read_calibration(options.calibration), where=where)
+
+
+def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
+    """The source, corrected where the options have a calibration, then perturbed where they ask for it.
+
+    Raises InputError where the calibration is not of it.
+    """
+    correction = correction_of(options, source.name)
+    if correction is not None:
+        source = CalibratedSource(source, correction, round(options.pose_tolerance_s * SECOND_NS))
+    return perturbed(source, options.perturb)
+
+
+class CalibratedSource:
+    """Records of another source as a calibration corrects them.
+
+    Joint states are moved to the clock of the frames. A moving camera is where the recording has it at the time of
+    its frame by the robot's clock: by a log's transforms then, of other recordings between the poses of frames. A
+    frame that has no pose within `tolerance_ns` of that time is left out, and counted.
+    """
+
+    def __init__(self, source: FrameSource, correction: Correction, tolerance_ns: int = 0) -> None:
+        self.inner = source
+        self._correction = correction
+        self._tolerance_ns = tolerance_ns
+        if isinstance(source, CaptureSource) and sha256(correction.file) in source.made_of:
+            raise InputError(
+                f"{source.name}: was ingested with {correction.file}", remedy="leave --calibration out: it is applied"
+            )
+        for camera in source.cameras:
+            correction.camera(camera)
+        self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
+        self.has_clock, self.world_frame = source.has_clock, source.world_frame
+        self.states = correction.states(source.states)
+        for _, camera, T in self._first_poses():
+            correction.pose(camera, T)
+
+    @property
+    def joint_topics(self) -> JointTopics | None:
+        """The topics of the joint states, None where they are on another clock."""
+        if self._correction.clock_ns or not isinstance(self.inner, RosLogSource | CaptureSource):
+            return None
+        return self.inner.joint_topics
+
+    @property
+    def loss(self) -> LossReport:
+        """That of the source, with a note, and with the frames that the clock leaves without a pose."""
+        loss = self.inner.loss
+        notes = self._correction.notes(list(self.inner.digests().values()))
+        return replace(loss, without_pose=loss.without_pose + self._num_without_pose, notes=[*loss.notes, *notes])
+
+    def records(self) -> Iterator[Record]:
+        return decoded(self.stored())
+
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        return by_stamp(self.states, self._frames())
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp."""
+        for stamp, camera, T_recorded in self.inner.poses():
+            T = self._pose(stamp, camera, T_recorded)
+            if T is not None:
+                yield stamp, camera, T
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of the source's files, and of the calibration."""
+        return {**self.inner.digests(), f"{CALIBRATION}{self._correction.file.name}": sha256(self._correction.file)}
+
+    def _frames(self) -> Iterator[StoredFrame]:
+        for item in self.inner.stored():
+            if isinstance(item, StoredFrame):
+                T = self._pose(item.stamp_ns, item.camera, item.T_world_camera)
+                if T is not None:
+                    yield self._corrected(item, T)
+
+    def _corrected(self, stored: StoredFrame, T: Float64) -> StoredFrame:
+        camera = self._correction.camera(stored.camera)
+        if (camera.scale, camera.bias) == (1.0, 0.0):
+            return replace(stored, T_world_camera=T)
+        unit = stored.depth_unit
+        if unit is None or camera.bias:
+            return replace(
+                stored,
+                T_world_camera=T,
+                read_depth=lambda: self._correction.depth(stored.camera, stored.depth),
+                depth_unit=None,
+                depth_file=None,
+            )
+        scaled = unit * camera.scale
+
+        def counted() -> Float32:
+            return metres(np.rint(stored.depth / np.float32(unit)).astype(np.uint16), scaled)
+
+        return replace(stored, T_world_camera=T, read_depth=counted, depth_unit=scaled)
+
+    def _pose(self, stamp_ns: int, camera: str, T_recorded: Float64) -> Float64 | None:
+        late_ns = self._correction.late_ns(camera)
+        T = self._recorded_at(camera, stamp_ns - late_ns) if late_ns else T_recorded
+        return None if T is None else self._correction.pose(camera, T)
+
+    def _recorded_at(self, camera: str, stamp_ns: int) -> Float64 | None:
+        if isinstance(self.inner, RosLogSource):
+            return self.inner.pose_at(camera, stamp_ns)
+        return _between(*self._paths[camera], stamp_ns, self._tolerance_ns)
+
+    @cached_property
+    def _num_without_pose(self) -> int:
+        """Frames that have a pose as recorded, and none at their time by the robot's clock."""
+        return sum(self._pose(*frame) is None for frame in self.inner.poses())
+
+    @cached_property
+    def _paths(self) -> dict[str, tuple[list[int], list[Float64]]]:
+        """Stamps [ns] and recorded poses by camera."""
+        paths: dict[str, tuple[list[int], list[Float64]]] = {}
+        for stamp, camera, T in self.inner.poses():
+            stamps, poses = paths.setdefault(camera, ([], []))
+            stamps.append(stamp)
+            poses.append(T)
+        return paths
+
+    def _first_poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of each camera."""
+        seen: set[str] = set()
+        for stamp, camera, T in self.inner.poses():
+            if camera not in seen:
+                seen.add(camera)
+                yield stamp, camera, T
+                if len(seen) == len(self.cameras):
+                    return
+
+
+def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_ns: int) -> Float64 | None:
+    """The pose (4, 4) at a time between those of a path, its end within a tolerance of that, else None."""
+    after = int(np.searchsorted(stamps, stamp_ns))
+    if after in (0, len(stamps)):
+        end = min(after, len(stamps) - 1)
+        return poses[end] if abs(stamp_ns - stamps[end]) <= tolerance_ns else None
+    share = (stamp_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+    return interpolate_transform(poses[after - 1], poses[after], share)
+
+
+def _same(T_a: Float64, T_b: Float64) -> bool:
+    distance, degrees = compare_poses(T_a, T_b)
+    return distance < fixed.SAME_POSE_METRES and degrees < fixed.SAME_POSE_DEGREES
+
+
+LIMITS = {"depth-noise": 1.0, "pose-error": 10.0, "pose-turn": 180.0, "seed": 2**31 - 1}  # m at 1 m, m, degrees
+
+
+@dataclass(frozen=True, kw_only=True)
+class Perturbation:
+    """What is done to a recording; all of it is drawn from `seed`, so that twice the size is twice the same error.
+
+    depth_noise: standard deviation of each pixel's depth at 1 m [m], growing with the square of the depth, as of a
+    stereo camera. pose_error [m], pose_turn [degrees]: how far each camera is moved in one direction of its own, and
+    turned about one axis of its own, the same in all its frames.
+    """
+
+    depth_noise: float = 0.0
+    pose_error: float = 0.0
+    pose_turn: float = 0.0
+    seed: int = 0
+
+    @classmethod
+    def of(cls, given: Mapping[str, float]) -> "Perturbation | None":
+        """From values by name; None for one that does nothing. Raises UsageError for another name or value."""
+        for name, value in given.items():
+            if name not in LIMITS:
+                raise UsageError(f"--perturb {name}: expected one of {', '.join(LIMITS)}", remedy="leave it out")
+            if not 0 <= value <= LIMITS[name] or (name == "seed" and value != int(value)):
+                raise UsageError(f"--perturb {name}: expected 0 to {LIMITS[name]:g}, got {value:g}")
+        made = cls(**{name.replace("-", "_"): int(v) if name == "seed" else v for name, v in given.items()})  # type: ignore[arg-type]
+        return made if made.depth_noise or made.pose_error or made.pose_turn else None
+
+    def depth(self, camera: str, stamp_ns: int, depth: Float32) -> Float32:
+        """A depth image (H, W) [m] with noise; what had no depth, or has none left, is 0."""
+        noise = self._generator(camera, stamp_ns).standard_normal(depth.shape, np.float32)
+        noisy = depth + np.float32(self.depth_noise) * depth**2 * noise
+        return np.where((depth > 0) & (noisy > 0), noisy, np.float32(0.0)).astype(np.float32)
+
+    def pose(self, camera: str, T_world_camera: Float64) -> Float64:
+        """T_world_camera (4, 4) of a camera that stands elsewhere."""
+        way, axis = self._generator(camera).standard_normal((2, 3))
+        half = np.radians(self.pose_turn) / 2
+        quat_xyzw = [*(np.sin(half) * axis / np.linalg.norm(axis)), np.cos(half)]
+        return np.asarray(T_world_camera @ transform_from(self.pose_error * way / np.linalg.norm(way), quat_xyzw))
+
+    def words(self) -> str:
+        """As on the command line."""
+        values = {"depth-noise": self.depth_noise, "pose-error": self.pose_error, "pose-turn": self.pose_turn}
+        return ",".join(f"{name}={value!r}" for name, value in {**values, "seed": self.seed}.items() if value)
+
+    def _generator(self, camera: str, stamp_ns: int = 0) -> np.random.Generator:
+        return np.random.default_rng([self.seed, zlib.crc32(camera.encode()), stamp_ns % 2**63])
+
+
+class PerturbedSource:
+    """Records of another source, perturbed; nothing is written."""
+
+    def __init__(self, source: FrameSource, perturbation: Perturbation) -> None:
+        self.inner, self._perturbation = source, perturbation
+        self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
+        self.has_clock, self.world_frame = source.has_clock, source.world_frame
+
+    @property
+    def states(self) -> StateColumns:
+        """The joint states, as recorded."""
+        return self.inner.states
+
+    @property
+    def joint_topics(self) -> JointTopics | None:
+        """The topics of the joint states, where the source knows them."""
+        found = getattr(self.inner, "joint_topics", None)
+        return found if isinstance(found, JointTopics) else None
+
+    @property
+    def loss(self) -> LossReport:
+        """That of the source, with a note."""
+        loss = self.inner.loss
+        return replace(loss, notes=[*loss.notes, f"perturbed: {self._perturbation.words()}"])
+
+    def records(self) -> Iterator[Record]:
+        return decoded(self.stored())
+
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        for item in self.inner.stored():
+            yield self._perturbed(item) if isinstance(item, StoredFrame) else item
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp."""
+        for stamp_ns, camera, T in self.inner.poses():
+            yield stamp_ns, camera, self._perturbation.pose(camera, T)
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of the source's files, and what is done to them."""
+        words = self._perturbation.words()
+        return {**self.inner.digests(), f"{PERTURB}{words}": words}
+
+    def _perturbed(self, stored: StoredFrame) -> StoredFrame:
+        asked, T = self._perturbation, self._perturbation.pose(stored.camera, stored.T_world_camera)
+        if not asked.depth_noise:
+            return replace(stored, T_world_camera=T)
+        return replace(
+            stored,
+            T_world_camera=T,
+            read_depth=lambda: asked.depth(stored.camera, stored.stamp_ns, stored.depth),
+            depth_unit=None,
+            depth_file=None,
+        )
+
+
+def perturbed(source: FrameSource, given: Mapping[str, float]) -> FrameSource:
+    """The source, with what is to be done to it. Raises UsageError as `Perturbation.of`."""
+    perturbation = Perturbation.of(given)
+    return source if perturbation is None else PerturbedSource(source, perturbation)
+
+
+LOGGED = RosLogSource | CaptureSource | CalibratedSource | PerturbedSource  # a log's or a capture's records

@@ -1,0 +1,214 @@
+"""``X.capture/``: a recording as a plain folder of images, poses and joints (docs/capture.md)."""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import DAMAGE, NpzFile, npy_of
+from splatctrl_cli.files.image_file import decode_file
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.recording.capture.capture_header import COLUMNS, ROBOT, FileSums, FrameRows, read_capture_header
+from splatctrl_cli.recording.log.messages import metres
+from splatctrl_cli.recording.log.state_columns import NO_STATES, StateColumns
+from splatctrl_cli.recording.log.stored_frame import (
+    AGAIN,
+    StoredFrame,
+    decoded,
+    human_mask,
+    joints_again,
+    read_topics,
+    with_joints,
+    without_joints,
+)
+from splatctrl_cli.recording.log.survey import RobotDescription
+from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB, SourceOptions, refuse_unknown_cameras
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, UInt8, by_stamp
+
+NEEDED = ("stamp_ns", "position", "velocity")
+OPTIONAL = ("commanded_velocity", "T_base_ee", "T_world_ee")  # NaN where a state has none, absent where none has one
+_NOT_FOR_CAPTURES = (
+    *("world_frame", "camera_topics", "camera_poses", "human_topics", "intrinsics"),
+    *("camera_pose_topics", "depth_scale", "root", "holdout", "stamps"),
+)
+
+
+class CaptureSource:
+    """Records of a capture folder; a file whose checksum differs is counted as damage and left out.
+
+    joints: a robot's, to be brought together from the topics that the capture kept, as from those of the log itself;
+    without them, or in a capture that kept none, the states are those of joints.npz.
+    """
+
+    def __init__(self, path: Path, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
+        options.refuse(_NOT_FOR_CAPTURES, "a capture", path)
+        self._path = path
+        self.name = path.name
+        header = read_capture_header(path)
+        self.world_frame = str(header["world_frame"])
+        self.has_clock = bool(header["has_clock"])
+        self.made_of = frozenset(header["sources"].values())  # sha256
+        applied = (CALIBRATION, PERTURB)
+        self._applied = {name: value for name, value in header["sources"].items() if name.startswith(applied)}
+        self.joint_names = tuple(header["joint_names"])
+        self._cameras: dict[str, dict[str, Any]] = header["cameras"]
+        self.cameras = tuple(self._cameras) if options.cameras is None else options.cameras
+        refuse_unknown_cameras(path, self.cameras, self._cameras)
+        self._sums = FileSums(path)
+        self._rows = FrameRows(path / "frames.csv", self.cameras)
+        self._damaged: list[str] = []  # of the last pass
+        self._damaged_before: list[str] = []  # of the pass before it that met most: the last may end early
+        self._loss = LossReport(**header["loss"])
+        described = header.get("joint_topics")
+        self.joint_topics = None if described is None else read_topics(path, described, self._checked)
+        self.states = NO_STATES
+        if joints is None or self.joint_topics is None:
+            options.refuse(("joint_topic",), "the states of one topic in a capture", path)
+            self.states = _read_joints(path) if self.joint_names else NO_STATES
+        else:
+            kept = self.joint_topics
+            self.joint_names, self.states, loss = joints_again(kept, options, joints)
+            others = without_joints(self._loss, kept.loss, kept.first_note)
+            self._loss = with_joints(others, loss, kept.first_note)
+
+    @property
+    def loss(self) -> LossReport:
+        """What `ingest` could not take, and what has been damaged since."""
+        loss = self._loss
+        damaged = max(self._damaged, self._damaged_before, key=len)
+        return replace(loss, damaged=loss.damaged + len(damaged), notes=[*loss.notes, *damaged])
+
+    def records(self) -> Iterator[Record]:
+        return decoded(self.stored())
+
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        self._damaged, self._damaged_before = [], max(self._damaged, self._damaged_before, key=len)
+        return by_stamp(self.states, self._stored_frames())
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of every row of frames.csv."""
+        return ((int(row["stamp_ns"]), row["camera"], _pose(row)) for row in self._rows)
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of SHA256SUMS, which covers every file, and what was applied to it."""
+        return {f"{self.name}/SHA256SUMS": sha256(self._path / "SHA256SUMS"), **self._applied}
+
+    def _stored_frames(self) -> Iterator[StoredFrame]:
+        for row in self._rows:
+            stored = self._stored_frame(row)
+            if stored is not None:
+                yield stored
+
+    def _stored_frame(self, row: Mapping[str, str]) -> StoredFrame | None:
+        """The frame of a row; None, and counted, where an image is not as it was written."""
+        color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
+        human_bytes = self._read(row["human"]) if row.get("human") else None
+        camera = self._cameras[row["camera"]]
+        valid = self._valid(row["valid"], camera) if row.get("valid") else None
+        if color_bytes is None or depth_bytes is None or (row.get("valid") and valid is None):
+            return None
+        color, depth = decode_file(color_bytes, color=True), _decode_depth(row["depth"], depth_bytes, camera)
+        if color is None or depth is None:
+            self._damaged.append(f"{row['color']}, {row['depth']}: cannot be decoded")
+            return None
+        if not color.shape[:2] == depth.shape == (camera["height"], camera["width"]):
+            size = f"{camera['width']}x{camera['height']}"
+            self._damaged.append(f"{row['color']}, {row['depth']}: expected images of {size} as capture.json says")
+            return None
+        intrinsics = Intrinsics(**{f.name: camera[f.name] for f in fields(Intrinsics)})
+        return StoredFrame(
+            stamp_ns=int(row["stamp_ns"]),
+            camera=row["camera"],
+            intrinsics=intrinsics,
+            T_world_camera=_pose(row),
+            read_color=lambda: color,
+            read_depth=lambda: depth,
+            human=None if human_bytes is None else self._human(row["human"], human_bytes, intrinsics),
+            valid=valid,
+            color_file=color_bytes,
+            depth_unit=camera["depth_scale"] if row["depth"].endswith(".png") else None,
+            origin=row["source"],
+        )
+
+    def _valid(self, name: str, camera: Mapping[str, Any]) -> Bool | None:
+        data = self._read(name)
+        pixels = None if data is None else decode_file(data, color=False)
+        if data is not None and (pixels is None or pixels.shape != (camera["height"], camera["width"])):
+            self._damaged.append(f"{name}: not a mask of the images' size")
+            return None
+        return None if pixels is None else np.asarray(pixels > 0)
+
+    def _human(self, name: str, data: bytes, intrinsics: Intrinsics) -> UInt8 | None:
+        pixels = decode_file(data, color=False)
+        if pixels is None:
+            self._damaged.append(f"{name}: cannot be decoded")
+            return None
+        return human_mask(pixels, intrinsics, str(self._path / name))
+
+    def _read(self, name: str) -> bytes | None:
+        path = self._path / name
+        if not path.is_file():
+            self._damaged.append(f"{name}: missing")
+            return None
+        data = path.read_bytes()
+        if self._sums.get(name) != hashlib.sha256(data).hexdigest():
+            self._damaged.append(f"{name}: its checksum differs from SHA256SUMS")
+            return None
+        return data
+
+    def _checked(self, name: str) -> Path:
+        """The path of a file that is as it was written. Raises InputError for another."""
+        file = self._path / name
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise InputError(f"{file}: lies outside the capture", remedy=AGAIN)
+        if not file.is_file() or self._sums.get(name) != sha256(file):
+            raise InputError(f"{file}: missing, or its checksum differs from SHA256SUMS", remedy=AGAIN)
+        return file
+
+
+def robot_description_of(path: Path) -> list[RobotDescription]:
+    """The robot that a capture's log described, none where it did not. Raises InputError for a file that changed."""
+    file = path / ROBOT
+    if not file.is_file():
+        return []
+    if FileSums(path).get(ROBOT) != sha256(file):
+        raise InputError(f"{file}: its checksum differs from SHA256SUMS", remedy=AGAIN)
+    return [RobotDescription(where=ROBOT, text=file.read_bytes().decode("utf-8"))]
+
+
+def _pose(row: Mapping[str, str]) -> Float64:
+    values = [float(row[key]) for key in COLUMNS[4:11]]
+    return transform_from(values[:3], values[3:])
+
+
+def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | None:
+    if name.endswith(".npy"):
+        try:
+            return np.asarray(npy_of(data), dtype=np.float32)
+        except DAMAGE:
+            return None
+    counts, scale = decode_file(data, color=False), camera.get("depth_scale")
+    return None if counts is None or scale is None else metres(counts, scale)
+
+
+def _read_joints(path: Path) -> StateColumns:
+    """The states of a capture folder's joints.npz, read a block at a time. Raises InputError."""
+    file = path / "joints.npz"
+    try:
+        content = NpzFile(file)
+        stamps = content.stamps("stamp_ns", 1, 0, least=0)
+        rows = {name: content.rows(name) for name in (*NEEDED[1:], *OPTIONAL) if name in (*NEEDED, *content.names)}
+    except InputError as error:
+        raise InputError(error.message, remedy=AGAIN) from None
+    if any(len(values) != len(stamps) for values in rows.values()):
+        raise InputError(
+            f"{file}: expected {len(stamps)} states in every array, got "
+            + ", ".join(f"{name} {len(values)}" for name, values in rows.items()),
+            remedy=AGAIN,
+        )
+    return StateColumns(stamp_ns=stamps, **rows)

@@ -1,0 +1,246 @@
+"""What a capture says of itself: capture.json, by which the rest is read, frames.csv and SHA256SUMS, a row at a time:
+some fifty bytes of memory a file.
+"""
+
+import csv
+import hashlib
+import json
+import math
+import tempfile
+import weakref
+from array import array
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import fields
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.files.spilled_rows import scratch_folder
+from splatctrl_cli.recording.log.stored_frame import AGAIN
+from splatctrl_cli.records import LossReport
+
+FORMAT, VERSION = "splatctrl-capture", 1
+INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
+
+
+def check_header(file: Path, header: Mapping[str, Any]) -> None:
+    """Raise InputError naming the first entry that is missing or of another kind."""
+    for name, is_right, expected in _ENTRIES:
+        if name not in header:
+            raise InputError(f"{file}: {name} is missing", remedy=AGAIN)
+        if not is_right(header[name]):
+            raise InputError(f"{file}: {name}: expected {expected}", remedy=AGAIN)
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _are_names(value: object) -> bool:
+    return isinstance(value, list) and all(map(_is_text, value))
+
+
+def _are_cameras(value: object) -> bool:
+    return isinstance(value, dict) and all(map(_is_camera, value.values()))
+
+
+def _is_camera(value: object) -> bool:
+    if not isinstance(value, dict):
+        return False
+    sides = [value.get(name) for name in ("width", "height")]
+    scale = value.get("depth_scale")
+    return (
+        all(isinstance(side, int) and 0 < side <= 65_536 for side in sides)
+        and all(_is_number(value.get(name)) for name in ("fx", "fy", "cx", "cy"))
+        and min(value["fx"], value["fy"]) > 0
+        and (scale is None or (_is_number(scale) and scale > 0))
+    )
+
+
+def _is_loss(value: object) -> bool:
+    counts = {field.name for field in fields(LossReport)} - {"notes"}
+    return isinstance(value, dict) and all(
+        _are_names(entry) if name == "notes" else name in counts and isinstance(entry, int)
+        for name, entry in value.items()
+    )
+
+
+_ENTRIES: tuple[tuple[str, Callable[[object], bool], str], ...] = (
+    ("world_frame", _is_text, "a name"),
+    ("has_clock", lambda value: isinstance(value, bool), "true or false"),
+    ("joint_names", _are_names, "a list of names"),
+    ("cameras", _are_cameras, "by name width, height, fx, fy, cx, cy and depth_scale of each"),
+    ("loss", _is_loss, "counts by name, and notes"),
+    ("sources", lambda value: isinstance(value, dict), "sha256 by name"),
+    ("name", _is_text, "a name"),
+)
+
+
+def is_capture(path: Path) -> bool:
+    """Whether a folder holds a capture."""
+    return (path / "capture.json").is_file()
+
+
+def read_capture_header(path: Path) -> dict[str, Any]:
+    """capture.json. Raises InputError where it is not one of ours, or of a newer kind."""
+    file = path / "capture.json"
+    try:
+        header = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise InputError(f"{file}: cannot be read: {error}", remedy=AGAIN) from None
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise InputError(f"{file}: not a splatctrl capture", remedy="expected what `splatctrl ingest` writes")
+    if header.get("version") != VERSION:
+        raise InputError(
+            f"{file}: expected version {VERSION}, got {header.get('version')}", remedy="use a newer splatctrl"
+        )
+    check_header(file, header)
+    _check_index(path)
+    return header
+
+
+def _check_index(path: Path) -> None:
+    """Raises InputError where an index file is not as it was written: nothing in it can be trusted then."""
+    sums = FileSums(path)
+    for name in INDEX_FILES:
+        if not (path / name).is_file():
+            raise InputError(f"{path / name}: missing", remedy=AGAIN)
+        if sums.get(name) != sha256(path / name):
+            raise InputError(f"{path / name}: its checksum differs from SHA256SUMS", remedy=AGAIN)
+
+
+SUMS = "SHA256SUMS"
+COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
+MASKS = ("human", "valid")  # further columns, where the recording has such masks
+ROBOT = "robot_description.urdf"  # the URDF that the log itself brings, where it does
+_FURTHER = ((), *((mask,) for mask in MASKS), MASKS)  # columns of frames.csv after COLUMNS
+_MOST_ROW = 1 << 16  # bytes of a row
+IN_MEMORY = 1 << 16  # [bytes] of the lines of one folder
+_UNREADABLE = (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError)
+
+
+class FrameRows:
+    """Rows of frames.csv of some cameras, in its order, read each time that they are asked for."""
+
+    def __init__(self, file: Path, cameras: Collection[str]) -> None:
+        """Raises InputError for a row that cannot be read, or that names a file outside the capture."""
+        self._file, self._cameras = file, cameras
+        try:
+            self._num = sum(1 for _ in self._read())
+        except _UNREADABLE as error:
+            raise InputError(f"{file}: cannot be read: {error}", remedy=AGAIN) from None
+
+    def __iter__(self) -> Iterator[Mapping[str, str]]:
+        """Raises InputError where the file is no longer what it was."""
+        num, changed = 0, InputError(f"{self._file}: changed while it was read", remedy="try again")
+        try:
+            for row in self._read():
+                num += 1
+                yield row
+        except _UNREADABLE:
+            raise changed from None
+        if num != self._num:
+            raise changed
+
+    def _read(self) -> Iterator[Mapping[str, str]]:
+        with self._file.open("rb") as stream:
+            lines = iter(lambda: stream.readline(_MOST_ROW), b"")
+            rows = csv.reader((line.decode("utf-8") for line in lines), strict=True)
+            names = tuple(next(rows, ()))
+            if names[: len(COLUMNS)] != COLUMNS or names[len(COLUMNS) :] not in _FURTHER:
+                raise InputError(f"{self._file}: expected columns {', '.join(COLUMNS)}", remedy=AGAIN)
+            for values in filter(None, rows):
+                row = _checked(dict(zip(names, values, strict=True)))
+                if row["camera"] in self._cameras:
+                    yield row
+
+
+def _checked(row: Mapping[str, str]) -> Mapping[str, str]:
+    """The row itself. Raises ValueError for what is no frame."""
+    int(row["stamp_ns"])
+    for key in COLUMNS[4:11]:
+        float(row[key])
+    for name in (row["color"], row["depth"], *(row.get(mask) or "" for mask in MASKS)):
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts:
+            raise ValueError(f"{name} lies outside the capture")
+    return row
+
+
+class FileSums:
+    """SHA256SUMS: the checksum that it says of a file, by name."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises InputError where there is none."""
+        file = folder / SUMS
+        if not file.is_file():
+            raise InputError(f"{file}: missing", remedy=f"the capture was not finished; {AGAIN}")
+        keys, sums = array("Q"), bytearray()
+        with file.open("rb") as stream:
+            while line := stream.readline(_MOST_ROW):
+                try:
+                    digest = bytes.fromhex(line[:64].decode("ascii"))
+                except ValueError:  # UnicodeDecodeError among them
+                    continue
+                if len(digest) == 32:
+                    keys.append(_key(line[66:].rstrip(b"\r\n")))
+                    sums += digest
+        order = np.argsort(np.frombuffer(keys, dtype=np.uint64), kind="stable")
+        self._keys = np.frombuffer(keys, dtype=np.uint64)[order]
+        self._sums = np.frombuffer(sums, dtype=np.uint8).reshape(-1, 32)[order]
+
+    def get(self, name: str) -> str | None:
+        """The sha256, hexadecimal, that the last line of a name says; None where there is none."""
+        at = int(np.searchsorted(self._keys, np.uint64(_key(name.encode())), side="right")) - 1
+        if at < 0 or int(self._keys[at]) != _key(name.encode()):
+            return None
+        return bytes(self._sums[at]).hex()
+
+
+def _key(name: bytes) -> int:
+    """64 bits of a name; two that share them would make a good file look damaged."""
+    return int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little")
+
+
+class Checksums:
+    """SHA256SUMS to be written, by name. Lines of a folder wait in a file without a name, as they come in order."""
+
+    def __init__(self) -> None:
+        self._folders: dict[str, IO[bytes]] = {}
+        self._others: dict[str, str] = {}
+
+    def add(self, digest: str, name: str) -> None:
+        """Of a file in a folder, after those before it there."""
+        folder = name.rpartition("/")[0]
+        if folder not in self._folders:
+            self._folders[folder] = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
+            weakref.finalize(self, self._folders[folder].close)
+        self._folders[folder].write(_line(digest, name))
+
+    def add_other(self, digest: str, name: str) -> None:
+        """Of one of few files, in any order, any number of times; not in a folder of `add`."""
+        self._others[name] = digest
+
+    def write(self, path: Path) -> None:
+        """All lines, by name."""
+        blocks = sorted([*(f"{folder}/" for folder in self._folders), *self._others])
+        with path.open("wb") as stream:
+            for block in blocks:
+                if block in self._others:
+                    stream.write(_line(self._others[block], block))
+                    continue
+                lines = self._folders[block[:-1]]
+                lines.seek(0)
+                while piece := lines.read(1 << 20):
+                    stream.write(piece)
+
+
+def _line(digest: str, name: str) -> bytes:
+    return f"{digest}  {name}\n".encode()

@@ -1,0 +1,371 @@
+"""Writes a capture folder (docs/capture.md) frame by frame, in bounded memory; what was written so far is in a
+journal, a line a frame, so that a killed run goes on.
+"""
+
+import csv
+import hashlib
+import json
+import shutil
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any, TextIO
+
+import cv2
+import numpy as np
+from numpy.lib import format as npy
+
+from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
+from splatctrl_cli.errors import InputError, UsageError, WriteError
+from splatctrl_cli.files.output import sha256, write_json
+from splatctrl_cli.files.spilled_rows import Table, blocks_of
+from splatctrl_cli.geometry import quat_from_rotation
+from splatctrl_cli.recording.capture.capture_header import COLUMNS, FORMAT, MASKS, ROBOT, VERSION, Checksums
+from splatctrl_cli.recording.log.messages import metres
+from splatctrl_cli.recording.log.state_columns import StateCollector, StateColumns
+from splatctrl_cli.recording.log.stored_frame import (
+    FOLDER,
+    FrameSource,
+    JointTopics,
+    StoredFrame,
+    is_png,
+    write_topics,
+)
+from splatctrl_cli.records import Float32, JointState, LossReport
+
+JOURNAL = "ingest.jsonl"  # in the folder while it is partial
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A frame that is on disk: its row of frames.csv, (sha256, name) of its files, its row of provenance.csv."""
+
+    row: Mapping[str, str]
+    sums: Sequence[tuple[str, str]]
+    provenance: Mapping[str, str]
+
+
+class Journal:
+    """The journal of a partial folder; entries of an earlier run come back one by one, then new ones are added."""
+
+    def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
+        """identity: what decides the bytes; kept for whoever goes on."""
+        self._path = folder / JOURNAL
+        self._files = ExitStack()
+        self.num_entries = 0
+        self.masks: set[str] = set()  # the columns that some frame has
+        self.has_provenance = False
+        folder.mkdir(parents=True, exist_ok=True)
+        if not self._path.is_file():
+            self._path.write_text(json.dumps({"identity": identity}) + "\n", encoding="utf-8")
+        self._cut()
+        self._kept = _lines(self._path)
+        next(self._kept, None)
+        self._stream: TextIO = self._files.enter_context(self._path.open("a", encoding="utf-8"))
+
+    def __enter__(self) -> "Journal":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._files.close()
+
+    def kept(self) -> Entry | None:
+        """The next frame of the earlier run; None after the last."""
+        found = next(self._kept, None)
+        if found is None:
+            return None
+        entry = Entry(**found)
+        self._count(entry)
+        return entry
+
+    def add(self, entry: Entry) -> None:
+        """A frame whose files are written."""
+        self._count(entry)
+        self._stream.write(json.dumps(vars(entry)) + "\n")
+        self._stream.flush()
+
+    def entries(self) -> Iterator[Entry]:
+        """All so far, in their order."""
+        lines = _lines(self._path)
+        next(lines, None)
+        yield from (Entry(**line) for line in lines)
+
+    def remove(self) -> None:
+        """Once everything is written."""
+        self._files.close()
+        self._path.unlink()
+
+    def _count(self, entry: Entry) -> None:
+        self.num_entries += 1
+        self.masks |= set(MASKS) & entry.row.keys()
+        self.has_provenance |= bool(entry.provenance)
+
+    def _cut(self) -> None:
+        """Leave out a last line that was not finished."""
+        with self._path.open("rb") as stream:
+            size = sum(len(line) for line in stream if line.endswith(b"\n"))
+        with self._path.open("r+b") as stream:
+            stream.truncate(size)
+
+
+def read_identity(folder: Path) -> Mapping[str, Any] | None:
+    """What decided the bytes of the run that was interrupted; None where there is none to go on with."""
+    path = folder / JOURNAL
+    first = next(_lines(path), None) if path.is_file() else None
+    return None if first is None else first.get("identity")
+
+
+def check_not_partial(folder: Path) -> None:
+    """Raise InputError for what an interrupted run left."""
+    if (folder / JOURNAL).is_file():
+        raise InputError(
+            f"{folder}: an ingest that was interrupted", remedy="continue it with the same command and --resume"
+        )
+
+
+def check_same_frame(folder: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
+    """Raise UsageError where a frame that was written is not the one that the source gives now."""
+    differing = [name for name in now if before.get(name) != now[name]]
+    if differing:
+        name = differing[0]
+        raise UsageError(
+            f"{folder}: --resume: {before.get('color')}: {name} was {before.get(name)}, is {now[name]}",
+            remedy="the source has changed; start over without --resume",
+        )
+
+
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    """Of a file as long as it is read."""
+    with path.open(encoding="utf-8") as stream:
+        for line in stream:
+            if line.endswith("\n"):
+                yield json.loads(line)
+
+
+PROVENANCE = "provenance.csv"
+PLACE = ("file", "offset", "log_time_ns")
+PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))
+PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]  # docs/benchmarks.md
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureSummary:
+    """What was written; num_resumed: frames of an earlier run."""
+
+    num_frames: dict[str, int]
+    num_joint_states: int
+    loss: LossReport
+    num_resumed: int = 0
+
+
+def write_capture(
+    folder: Path,
+    source: FrameSource,
+    *,
+    topics: JointTopics | None = None,
+    robot: str = "",
+    progress: Callable[[int], None] | None = None,
+    identity: Mapping[str, Any] | None = None,
+) -> CaptureSummary:
+    """Write all of `source` into `folder`; the same input gives the same bytes.
+
+    The folder is empty, or what an interrupted run left: its frames are not written again. JPEG and PNG colour is
+    kept byte for byte where its pixels are the frame's; depth becomes 16-bit PNG in the unit it was recorded in, or
+    .npy [m] where no unit holds it. topics: the joint states as they were recorded, beside those of `source`, which
+    are of one topic. robot: the URDF that the log itself brings, "" for none. Raises InputError when the source
+    yields no frame, UsageError where the frames that are there are not the source's.
+    """
+    states = StateCollector(len(source.joint_names))
+    cameras: dict[str, dict[str, Any]] = {}
+    num_states = num_resumed = 0
+    with Journal(folder, identity or {}) as journal:
+        for item in source.stored():
+            if isinstance(item, JointState):
+                states.add(item)
+                num_states += 1
+                continue
+            row, kept = _row(item, cameras), journal.kept()
+            if kept is None:
+                journal.add(_write_frame(folder, item, row, cameras[item.camera]))
+            else:
+                check_same_frame(folder, kept.row, row)
+                num_resumed += 1
+            if progress is not None:
+                progress(journal.num_entries)
+        if not journal.num_entries:
+            raise InputError(f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
+        header = {
+            "format": FORMAT,
+            "version": VERSION,
+            "name": source.name,
+            "world_frame": source.world_frame,
+            "units": {"length": "m", "time": "ns", "angle": "rad"},
+            "pose": "T_world_camera, optical frame (x right, y down, z forward), quaternion x y z w",
+            "pixels": "pixel (0, 0) is centred at u = v = 0",
+            "has_clock": source.has_clock,
+            "cameras": cameras,
+            "joint_names": list(source.joint_names),
+            "sources": source.digests(),
+            "loss": asdict(source.loss),
+        }
+        _write_joints(folder / "joints.npz", states.columns())
+        _write_index(folder, header, journal, topics, robot)
+        journal.remove()
+    return CaptureSummary(
+        num_frames={name: camera["num_frames"] for name, camera in cameras.items()},
+        num_joint_states=num_states,
+        loss=source.loss,
+        num_resumed=num_resumed,
+    )
+
+
+def _write_index(
+    folder: Path, header: dict[str, Any], journal: Journal, topics: JointTopics | None, robot: str
+) -> None:
+    """frames.csv, provenance.csv, joint topics, the robot's URDF, capture.json and SHA256SUMS, which names everything
+    but itself.
+    """
+    names = ["joints.npz", "frames.csv"]
+    if robot:
+        (folder / ROBOT).write_text(robot, encoding="utf-8", newline="")
+        names.append(ROBOT)
+    columns = (*COLUMNS, *(name for name in MASKS if name in journal.masks))
+    _write_table(folder / "frames.csv", columns, (entry.row for entry in journal.entries()))
+    if journal.has_provenance:
+        names.append(PROVENANCE)
+        _write_table(folder / PROVENANCE, PROVENANCE_COLUMNS, (entry.provenance for entry in journal.entries()))
+    if topics is not None and topics.topics:
+        shutil.rmtree(folder / FOLDER, ignore_errors=True)  # what an interrupted run left
+        header = header | {"joint_topics": write_topics(folder, topics, names.append)}
+    write_json(folder / "capture.json", header)
+    sums = Checksums()
+    for entry in journal.entries():
+        for digest, name in entry.sums:
+            is_of_lens = name.startswith("valid/")  # not in the order of frames, which share it
+            (sums.add_other if is_of_lens else sums.add)(digest, name)
+    for name in [*names, "capture.json"]:
+        sums.add_other(sha256(folder / name), name)
+    sums.write(folder / "SHA256SUMS")
+
+
+def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
+    """The frame's row of frames.csv, but for the suffixes of its files; its camera is counted."""
+    if stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera):
+        raise InputError(
+            f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="rename the camera"
+        )
+    unit = FLOAT_DEPTH_UNIT if stored.depth_unit is None else stored.depth_unit
+    intrinsics = vars(stored.intrinsics)
+    camera = cameras.setdefault(stored.camera, {**intrinsics, "depth_scale": unit, "num_frames": 0})
+    if any(camera[name] != value for name, value in intrinsics.items()):
+        raise InputError(
+            f"{stored.origin}: camera {stored.camera} changes its intrinsics; a capture holds one set of each camera",
+            remedy="leave --holdout to `reconstruct` and `score`",
+        )
+    camera["num_frames"] += 1
+    T = stored.T_world_camera
+    pose = [repr(float(value)) for value in (*T[:3, 3], *quat_from_rotation(T[:3, :3]))]
+    return {
+        "camera": stored.camera,
+        "stamp_ns": str(stored.stamp_ns),
+        **dict(zip(COLUMNS[4:11], pose, strict=True)),
+        "source": stored.origin,
+    }
+
+
+def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera: Mapping[str, Any]) -> Entry:
+    """Write the images of a frame whose row is without their names."""
+    stem, unit = f"{camera['num_frames'] - 1:06d}", float(camera["depth_scale"])
+    color = stored.color_file or encoded(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
+    color_name = f"color/{stored.camera}/{stem}.{'png' if is_png(color) else 'jpg'}"
+    kind, depth = _depth_file(stored, unit)
+    depth_name = f"depth/{stored.camera}/{stem}.{kind}"
+    files = {color_name: color, depth_name: depth}
+    named = {"color": color_name, "depth": depth_name}
+    if stored.human is not None:
+        named["human"] = f"human/{stored.camera}/{stem}.png"
+        files[named["human"]] = encoded(stored.human * np.uint8(255))
+    if stored.valid is not None:
+        mask = encoded(stored.valid * np.uint8(255))
+        named["valid"] = f"valid/{stored.camera}/{hashlib.sha256(mask).hexdigest()[:16]}.png"
+        files[named["valid"]] = mask
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    sums = [(hashlib.sha256(data).hexdigest(), name) for name, data in files.items()]
+    return Entry(row=row | named, sums=sums, provenance=_provenance(stored, color_name, depth_name))
+
+
+def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
+    """Where the images of a frame were recorded; a byte that is not known stays empty."""
+    if not stored.places:
+        return {}
+    found = {"color": color, "depth": depth}
+    for kind, place in zip(("color", "depth"), stored.places, strict=False):
+        offset = "" if place.offset < 0 else str(place.offset)
+        found |= {f"{kind}_file": place.file, f"{kind}_offset": offset, f"{kind}_log_time_ns": str(place.log_time_ns)}
+    return found
+
+
+def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
+    """Suffix and bytes of the depth image: the recorded PNG where it counts in the camera's unit."""
+    if stored.depth_file is not None and stored.depth_unit == unit:
+        return "png", stored.depth_file
+    counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)
+    return ("npy", _npy(stored.depth)) if counts is None else ("png", encoded(counts))
+
+
+def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:
+    """Depth as uint16 counts of `unit`; None where they would not give the depth back."""
+    if depth.max(initial=0.0) / unit > 65534.5:
+        return None
+    counts = np.round(depth / np.float32(unit)).astype(np.uint16)
+    error = np.abs(metres(counts, unit) - depth).max(initial=0.0)
+    return counts if error <= (0.0 if is_exact else FLOAT_DEPTH_ERROR) else None
+
+
+def encoded(pixels: np.ndarray[Any, Any]) -> bytes:
+    """The PNG file of an image."""
+    is_written, data = cv2.imencode(".png", pixels, PNG)
+    if not is_written:
+        raise WriteError(f"an image of shape {pixels.shape} could not be encoded as PNG")
+    return bytes(data)
+
+
+def _npy(depth: Float32) -> bytes:
+    stream = BytesIO()
+    np.save(stream, np.ascontiguousarray(depth, dtype="<f4"), allow_pickle=False)
+    return stream.getvalue()
+
+
+def _write_joints(path: Path, states: StateColumns) -> None:
+    """joints.npz as numpy.savez would write it, a block at a time."""
+    columns: dict[str, Table | None] = {
+        "position": states.position,
+        "velocity": states.velocity,
+        "commanded_velocity": states.commanded_velocity,
+        "T_base_ee": states.T_base_ee,
+        "T_world_ee": states.T_world_ee,
+    }
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        with archive.open("stamp_ns.npy", "w", force_zip64=True) as stream:
+            npy.write_array(stream, states.stamp_ns, allow_pickle=False)
+        for name, rows in columns.items():
+            if rows is None:
+                continue
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                header = {"descr": "<f8", "fortran_order": False, "shape": tuple(rows.shape)}
+                npy.write_array_header_1_0(stream, header)
+                for block in blocks_of(rows):
+                    stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())

@@ -1,0 +1,389 @@
+"""The messages of ROS bags: ROS 1, with or without index, and ROS 2 sqlite3; damage is left out and counted.
+
+A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is a sequence of records, each a header of named fields and a
+body, read from front to back in bounded memory. Its index stands at the end and is written last, so a bag that was
+cut, or is still being written, has none: nothing here needs it.
+
+rosbags' reader of ROS 2 (rosbags/rosbag2/storage_sqlite3.py) counts all messages when it opens a file, and so refuses
+one with a single bad page. Tables as rosbag2_storage_sqlite3 creates them: topics, messages, since Iron
+message_definitions.
+"""
+
+import shutil
+import sqlite3
+import struct
+import tempfile
+import weakref
+from collections.abc import Collection, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+from urllib.parse import quote
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.spilled_rows import scratch_folder
+from splatctrl_cli.files.unpacking import MAX_BLOCK, PIECE, BadBlockError, Budget, unpacked_start
+from splatctrl_cli.recording.container.foxglove import standing_in
+from splatctrl_cli.recording.container.mcap_log import ros_type_name
+from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.records import SECOND_NS
+
+MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
+_KINDS = frozenset({MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION})
+_U32 = struct.Struct("<I")
+_MARK = b"compression="  # of a chunk's header, behind its length and perhaps the fields `op` and `size`
+_MARK_OFFSETS = (8, 16, 21, 29)
+
+Fields = dict[str, bytes]
+
+
+class BagRecord(NamedTuple):
+    """One record: its fields and body; the body is what the file still holds of it where it is cut."""
+
+    offset: int
+    kind: int
+    fields: Fields
+    body: bytes
+    is_cut: bool = False
+
+
+class BagFile:
+    """Walks over the records of one file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.size = path.stat().st_size
+
+    def records(self, damage: Damage) -> Iterator[BagRecord]:
+        """Yield chunks, connections, messages and the bag's header in order; what is lost goes to `damage`."""
+        with self.path.open("rb") as stream:
+            if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
+                damage.add(f"{self.path.name}: is not a bag of format 2.0")
+                return
+            while stream.tell() < self.size:
+                offset = stream.tell()
+                record = self._record(stream, offset)
+                if record is not None and not record.is_cut:
+                    yield record
+                    continue
+                place = self._next_chunk(stream, offset)
+                if place is None:
+                    damage.add(f"{self.path.name}: cut or damaged after byte {offset}")
+                    if record is not None:
+                        yield record
+                    return
+                damage.add(f"{self.path.name}: bytes {offset} to {place} are damaged and were left out")
+                stream.seek(place)
+
+    def connections(self) -> list[BagRecord]:
+        """The connections that the index at the end names; none where there is no index."""
+        with self.path.open("rb") as stream:
+            stream.readline(64)
+            first = self._record(stream, stream.tell())
+            place = number(first.fields, "index_pos") if first is not None and first.kind == BAG_HEADER else 0
+            if not 0 < place < self.size:
+                return []
+            stream.seek(place)
+            found = []
+            while (record := self._record(stream, stream.tell())) is not None and record.kind == CONNECTION:
+                found.append(record)
+            return found
+
+    def _record(self, stream: BinaryIO, offset: int) -> BagRecord | None:
+        """The record at `offset`, None where there is none; the stream is left behind it."""
+        head = self._head(stream)
+        if head is None:
+            return None
+        kind, fields, length = head
+        end = stream.tell() + length
+        is_cut = end > self.size
+        is_read = kind in {MESSAGE, CHUNK, CONNECTION} or is_cut
+        body = stream.read(min(length, MAX_BLOCK)) if is_read else b""
+        stream.seek(min(end, self.size))
+        return BagRecord(offset, kind, fields, body, is_cut)
+
+    def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
+        """Kind, fields and length of the body of the record that begins here; the stream is left at the body."""
+        length = self._length(stream)
+        if length is None or length > min(1 << 20, self.size - stream.tell()):  # those of connections hold a name
+            return None
+        fields = fields_of(stream.read(length))
+        kind = fields["op"][0] if fields is not None and len(fields.get("op", b"")) == 1 else 0
+        length = self._length(stream)
+        return None if fields is None or kind not in _KINDS or length is None else (kind, fields, length)
+
+    def _next_chunk(self, stream: BinaryIO, offset: int) -> int | None:
+        """Where behind `offset` a whole chunk begins, by the fields of its header."""
+        stream.seek(offset + 1)
+        kept = b""
+        while block := stream.read(PIECE):
+            here = stream.tell()
+            base, block = here - len(block) - len(kept), kept + block
+            at = block.find(_MARK)
+            while at >= 0:
+                for back in _MARK_OFFSETS:
+                    place = base + at - back
+                    if place > offset and self._is_chunk(stream, place):
+                        return place
+                at = block.find(_MARK, at + 1)
+            stream.seek(here)
+            kept = block[-(len(_MARK) - 1) :]
+        return None
+
+    def _is_chunk(self, stream: BinaryIO, place: int) -> bool:
+        stream.seek(place)
+        head = self._head(stream)
+        return head is not None and head[0] == CHUNK and stream.tell() + head[2] <= self.size
+
+    @staticmethod
+    def _length(stream: BinaryIO) -> int | None:
+        content = stream.read(4)
+        return int(_U32.unpack(content)[0]) if len(content) == 4 else None
+
+
+def fields_of(header: bytes) -> Fields | None:
+    """The named fields of a record's header; None where its lengths do not fit."""
+    found: Fields = {}
+    at = 0
+    while at < len(header):
+        if at + 4 > len(header):
+            return None
+        length = _U32.unpack_from(header, at)[0]
+        at += 4 + length
+        name, equals, value = header[at - length : at].partition(b"=")
+        if at > len(header) or not equals:
+            return None
+        found[name.decode("latin-1")] = value
+    return found
+
+
+def number(fields: Fields, name: str) -> int:
+    """A field of four or eight bytes as a number; -1 where it is missing."""
+    value = fields.get(name, b"")
+    return int.from_bytes(value, "little") if len(value) in {4, 8} else -1
+
+
+def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
+    """Yield kind, fields and body of the records of an unpacked chunk, up to the first that does not fit.
+
+    Raises ValueError where bytes are left that are not a record.
+    """
+    at = 0
+    while at < len(content):
+        if at + 4 > len(content):
+            raise ValueError(f"{len(content) - at} bytes are not a record")
+        start = at + 4
+        end = start + _U32.unpack_from(content, at)[0]
+        fields = fields_of(content[start:end]) if end + 4 <= len(content) else None
+        if fields is None:
+            raise ValueError(f"{len(content) - at} bytes are not a record")
+        body = end + 4
+        at = body + _U32.unpack_from(content, end)[0]
+        kind = fields.get("op", b"")
+        if at > len(content) or len(kind) != 1:
+            raise ValueError(f"{len(content) - body} bytes are not a record")
+        yield kind[0], fields, content[body:at]
+
+
+class Bag1Log:
+    """One ROS 1 bag.
+
+    rosbags' reader (rosbags/rosbag1/reader.py) goes by the index: it refuses a bag without one, and ends at the
+    first damaged chunk. Raises InputError where there is no record at all.
+    """
+
+    container = "ROS 1 bag"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.files = (path,)
+        self._file = BagFile(path)
+        self._topics: dict[int, Topic] = {}
+        if next(self._file.records(Damage()), None) is None:
+            raise InputError(f"{path}: not a readable ROS 1 bag: no whole record", remedy="record or copy it again")
+        for record in self._file.connections():
+            self._connect(record.fields, record.body, Damage())
+
+    def topics(self) -> tuple[Topic, ...]:
+        """The connections of the index, and those met while reading."""
+        return tuple(self._topics.values())
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Yield messages in file order; a chunk that does not unpack is left out, a cut one read to its cut."""
+        budget, num_indexed, num_chunks = Budget(self._file.size), 0, None
+        for record in self._file.records(damage):
+            if record.kind == BAG_HEADER:
+                num_chunks = number(record.fields, "chunk_count")
+                if number(record.fields, "index_pos") <= 0:
+                    damage.add(f"{self.path.name}: has no index: cut, or still being written")
+                    num_chunks = 0
+            elif record.kind == CHUNK_INFO:
+                num_indexed += 1
+            elif record.kind == CHUNK:
+                yield from self._chunk(record, budget, damage, names)
+            elif not record.is_cut:
+                yield from self._read(record.kind, record.fields, record.body, record.offset, damage, names)
+        if num_chunks is None or num_indexed < num_chunks:
+            damage.add(f"{self.path.name}: its index is not whole")
+
+    def _chunk(
+        self, record: BagRecord, budget: Budget, damage: Damage, names: Collection[str] | None
+    ) -> Iterator[RawMessage]:
+        compression = record.fields.get("compression", b"").decode("latin-1")
+        size = number(record.fields, "size")
+        try:
+            unpack = unpacked_start if record.is_cut else budget.unpacked
+            content = unpack(record.body, compression, size)
+            for kind, fields, body in records_in(content):
+                yield from self._read(kind, fields, body, record.offset, damage, names)
+        except (BadBlockError, ValueError) as error:
+            if not record.is_cut:  # the cut has been counted
+                damage.add(f"{self.path.name}: the chunk at byte {record.offset} was left out: {error}")
+
+    def _read(
+        self, kind: int, fields: Fields, body: bytes, offset: int, damage: Damage, names: Collection[str] | None
+    ) -> Iterator[RawMessage]:
+        if kind == CONNECTION:
+            self._connect(fields, body, damage)
+        elif kind == MESSAGE:
+            topic, time = self._topics.get(number(fields, "conn")), fields.get("time", b"")
+            if topic is None or len(time) != 8:
+                damage.add(f"{self.path.name}: a message without a connection or time")
+            elif names is None or topic.name in names:
+                seconds, nanoseconds = int.from_bytes(time[:4], "little"), int.from_bytes(time[4:], "little")
+                at = seconds * SECOND_NS + nanoseconds
+                yield RawMessage(topic=topic, log_time_ns=at, data=body, file=self.path.name, offset=offset)
+
+    def _connect(self, fields: Fields, body: bytes, damage: Damage) -> None:
+        told = fields_of(body)
+        if told is None or "topic" not in fields or "type" not in told:
+            damage.add(f"{self.path.name}: a connection without topic or type")
+            return
+        topic = Topic(
+            name=fields["topic"].decode("utf-8", "replace"),
+            type_name=ros_type_name(told["type"].decode("utf-8", "replace")),
+            encoding="ros1",
+            definition=told.get("message_definition", b"").decode("utf-8", "replace"),
+        )
+        self._topics[number(fields, "conn")] = standing_in(topic)
+
+
+_WIDEST_HOLE = 1 << 40
+_WAL = b"\2\2"  # format versions of a database that keeps what is new in a journal, "-wal"
+_FILE_FORMAT = slice(18, 20)  # of its header (sqlite.org/fileformat2.html)
+
+
+class Db3Log:
+    """One .db3 file, with what its journal ("-wal") holds where its recorder was stopped before it closed the bag.
+
+    SQLite writes while it reads a journal: file and journal are copied first. Raises InputError where its tables are
+    not those of a bag, or cannot be read at all.
+    """
+
+    container = "ROS 2 bag (sqlite3)"
+
+    def __init__(self, path: Path) -> None:
+        self.path = self._database = path
+        self._journal, self._num_pages = path.with_name(f"{path.name}-wal"), 0
+        has_journal = self._journal.is_file() and self._journal.stat().st_size > 0
+        self.files = (path, self._journal) if has_journal else (path,)
+        try:
+            if has_journal:
+                self._merge()
+            with closing(self._opened()) as database:
+                self._topics = _topics(database)
+        except (sqlite3.Error, ValueError) as error:
+            remedy = "try 'ros2 bag reindex', or copy it again"
+            with path.open("rb") as stream:
+                is_in_parts = stream.read(_FILE_FORMAT.stop)[_FILE_FORMAT] == _WAL
+            if is_in_parts and not has_journal:
+                error = ValueError(f"{error}, and {self._journal.name} is not beside it")
+                remedy = f"copy {self._journal.name} from where the bag was recorded: a stopped recorder leaves it"
+            raise InputError(f"{path}: not a readable {self.container}: {error}", remedy=remedy) from None
+
+    def _merge(self) -> None:
+        """Bring the journal into a copy of the file. Raises InputError where there is no room for one."""
+        folder = Path(tempfile.mkdtemp(prefix="splatctrl-", dir=scratch_folder()))
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        try:
+            self._database = Path(shutil.copyfile(self.path, folder / self.path.name))
+            shutil.copyfile(self._journal, folder / self._journal.name)
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: cannot be copied to {folder.parent} to read {self._journal.name}: {error.strerror}",
+                remedy="set TMPDIR to a folder with room for both files",
+            ) from None
+        try:
+            with closing(sqlite3.connect(self._database)) as database:
+                self._num_pages = database.execute("PRAGMA wal_checkpoint").fetchone()[1]
+        except sqlite3.Error:
+            self._database = self.path  # what is whole of it is read without its journal
+
+    def topics(self) -> tuple[Topic, ...]:
+        """The topics table."""
+        return tuple(self._topics.values())
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Yield messages in the order they were written; rows on damaged pages are passed over and counted."""
+        if self._num_pages > 0:
+            damage.remark(
+                f"{self.path.name}: was not closed; {self._num_pages} pages of {self._journal.name} were read"
+            )
+        elif len(self.files) > 1:
+            damage.add(f"{self._journal.name}: holds no page that can be read; the bag was not closed")
+        with closing(self._opened()) as database:
+            for topic_id, log_time_ns, data in self._rows(database, damage):
+                topic = self._topics.get(topic_id)
+                if topic is None or not isinstance(data, bytes) or not isinstance(log_time_ns, int):
+                    damage.add(f"{self.path.name}: a message without topic, time or data")
+                elif names is None or topic.name in names:
+                    yield RawMessage(topic=topic, log_time_ns=log_time_ns, data=data, file=self.path.name)
+
+    def _rows(self, database: sqlite3.Connection, damage: Damage) -> Iterator[tuple[object, object, object]]:
+        last, hole = -(1 << 62), 1  # hole: how many rows to pass over next
+        for _ in range(1000):
+            try:
+                query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id"
+                for number, *row in database.execute(query, (last,)):
+                    hole = min(hole, 1)
+                    last = number
+                    yield row[0], row[1], row[2]
+            except (sqlite3.Error, OverflowError) as error:
+                if hole == 1:
+                    damage.add(f"{self.path.name}: damaged behind message {max(last, 0)}: {error}")
+                last, hole = max(last, 0) + hole, hole * 2
+                if hole > _WIDEST_HOLE:
+                    return
+                continue
+            return
+
+    def _opened(self) -> sqlite3.Connection:
+        database = sqlite3.connect(f"file:{quote(str(self._database.absolute()))}?mode=ro&immutable=1", uri=True)
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BLOCK)
+        database.execute("PRAGMA trusted_schema = OFF")
+        database.execute("PRAGMA writable_schema = ON")  # else sqlite refuses a file that is shorter than it says
+        database.text_factory = lambda content: content.decode("utf-8", "replace")
+        return database
+
+
+def _topics(database: sqlite3.Connection) -> dict[object, Topic]:
+    """The topics by their number. Raises ValueError where a table is missing."""
+    found = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if not {"topics", "messages"} <= found:
+        raise ValueError("no tables named topics and messages")
+    definitions = {}
+    if "message_definitions" in found:
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        definitions = {kind: (encoding, text) for kind, encoding, text in database.execute(query)}
+    topics: dict[object, Topic] = {}
+    for number, name, kind, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):
+        definition_format, text = definitions.get(kind, ("", ""))
+        topic = Topic(
+            name=str(name),
+            type_name=str(kind),
+            encoding=str(encoding),
+            definition=str(text) if definition_format in {"ros2msg", "ros2idl"} else "",
+            definition_format="idl" if definition_format == "ros2idl" else "msg",
+        )
+        topics[number] = standing_in(topic)
+    return topics

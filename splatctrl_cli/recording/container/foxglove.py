@@ -1,0 +1,230 @@
+"""Foxglove's schemas as the ROS messages that they stand for, from JSON, their ROS twins, or protobuf, which is read
+by the FileDescriptorSet that a log carries, without generated code. And the RealSense SDK's texts: its .db3 holds
+intrinsics, extrinsics and depth units as std_msgs/String (librealsense, src/media/ros2/ros2_writer.cpp).
+
+Fields are those of docs.foxglove.dev ("Schemas"): in JSON times are {sec, nsec} and bytes base64, in protobuf times
+are google.protobuf.Timestamp.
+"""
+
+import base64
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from google.protobuf.descriptor_database import DescriptorDatabase, DescriptorDatabaseConflictingDefinitionError
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message import DecodeError
+from google.protobuf.message_factory import GetMessageClass
+
+from splatctrl_cli.geometry import quat_from_rotation
+from splatctrl_cli.recording.container.raw_log import Topic
+
+
+class MessageTypes:
+    """The message types of one FileDescriptorSet. Raises ValueError where the bytes are none."""
+
+    def __init__(self, descriptor_set: bytes) -> None:
+        files = DescriptorDatabase()  # asked by the pool, so that a file may come before those that it imports
+        try:
+            for file in FileDescriptorSet.FromString(descriptor_set).file:
+                files.Add(file)
+        except (DecodeError, DescriptorDatabaseConflictingDefinitionError) as error:
+            raise ValueError(f"protobuf: the schema is not usable: {error}") from None
+        self._pool = DescriptorPool(files)
+
+    def read(self, type_name: str, data: bytes) -> Any:
+        """A message with the fields of its type, those not written at their defaults.
+
+        Raises ValueError where it does not decode.
+        """
+        try:
+            return GetMessageClass(self._pool.FindMessageTypeByName(type_name)).FromString(data)
+        except KeyError:
+            raise ValueError(f"the schema does not define {type_name}") from None
+        except (DecodeError, TypeError) as error:
+            raise ValueError(f"protobuf: {error}") from None
+
+
+_STANDS_FOR = {
+    "CompressedImage": "sensor_msgs/msg/CompressedImage",
+    "CompressedVideo": "foxglove_msgs/msg/CompressedVideo",  # ROS has none; the same fields as a CompressedImage
+    "RawImage": "sensor_msgs/msg/Image",
+    "CameraCalibration": "sensor_msgs/msg/CameraInfo",
+    "FrameTransform": "tf2_msgs/msg/TFMessage",
+    "FrameTransforms": "tf2_msgs/msg/TFMessage",
+    "JointStates": "sensor_msgs/msg/JointState",
+}
+_VECTORS = "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
+_TRANSFORM = f"builtin_interfaces/Time timestamp\nstring parent_frame_id\nstring child_frame_id\n{_VECTORS}"
+_STAMPED = "builtin_interfaces/Time timestamp\nstring frame_id\n"
+_SIZED = f"{_STAMPED}uint32 width\nuint32 height\n"
+DEFINITIONS = {  # for bags without any; foxglove/schemas, ros_foxglove_msgs/ros2
+    "foxglove_msgs/msg/CompressedImage": f"{_STAMPED}uint8[] data\nstring format\n",
+    "foxglove_msgs/msg/CompressedVideo": f"{_STAMPED}uint8[] data\nstring format\n",
+    "foxglove_msgs/msg/RawImage": f"{_SIZED}string encoding\nuint32 step\nuint8[] data\n",
+    "foxglove_msgs/msg/CameraCalibration": (
+        f"{_SIZED}string distortion_model\nfloat64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\n"
+    ),
+    "foxglove_msgs/msg/FrameTransform": _TRANSFORM,
+    "foxglove_msgs/msg/FrameTransforms": "foxglove_msgs/FrameTransform[] transforms\n",
+}
+TEXT = "std_msgs/msg/String"
+_SENSOR = r"/device_\d+/sensor_\d+"
+_TEXTS = {  # by the topic, what a text of the SDK stands for; metadata say the depth unit of one image
+    rf"{_SENSOR}/\w+_\d+/camera_info": "sensor_msgs/msg/CameraInfo",
+    rf"{_SENSOR}/\w+_\d+/tf/ref_\d+": "geometry_msgs/msg/Transform",
+    rf"{_SENSOR}/(option/Depth_Units/value|\w+_\d+/image/metadata)": "std_msgs/msg/Float32",
+}
+_PREFIXES = ("foxglove.", "foxglove_msgs/msg/", "foxglove_msgs/")
+
+
+def stands_for(schema: str) -> str:
+    """The ROS type of a Foxglove schema, "" for any other type."""
+    prefix = next((prefix for prefix in _PREFIXES if schema.startswith(prefix)), None)
+    return "" if prefix is None else _STANDS_FOR.get(schema.removeprefix(prefix), "")
+
+
+def standing_in(topic: Topic) -> Topic:
+    """A topic of ROS messages, with the type that they stand for where they are foxglove_msgs or the SDK's texts."""
+    texts = _TEXTS if topic.type_name == TEXT else {}
+    said = next((kind for pattern, kind in texts.items() if re.fullmatch(pattern, topic.name)), "")
+    ros_type = said or stands_for(topic.type_name)
+    return replace(topic, type_name=ros_type, schema=topic.type_name) if ros_type else topic
+
+
+def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> Any:
+    """The ROS message that `data` stand for; definition: the FileDescriptorSet of protobuf, a byte a character.
+
+    Raises ValueError, KeyError, TypeError or AttributeError where they do not decode.
+    """
+    if encoding == "json":
+        return as_ros(schema, _object(json.loads(data)))
+    return as_ros(schema, _types(definition).read(schema, data))
+
+
+def as_ros(schema: str, message: Any) -> Any:
+    """A decoded Foxglove message as the ROS message that it stands for."""
+    return _READERS[schema.replace("/", ".").rpartition(".")[2]](message)
+
+
+@lru_cache(maxsize=16)
+def _types(definition: str) -> MessageTypes:
+    return MessageTypes(definition.encode("latin-1"))
+
+
+def _object(value: Any) -> Any:
+    """JSON objects as objects with fields."""
+    if isinstance(value, dict):
+        return SimpleNamespace(**{key: _object(item) for key, item in value.items()})
+    return [_object(item) for item in value] if isinstance(value, list) else value
+
+
+def _header(message: Any, frame_id: str | None = None) -> Any:
+    """frame_id: of a message that has no field of that name."""
+    frame_id = str(getattr(message, "frame_id", "")) if frame_id is None else frame_id
+    time = getattr(message, "timestamp", None)
+    seconds = _either(time, "sec", "seconds")
+    nanoseconds = _either(time, "nsec", "nanos", "nanosec")
+    return SimpleNamespace(stamp=SimpleNamespace(sec=int(seconds), nanosec=int(nanoseconds)), frame_id=frame_id)
+
+
+def _either(message: Any, *names: str) -> Any:
+    """The first of some fields that a message has; 0 where it has none, as JSON writers leave zeros out."""
+    return next((getattr(message, name) for name in names if hasattr(message, name)), 0)
+
+
+def _data(message: Any) -> Any:
+    value = message.data
+    return np.frombuffer(base64.b64decode(value, validate=True) if isinstance(value, str) else value, dtype=np.uint8)
+
+
+def _compressed_image(message: Any) -> Any:
+    return SimpleNamespace(header=_header(message), format=message.format, data=_data(message))
+
+
+def _raw_image(message: Any) -> Any:
+    return SimpleNamespace(
+        header=_header(message),
+        width=int(message.width),
+        height=int(message.height),
+        encoding=str(message.encoding),
+        step=int(message.step),
+        is_bigendian=0,
+        data=_data(message),
+    )
+
+
+def _calibration(message: Any) -> Any:
+    return SimpleNamespace(
+        header=_header(message),
+        width=int(message.width),
+        height=int(message.height),
+        distortion_model=str(_either(message, "distortion_model") or ""),
+        d=_numbers(_either(message, "D", "d"), 0),
+        k=_numbers(_either(message, "K", "k"), 9),
+        r=_numbers(_either(message, "R", "r"), 9),
+        p=_numbers(_either(message, "P", "p"), 12),
+    )
+
+
+def _numbers(values: Any, count: int) -> Any:
+    """As an array; `count` zeros where nothing is written."""
+    array = np.asarray([] if isinstance(values, int) else values, dtype=np.float64)
+    return array if array.size else np.zeros(count)
+
+
+def _transform(message: Any) -> Any:
+    t, r = message.translation, message.rotation
+    return SimpleNamespace(
+        header=_header(message, str(message.parent_frame_id)),
+        child_frame_id=str(message.child_frame_id),
+        transform=SimpleNamespace(
+            translation=SimpleNamespace(**{key: float(_either(t, key)) for key in "xyz"}),
+            rotation=SimpleNamespace(**{key: float(_either(r, key)) for key in "xyzw"}),
+        ),
+    )
+
+
+def _joint_states(message: Any) -> Any:
+    """Without velocities: one that is not set cannot be told from zero."""
+    return SimpleNamespace(
+        header=_header(message),
+        name=[str(joint.name) for joint in message.joints],
+        position=np.array([float(_either(joint, "position")) for joint in message.joints]),
+        velocity=np.zeros(0),
+    )
+
+
+def _sdk_text(message: Any) -> Any:
+    """Raises KeyError or ValueError where a text of the SDK lacks a field."""
+    said = dict(part.split("=", 1) for part in message.data.split(";") if "=" in part)
+    values = {key: np.array(text.split(","), np.float64) for key, text in said.items() if key in _TEXT_FIELDS}
+    if "fx" in said:
+        fx, fy, cx, cy = (float(values[key][0]) for key in ("fx", "fy", "ppx", "ppy"))
+        size = SimpleNamespace(width=float(said["width"]), height=float(said["height"]))
+        lens = {"distortion_model": said["model"], "K": [fx, 0, cx, 0, fy, cy, 0, 0, 1], "D": values["coeffs"]}
+        return _calibration(SimpleNamespace(**vars(size), **lens))
+    if "rotation" in said:
+        x, y, z, w = quat_from_rotation(values["rotation"].reshape(3, 3).T)  # written by columns
+        t = dict(zip("xyz", values["translation"], strict=True))
+        return SimpleNamespace(translation=SimpleNamespace(**t), rotation=SimpleNamespace(x=x, y=y, z=z, w=w))
+    return SimpleNamespace(data=float(said.get("Depth Units", 0) if said else message.data))
+
+
+_TEXT_FIELDS = ("fx", "fy", "ppx", "ppy", "coeffs", "rotation", "translation")
+_READERS: dict[str, Callable[[Any], Any]] = {
+    "CompressedImage": _compressed_image,
+    "CompressedVideo": _compressed_image,
+    "RawImage": _raw_image,
+    "CameraCalibration": _calibration,
+    "FrameTransform": lambda message: SimpleNamespace(transforms=[_transform(message)]),
+    "JointStates": _joint_states,
+    "String": _sdk_text,
+    "FrameTransforms": lambda message: SimpleNamespace(transforms=[_transform(item) for item in message.transforms]),
+}

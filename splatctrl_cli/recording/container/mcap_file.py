@@ -1,0 +1,313 @@
+"""The records of an MCAP file from front to back, whatever is wrong with it, in bounded memory.
+
+Nothing is believed that the file's length does not bear out. A record that cannot be where it stands is skipped: to
+the next place that the summary names, else to the next compressed chunk whose lengths agree with each other.
+"""
+
+import bisect
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from splatctrl_cli.files.unpacking import MAX_BLOCK, PIECE
+from splatctrl_cli.recording.container.mcap_records import (
+    ATTACHMENT,
+    CHUNK,
+    CHUNK_INDEX,
+    DATA_END,
+    FIRST_OPCODE,
+    FOOTER,
+    HEAD,
+    MAGIC,
+    BadRecordError,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    parse_record,
+)
+from splatctrl_cli.recording.container.raw_log import Damage
+
+_CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, start, end, unpacked size, crc; then the compression's name
+_COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
+_FOOTER_SIZE = HEAD.size + 20
+
+
+class Part(NamedTuple):
+    """One record of the file; of an attachment and of a record without a meaning, the content is left out."""
+
+    offset: int
+    opcode: int
+    content: bytes
+    is_cut: bool = False
+
+
+class McapFile:
+    """Walks over the records of one file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.size = path.stat().st_size
+
+    def parts(self, damage: Damage, *, is_known: bool = False) -> Iterator[Part]:
+        """Yield the records in order; what is lost or wrong goes to `damage`, checksums of the file included.
+
+        is_known: leave out these checksums, as they were compared before.
+        """
+        with self.path.open("rb") as stream:
+            walk = _Walk(stream, self.path.name, self.size, damage, self._places(), has_crc=not is_known)
+            yield from walk.parts()
+
+    def state(self) -> tuple[int, int]:
+        """What changes with the file: its size and when it was written [ns]."""
+        stat = self.path.stat()
+        return stat.st_size, stat.st_mtime_ns
+
+    def summary(self) -> list[Part]:
+        """The records of the summary section; empty where there is none that can be read."""
+        with self.path.open("rb") as stream:
+            footer = _footer(stream, self.size)
+            if footer is None or not len(MAGIC) <= footer.summary_start < self.size:
+                return []
+            stream.seek(footer.summary_start)
+            content = stream.read(min(self.size - footer.summary_start, 64 << 20))
+        found, at = [], 0
+        while at + HEAD.size <= len(content):
+            opcode, length = HEAD.unpack_from(content, at)
+            start, at = at + HEAD.size, at + HEAD.size + length
+            if opcode < FIRST_OPCODE or at > len(content) or opcode == FOOTER:
+                break
+            found.append(Part(footer.summary_start + start - HEAD.size, opcode, content[start:at]))
+        return found
+
+    def chunk_indexes(self) -> list[ChunkIndex]:
+        """The chunks that the summary names, in the order of the file."""
+        return _chunk_indexes(self.summary())
+
+    def chunk_at(self, index: ChunkIndex) -> bytes:
+        """The content of a chunk's record; what is left of it where the file is shorter."""
+        with self.path.open("rb") as stream:
+            stream.seek(min(index.chunk_start_offset, self.size))
+            opcode, length = HEAD.unpack((stream.read(HEAD.size) + bytes(HEAD.size))[: HEAD.size])
+            return stream.read(min(length, MAX_BLOCK + PIECE)) if opcode == CHUNK else b""
+
+    def _places(self) -> list[int]:
+        """Where records are known to begin: chunks, and the end of the data."""
+        summary = self.summary()
+        return [index.chunk_start_offset for index in _chunk_indexes(summary)] + [p.offset for p in summary[:1]]
+
+
+class _Walk:
+    """One pass over a file."""
+
+    def __init__(
+        self, stream: BinaryIO, name: str, size: int, damage: Damage, places: list[int], *, has_crc: bool
+    ) -> None:
+        self._stream, self._name, self._size = stream, name, size
+        self._damage, self._places = damage, sorted(places)
+        self._crc: int | None = 0 if has_crc else None  # of the data section so far; None once a part was skipped
+
+    def parts(self) -> Iterator[Part]:
+        """Yield the records up to the footer, or to what is left of the last one."""
+        if self._take(len(MAGIC)) != MAGIC:
+            self._add("does not begin like an MCAP")
+            return
+        is_data = True
+        while True:
+            offset = self._stream.tell()
+            head = self._stream.read(HEAD.size)
+            opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
+            end = offset + HEAD.size + length
+            if opcode < FIRST_OPCODE or end > self._size:
+                if not head:
+                    self._add("ends without a footer: cut, or still being written")
+                    return
+                part = self._beyond(offset, opcode)
+                if part is not None:
+                    yield part
+                    return
+                if self._stream.tell() >= self._size:
+                    return
+                continue
+            if is_data and opcode in {DATA_END, FOOTER}:
+                is_data = False
+                self._check_data(opcode, length)
+            part = self._part(offset, opcode, length, head)
+            yield part
+            if self._stream.tell() != end:
+                self._stream.seek(end)
+            if opcode == FOOTER:
+                self._check_end(part)
+                return
+
+    def _part(self, offset: int, opcode: int, length: int, head: bytes) -> Part:
+        """The record at `offset`; its content stays out where it is too large or means nothing to us."""
+        self._count(head)
+        if opcode == ATTACHMENT:
+            self._check_attachment(offset, length)
+            return Part(offset, opcode, b"")
+        if opcode <= DATA_END and length <= MAX_BLOCK + PIECE:
+            return Part(offset, opcode, self._take(length))
+        if opcode <= DATA_END:
+            self._add(f"the record at byte {offset} was left out: {length} bytes, at most {MAX_BLOCK} are read")
+        self._pass_over(length)
+        return Part(offset, opcode, b"", opcode <= DATA_END)
+
+    def _beyond(self, offset: int, opcode: int) -> Part | None:
+        """Go to where reading can go on, or return what the file still holds of its last record."""
+        start = self._next_place(offset)
+        if start is not None:
+            self._add(f"bytes {offset} to {start} are damaged and were left out")
+            self._stream.seek(start)
+            self._crc = None
+            return None
+        self._add(f"cut or damaged after byte {offset}")
+        self._stream.seek(min(offset + HEAD.size, self._size))
+        if opcode == CHUNK:
+            return Part(offset, opcode, self._stream.read(MAX_BLOCK), True)
+        self._stream.seek(self._size)
+        return None
+
+    def _next_place(self, offset: int) -> int | None:
+        position = bisect.bisect_right(self._places, offset)
+        if position < len(self._places) and self._places[position] + HEAD.size <= self._size:
+            return self._places[position]
+        before = _CHUNK_HEAD.size
+        self._stream.seek(offset + 1)
+        kept = b""
+        while block := self._stream.read(PIECE):
+            base = self._stream.tell() - len(block) - len(kept)
+            block = kept + block
+            found = min((at for at in self._chunks_in(block, base) if base + at > offset), default=None)
+            if found is not None:
+                return base + found
+            kept = block[-(before + 16) :]
+        return None
+
+    def _chunks_in(self, block: bytes, base: int) -> Iterator[int]:
+        """Places in `block` (of the file from `base`) where a chunk begins whose lengths agree."""
+        for name in _COMPRESSIONS:
+            at = block.find(name)
+            while at >= 0:
+                start, tail = at - _CHUNK_HEAD.size, at + len(name)
+                if start >= 0 and tail + 8 <= len(block):
+                    opcode, length, first, last, *_ = _CHUNK_HEAD.unpack_from(block, start)
+                    stored = int.from_bytes(block[tail : tail + 8], "little")
+                    agrees = length >= _CHUNK_HEAD.size - HEAD.size + len(name) + 8 + stored
+                    if opcode == CHUNK and agrees and first <= last and base + start + 9 + length <= self._size:
+                        yield start
+                at = block.find(name, at + 1)
+
+    def _check_data(self, opcode: int, length: int) -> None:
+        """Compare the checksum of the data section with what its last record says."""
+        if opcode != DATA_END or length > PIECE:
+            return
+        here = self._stream.tell()
+        try:
+            record = parse_record(opcode, self._stream.read(length))
+        except BadRecordError:
+            record = None
+        self._stream.seek(here)
+        expected = record.data_section_crc if isinstance(record, DataEnd) else 0
+        if expected and self._crc is not None and self._crc != expected:
+            self._add("checksum of the data section differs")
+        self._crc = None
+
+    def _check_attachment(self, offset: int, length: int) -> None:
+        start = self._stream.tell()
+        head = self._take(min(length, 1 << 16))  # bytes in which its name and media type must end
+        body = _attachment_length(head)
+        if body is None or body + 4 > length:
+            self._add(f"the attachment at byte {offset} does not hold what it announces")
+            self._pass_over(length - len(head))
+            return
+        crc = zlib.crc32(head[:body])
+        crc = self._pass_over(max(0, body - len(head)), crc)
+        tail = head[body : body + 4]
+        tail += self._take(4 - len(tail))
+        expected = int.from_bytes(tail, "little")
+        if expected and expected != crc:
+            self._add(f"checksum of the attachment at byte {offset} differs")
+        self._pass_over(length - (self._stream.tell() - start))
+
+    def _check_end(self, part: Part) -> None:
+        try:
+            footer = parse_record(FOOTER, part.content)
+        except BadRecordError:
+            footer = None
+        if not isinstance(footer, Footer):
+            self._add("its footer is damaged")
+            return
+        after = self._stream.tell()
+        if self._stream.read(len(MAGIC)) != MAGIC:
+            self._add("its closing mark is missing")
+        elif after + len(MAGIC) < self._size:
+            self._add(f"{self._size - after - len(MAGIC)} bytes after its end were left out")
+        start = footer.summary_start or part.offset
+        end = part.offset + HEAD.size + 16
+        is_inside = len(MAGIC) <= start <= part.offset
+        if footer.summary_crc and not (is_inside and self._crc_of(start, end) == footer.summary_crc):
+            self._add("checksum of the summary differs")
+
+    def _crc_of(self, start: int, end: int) -> int:
+        self._stream.seek(start)
+        self._crc = None
+        return self._pass_over(end - start)
+
+    def _pass_over(self, length: int, crc: int = 0) -> int:
+        """Read over `length` bytes; their checksum, going on from `crc`."""
+        while length > 0 and (piece := self._take(min(length, PIECE))):
+            crc = zlib.crc32(piece, crc)
+            length -= len(piece)
+        return crc
+
+    def _take(self, length: int) -> bytes:
+        content = self._stream.read(length)
+        self._count(content)
+        return content
+
+    def _count(self, content: bytes) -> None:
+        if self._crc is not None:
+            self._crc = zlib.crc32(content, self._crc)
+
+    def _add(self, note: str) -> None:
+        self._damage.add(f"{self._name}: {note}")
+
+
+def _chunk_indexes(summary: list[Part]) -> list[ChunkIndex]:
+    found = []
+    for part in summary:
+        try:
+            record = parse_record(part.opcode, part.content) if part.opcode == CHUNK_INDEX else None
+        except BadRecordError:
+            continue
+        if isinstance(record, ChunkIndex):
+            found.append(record)
+    return sorted(found, key=lambda index: index.chunk_start_offset)
+
+
+def _footer(stream: BinaryIO, size: int) -> Footer | None:
+    """The footer right before the closing mark (bytes that a later version adds to it would hide it)."""
+    if size < 2 * len(MAGIC) + _FOOTER_SIZE:
+        return None
+    stream.seek(size - len(MAGIC) - _FOOTER_SIZE)
+    content = stream.read(_FOOTER_SIZE + len(MAGIC))
+    opcode, length = HEAD.unpack_from(content)
+    if opcode != FOOTER or length != 20 or not content.endswith(MAGIC):
+        return None
+    footer = parse_record(FOOTER, content[HEAD.size : _FOOTER_SIZE])
+    assert isinstance(footer, Footer)
+    return footer
+
+
+def _attachment_length(head: bytes) -> int | None:
+    """Bytes of an attachment's record before its checksum; None where its head does not say."""
+    at = 16
+    for _ in range(2):
+        if at + 4 > len(head):
+            return None
+        at += 4 + int.from_bytes(head[at : at + 4], "little")
+    if at + 8 > len(head):
+        return None
+    return at + 8 + int.from_bytes(head[at : at + 8], "little")

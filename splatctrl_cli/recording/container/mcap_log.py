@@ -1,0 +1,275 @@
+"""The messages of an MCAP file, by its own records; what is damaged is left out and counted. And what a file holds
+without reading it: from the heads of its records, where no summary says so.
+
+The `mcap` package's readers allocate what a record announces, and its indexed reader needs an intact summary: it
+raises on valid files without one and yields nothing from a truncated file.
+"""
+
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatctrl_cli.files.unpacking import BadBlockError, Budget, unpacked_start
+from splatctrl_cli.recording.container.foxglove import standing_in, stands_for
+from splatctrl_cli.recording.container.mcap_file import McapFile
+from splatctrl_cli.recording.container.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    FIRST_OPCODE,
+    FOOTER,
+    HEAD,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_INDEX,
+    SCHEMA,
+    STATISTICS,
+    BadRecordError,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Schema,
+    Statistics,
+    parse_record,
+)
+from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
+
+MOST_HEADS = 100_000  # records that are visited: a second or so
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogIndex:
+    """Messages by channel, log times [ns], chunks in file order; notes say what it does not cover."""
+
+    counts: dict[int, int]
+    first_ns: int
+    last_ns: int
+    chunks: tuple[ChunkIndex, ...]
+    notes: tuple[str, ...]
+
+
+def index_by_heads(file: McapFile) -> LogIndex:
+    """The chunks and messages of a file without a summary, up to the first damaged place or MOST_HEADS records."""
+    counts: dict[int, int] = {}
+    chunks: list[ChunkIndex] = []
+    stamps: list[int] = []
+    offset, num_heads = len(MAGIC), 0
+    with file.path.open("rb") as stream:
+        while offset + HEAD.size <= file.size and num_heads < MOST_HEADS:
+            stream.seek(offset)
+            head = stream.read(HEAD.size + 64)  # bytes that hold the fields of a chunk before its records
+            opcode, length = HEAD.unpack_from(head)
+            if opcode < FIRST_OPCODE or opcode == FOOTER or offset + HEAD.size + length > file.size:
+                break
+            content = head[HEAD.size :]
+            if opcode == CHUNK:
+                chunk = _chunk_index(content, offset, length)
+                if chunk is not None:
+                    chunks.append(chunk)
+            elif opcode == MESSAGE_INDEX and chunks:
+                channel, size = struct.unpack_from("<HI", content)
+                counts[channel] = counts.get(channel, 0) + size // 16
+                offsets = {**chunks[-1].message_index_offsets, channel: offset}
+                chunks[-1] = chunks[-1]._replace(message_index_offsets=offsets)
+            elif opcode == MESSAGE:
+                channel, _, stamp, _ = struct.unpack_from("<HIQQ", content)
+                counts[channel] = counts.get(channel, 0) + 1
+                stamps.append(stamp)
+            offset += HEAD.size + length
+            num_heads += 1
+    stamps += [stamp for c in chunks for stamp in (c.message_start_time, c.message_end_time)]
+    notes = [] if offset + HEAD.size >= file.size else [f"counted up to byte {offset} of {file.size}"]
+    return LogIndex(
+        counts=counts,
+        first_ns=min(stamps, default=0),
+        last_ns=max(stamps, default=0),
+        chunks=tuple(chunks),
+        notes=("has no summary: counted by the heads of its records", *notes),
+    )
+
+
+def _chunk_index(content: bytes, offset: int, length: int) -> ChunkIndex | None:
+    try:
+        chunk = parse_record(CHUNK, content)
+    except BadRecordError:
+        return None
+    assert isinstance(chunk, Chunk)
+    return ChunkIndex(
+        message_start_time=chunk.message_start_time,
+        message_end_time=chunk.message_end_time,
+        chunk_start_offset=offset,
+        chunk_length=length + HEAD.size,
+        message_index_offsets={},
+        message_index_length=0,
+        compression=chunk.compression,
+        compressed_size=chunk.compressed_size,
+        uncompressed_size=chunk.uncompressed_size,
+    )
+
+
+_MESSAGE = struct.Struct("<HIQQ")
+
+
+class McapLog:
+    """One MCAP file."""
+
+    container = "MCAP"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.files = (path,)
+        self._file = McapFile(path)
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Topic] = {}
+        self._statistics: Statistics | None = None
+        self._budget = Budget(self._file.size)
+        self._whole: tuple[int, int] | None = None  # the file's state when a pass found all its checksums right
+        for part in self._file.summary():  # so that a damaged chunk hides no channel of others
+            if part.opcode in {SCHEMA, CHANNEL, STATISTICS}:
+                self._declare(part.opcode, part.content, Damage())
+
+    def topics(self) -> tuple[Topic, ...]:
+        """The channels of the summary section, and those met while reading."""
+        return tuple(self._channels.values())
+
+    def index(self) -> LogIndex:
+        """What the file says of itself: by its summary, else by the heads of its records."""
+        found = self._statistics
+        if found is not None:
+            chunks = tuple(self._file.chunk_indexes())
+            if len(chunks) == found.chunk_count:
+                return LogIndex(
+                    counts=dict(found.channel_message_counts),
+                    first_ns=found.message_start_time,
+                    last_ns=found.message_end_time,
+                    chunks=chunks,
+                    notes=(),
+                )
+        return index_by_heads(self._file)
+
+    def topic_of(self, channel: int) -> Topic | None:
+        """The topic of a channel, if it has been declared so far."""
+        return self._channels.get(channel)
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Yield messages in file order; what is damaged is left out, a cut chunk read as far as it goes.
+
+        Checksums are compared until one pass, to the end, has found all of them right.
+        """
+        self._budget = Budget(self._file.size)
+        state, count = self._forget_changed(), damage.count
+        for part in self._file.parts(damage, is_known=self._whole is not None):
+            if part.opcode == CHUNK and part.content:
+                yield from self._chunk_messages(part.content, part.offset, damage, names, is_cut=part.is_cut)
+            elif part.opcode == MESSAGE and part.content:
+                message = self._message(part.content, 0, len(part.content), part.offset, damage, names)
+                if message is not None:
+                    yield message
+            elif part.opcode in {SCHEMA, CHANNEL}:
+                self._declare(part.opcode, part.content, damage)
+        self._whole = state if damage.count == count else None
+
+    def messages_of(
+        self, chunks: Collection[ChunkIndex], damage: Damage, names: Collection[str] | None = None
+    ) -> Iterator[RawMessage]:
+        """Yield the messages of these chunks only, wherever in the file they lie."""
+        self._forget_changed()
+        for index in chunks:
+            content = self._file.chunk_at(index)
+            yield from self._chunk_messages(content, index.chunk_start_offset, damage, names, is_cut=False)
+
+    def _forget_changed(self) -> tuple[int, int]:
+        """The state of the file; its checksums count as unknown where it is another than when they were compared."""
+        state = self._file.state()
+        self._whole = self._whole if state == self._whole else None
+        return state
+
+    def _chunk_messages(
+        self, content: bytes, offset: int, damage: Damage, names: Collection[str] | None, *, is_cut: bool
+    ) -> Iterator[RawMessage]:
+        records = self._records_in(content, offset, damage, is_cut=is_cut)
+        at, end = 0, len(records)
+        while at + HEAD.size <= end:
+            opcode, length = HEAD.unpack_from(records, at)
+            start, at = at + HEAD.size, at + HEAD.size + length
+            if at > end or opcode < FIRST_OPCODE:
+                if not is_cut:
+                    damage.add(f"{self.path.name}: the chunk at byte {offset} holds bytes that are not a record")
+                return
+            if opcode == MESSAGE:
+                message = self._message(records, start, at, offset, damage, names)
+                if message is not None:
+                    yield message
+            elif opcode in {SCHEMA, CHANNEL}:
+                self._declare(opcode, records[start:at], damage)
+
+    def _records_in(self, content: bytes, offset: int, damage: Damage, *, is_cut: bool) -> bytes:
+        """The records of a chunk, or of its start where the file ends in it; none where it is damaged."""
+        try:
+            chunk = parse_record(CHUNK, content)
+            assert isinstance(chunk, Chunk)
+            if is_cut or len(chunk.records) < chunk.compressed_size:
+                return unpacked_start(chunk.records, chunk.compression, chunk.uncompressed_size)
+            records = self._budget.unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
+            is_known = self._whole is not None
+            if chunk.uncompressed_crc and not is_known and zlib.crc32(records) != chunk.uncompressed_crc:
+                raise BadBlockError("checksum differs")
+        except (BadRecordError, BadBlockError) as error:
+            if not is_cut:  # the cut has been counted
+                damage.add(f"{self.path.name}: the chunk at byte {offset} was left out: {error}")
+            return b""
+        return records
+
+    def _message(
+        self, records: bytes, start: int, end: int, offset: int, damage: Damage, names: Collection[str] | None
+    ) -> RawMessage | None:
+        """The message in these bytes of `records`, found at `offset`; None where it is not wanted or no message."""
+        if end - start < _MESSAGE.size:
+            damage.add(f"{self.path.name}: a message record of {end - start} bytes")
+            return None
+        channel, _, log_time_ns, _ = _MESSAGE.unpack_from(records, start)
+        topic = self._channels.get(channel)
+        if topic is None:
+            damage.add(f"{self.path.name}: a message of undeclared channel {channel}")
+            return None
+        if names is not None and topic.name not in names:
+            return None
+        data = records[start + _MESSAGE.size : end]
+        return RawMessage(topic=topic, log_time_ns=log_time_ns, data=data, file=self.path.name, offset=offset)
+
+    def _declare(self, opcode: int, content: bytes, damage: Damage) -> None:
+        """Take a schema, a channel or the statistics."""
+        try:
+            record = parse_record(opcode, content)
+        except BadRecordError as error:
+            damage.add(f"{self.path.name}: a schema or channel was left out: {error}")
+            return
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._channels[record.id] = _topic(record, self._schemas.get(record.schema_id))
+        elif isinstance(record, Statistics):
+            self._statistics = record
+
+
+def _topic(channel: Channel, schema: Schema | None) -> Topic:
+    if schema is None:
+        return Topic(name=channel.topic, type_name="", encoding=channel.message_encoding)
+    is_ros, is_protobuf = schema.encoding in {"ros2msg", "ros2idl", "ros1msg"}, schema.encoding == "protobuf"
+    type_name, ros_type = ros_type_name(schema.name) if is_ros else schema.name, stands_for(schema.name)
+    topic = Topic(
+        name=channel.topic,
+        type_name=ros_type or type_name,
+        encoding=channel.message_encoding,
+        definition=schema.data.decode("utf-8" if is_ros else "latin-1", "replace") if is_ros or is_protobuf else "",
+        definition_format={"ros2idl": "idl", "protobuf": "protobuf"}.get(schema.encoding, "msg"),
+        schema=type_name if ros_type else "",
+    )
+    return standing_in(topic) if is_ros else topic
+
+
+def ros_type_name(name: str) -> str:
+    """``package/msg/Type`` of ROS 1's ``package/Type``; other names as they are."""
+    package, slash, kind = name.partition("/")
+    return f"{package}/msg/{kind}" if slash and "/" not in kind else name

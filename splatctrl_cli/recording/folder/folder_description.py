@@ -1,0 +1,367 @@
+"""The TOML file that describes a folder of colour and depth images (docs/input.md)."""
+
+import difflib
+import tomllib
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.recording.folder.poses import AXES, CONVENTIONS, FORMATS, rigid
+from splatctrl_cli.recording.log.registration import DISTORTION_MODELS
+from splatctrl_cli.records import Float64, Intrinsics
+
+DEPTH_ENCODINGS = ("uint16", "uint16-rotated3", "float32")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraTable:
+    """``[camera]`` or ``[depth_camera]``; pixel_center is the coordinate of the first pixel's centre (0 or 0.5)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    pixel_center: float = 0.0
+    name: str = "camera"
+    distortion: list[float] = field(default_factory=list)
+    distortion_model: str = "plumb_bob"
+    depth_to_color: list[list[float]] = field(default_factory=list)
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """With pixel (0, 0) centred at u = v = 0."""
+        return Intrinsics(
+            fx=self.fx,
+            fy=self.fy,
+            cx=self.cx - self.pixel_center,
+            cy=self.cy - self.pixel_center,
+            width=self.width,
+            height=self.height,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesTable:
+    """``[frames]``: globs with one ``*``; files with the same text for it belong together.
+
+    human_mask: 8-bit grey images, not 0 where the colour image shows a person.
+    """
+
+    color: str
+    depth: str
+    human_mask: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthTable:
+    """``[depth]``: how depth is stored, metres per count, and the count that means none beside 0 (-1: no other)."""
+
+    encoding: str = "uint16"
+    scale: float = 1e-3
+    invalid: int = -1
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosesTable:
+    """``[poses]``; heading selects the blocks of `matrix-blocks`."""
+
+    format: str
+    file: str
+    convention: str = "camera_to_world"
+    axes: str = "opencv"
+    heading: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StampsTable:
+    """``[stamps]``: rate [1/s] of the frame numbers, or `names`: file names are seconds."""
+
+    rate: float | None = None
+    names: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitTable:
+    """``[split]``: frames (position or name) that become camera `holdout`."""
+
+    holdout: list[int | str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagePart:
+    """An image that is a part of a file, used as the path of an image file is: its number there, (columns, rows), and
+    what gives it as an image file of that suffix, without bytes where it is damaged.
+    """
+
+    file: Path
+    number: int
+    size: tuple[int, int]
+    suffix: str
+    read_bytes: Callable[[], bytes]
+
+    @property
+    def name(self) -> str:
+        """The file's, with the image's number."""
+        return f"{self.file.name}#{self.number}"
+
+    def is_file(self) -> bool:
+        """Whether the file is there."""
+        return self.file.is_file()
+
+    def absolute(self) -> Path:
+        """The whole file."""
+        return self.file.absolute()
+
+    def relative_to(self, root: Path) -> Path:
+        """The whole file, from a folder."""
+        return self.file.relative_to(root)
+
+    def __str__(self) -> str:
+        return str(self.file.with_name(self.name))
+
+
+ImageFile = Path | ImagePart
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListedView:
+    """A view by its files, where a layout names them one by one instead of by globs.
+
+    depth: None where no view of a layout has any; matrix: its pose as the layout writes it, None where it has none;
+    camera: its lens, None for [camera];
+    depth_scale: metres per count, None for that of [depth]; valid: an 8-bit grey image, 0 where a pixel is not to be
+    used, None where all are.
+    """
+
+    name: str
+    color: ImageFile
+    depth: ImageFile | None
+    matrix: Float64 | None
+    human: Path | None = None
+    stamp_ns: int | None = None
+    camera: CameraTable | None = None
+    depth_scale: float | None = None
+    valid: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """A whole description; camera and frames may be left to a transforms.json, poses to --camera-pose.
+
+    listed: the views of a layout, instead of frames; is_depth_resized: depth of another size shows the same view and
+    is brought to the size of colour by nearest pixels; unpaired: colour and depth files without partner; num_damaged:
+    views that a damaged file lacks; supply: how depth may be added where no view has any; notes: what a layout leaves
+    open and was taken as usual.
+    """
+
+    path: Path
+    root: Path
+    poses: PosesTable | None
+    camera: CameraTable | None = None
+    depth_camera: CameraTable | None = None
+    frames: FramesTable | None = None
+    depth: DepthTable = field(default_factory=DepthTable)
+    stamps: StampsTable = field(default_factory=StampsTable)
+    split: SplitTable = field(default_factory=SplitTable)
+    listed: tuple[ListedView, ...] = ()
+    is_depth_resized: bool = False
+    unpaired: tuple[int, int] = (0, 0)
+    num_damaged: int = 0
+    supply: str = "describe colour and depth files in a .toml (splatctrl help input)"
+    notes: tuple[str, ...] = ()
+
+    @property
+    def T_color_depth(self) -> Float64:
+        """``depth_to_color`` (4, 4): maps depth-camera to colour-camera coordinates."""
+        where = f"{self.path}: depth_camera.depth_to_color"
+        rows = self.depth_camera.depth_to_color if self.depth_camera is not None else []
+        try:
+            matrix = np.array(rows, dtype=np.float64) if rows else np.eye(4)
+        except ValueError:
+            raise _refused(f"{where}: expected a 4x4 matrix") from None
+        return rigid(matrix, where)
+
+
+T = TypeVar("T")
+
+
+def _refused(what: str) -> InputError:
+    return InputError(what, remedy="see splatctrl help input")
+
+
+def read_description(path: Path, root: Path | None = None) -> Description:
+    """Parse a description. Raises InputError naming the key that is unknown, missing or wrong."""
+    return _read(_content(path), path, root)
+
+
+def read_table(
+    kind: type[T],
+    path: Path,
+    name: str,
+    *,
+    beside: Collection[str] = (),
+    fill: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
+) -> T:
+    """The table [name] of a TOML file that holds none but those `beside`; `fill` gives it keys that it leaves out.
+
+    Raises InputError as `read_description`.
+    """
+    content = _content(path)
+    _check_keys(content, {name, *beside}, str(path), "")
+    if fill is not None and isinstance(content.get(name), dict):
+        content[name] = fill(content[name])
+    return _required(kind, content, name, path)
+
+
+def has_table(path: Path, name: str) -> bool:
+    """Whether a TOML file has a table [name]. Raises InputError where it is not TOML."""
+    return name in _content(path)
+
+
+def read_rig(path: Path, root: Path | None = None) -> list[Description]:
+    """One description per ``[[cameras]]`` of a file that has them: its keys are those of [camera], and `color`,
+    `depth` and `poses` for its files; all else is common to them. Empty where the file has none.
+
+    Raises InputError as `read_description`, and where two cameras share a name or any is without.
+    """
+    content = _content(path)
+    cameras = content.pop("cameras", [])
+    if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
+        raise _refused(f"{path}: cameras: expected tables [[cameras]], got {cameras!r}")
+    names = [camera.get("name") for camera in cameras]
+    if None in names or len(set(names)) < len(names):
+        raise _refused(f"{path}: [[cameras]]: expected a name for each of its own, got {names}")
+    if cameras and not {"camera", "frames", "split"}.isdisjoint(content):
+        raise InputError(
+            f"{path}: [[cameras]] beside [camera], [frames] or [split]", remedy="leave the single tables out"
+        )
+    return [_read(_of_camera(content, camera, path), path, root) for camera in cameras]
+
+
+def _of_camera(common: dict[str, Any], camera: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The description of one of several cameras."""
+    for key in ("color", "depth", "poses"):
+        if not isinstance(camera.get(key), str):
+            raise _refused(f"{path}: [[cameras]]: {key} is missing")
+    lens = {key: value for key, value in camera.items() if key not in ("color", "depth", "poses")}
+    frames = {"color": camera["color"], "depth": camera["depth"]}
+    poses = {"format": "matrix-files", **common.get("poses", {}), "file": camera["poses"]}
+    return {**common, "camera": lens, "frames": frames, "poses": poses}
+
+
+def _content(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise _refused(f"{path}: not TOML: {error}") from None
+
+
+def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description:
+    known = {f.name for f in fields(Description)} - {
+        *("path", "listed", "is_depth_resized", "unpaired", "num_damaged", "supply", "notes")
+    }
+    _check_keys(content, known, str(path), "")
+    try:
+        folder = root or path.parent / Path(str(content.get("root", "."))).expanduser()
+    except RuntimeError:  # ~ of a person who is not here
+        raise InputError(f"{path}: root: no home folder of {content.get('root')}", remedy="give --root") from None
+    if not folder.is_dir():
+        raise InputError(f"{path}: root {folder}: no such folder", remedy="correct `root`, or give --root")
+    description = Description(
+        path=path,
+        root=folder,
+        poses=_optional(PosesTable, content, "poses", path),
+        camera=_optional(CameraTable, content, "camera", path),
+        depth_camera=_optional(CameraTable, content, "depth_camera", path),
+        frames=_optional(FramesTable, content, "frames", path),
+        depth=_optional(DepthTable, content, "depth", path) or DepthTable(),
+        stamps=_optional(StampsTable, content, "stamps", path) or StampsTable(),
+        split=_optional(SplitTable, content, "split", path) or SplitTable(),
+    )
+    if description.poses is not None:
+        _check_choice(path, "poses.format", description.poses.format, FORMATS)
+        _check_choice(path, "poses.convention", description.poses.convention, CONVENTIONS)
+        _check_choice(path, "poses.axes", description.poses.axes, AXES)
+    _check_choice(path, "depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)
+    for name, camera in (("camera", description.camera), ("depth_camera", description.depth_camera)):
+        if camera is not None:
+            check_camera(camera, f"{path}: {name}")
+    if not 0 < description.depth.scale < 1e3:
+        raise _refused(f"{path}: depth.scale: expected metres per count, got {description.depth.scale}")
+    if description.poses is None or description.poses.format != "nerfstudio":
+        for name in ("camera", "frames"):
+            if getattr(description, name) is None:
+                raise _refused(f"{path}: [{name}] is missing")
+    return description
+
+
+def check_camera(camera: CameraTable, where: str) -> None:
+    """Raises InputError naming a size or focal length that no camera has."""
+    for name in ("width", "height", "fx", "fy"):
+        value = getattr(camera, name)
+        if not 1e-2 <= value < 1e5:
+            raise _refused(f"{where}.{name}: expected a positive number of pixels, got {value}")
+    for name in ("cx", "cy"):
+        if not abs(getattr(camera, name)) < 1e5:
+            raise _refused(f"{where}.{name}: expected pixels, got {getattr(camera, name)}")
+    if not all(isinstance(value, int | float) for value in camera.distortion):
+        raise _refused(f"{where}.distortion: expected numbers, got {camera.distortion}")
+    if camera.distortion_model not in DISTORTION_MODELS:
+        names = ", ".join(DISTORTION_MODELS)
+        raise _refused(f"{where}.distortion_model: expected one of {names}, got {camera.distortion_model!r}")
+
+
+def _required(kind: type[T], content: dict[str, Any], name: str, path: Path) -> T:
+    table = _optional(kind, content, name, path)
+    if table is None:
+        raise _refused(f"{path}: [{name}] is missing")
+    return table
+
+
+def _optional(kind: type[T], content: dict[str, Any], name: str, path: Path) -> T | None:
+    if name not in content:
+        return None
+    table = content[name]
+    if not isinstance(table, dict):
+        raise _refused(f"{path}: {name}: expected a table [{name}], got {table!r}")
+    declared = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
+    _check_keys(table, set(declared), str(path), f"{name}.")
+    for key, f in declared.items():
+        if key not in table and f.default is MISSING and f.default_factory is MISSING:
+            raise _refused(f"{path}: {name}.{key} is missing")
+    values = {key: _typed(value, declared[key].type, f"{path}: {name}.{key}") for key, value in table.items()}
+    return kind(**values)
+
+
+def _typed(value: Any, hint: Any, where: str) -> Any:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    good = {
+        int: isinstance(value, int) and is_number,
+        float: is_number,
+        str: isinstance(value, str),
+        bool: isinstance(value, bool),
+        float | None: is_number,
+        int | None: isinstance(value, int) and is_number,
+    }.get(hint, isinstance(value, list))
+    if not good:
+        raise _refused(f"{where}: expected {getattr(hint, '__name__', hint)}, got {value!r}")
+    return float(value) if hint in (float, float | None) else value
+
+
+def _check_keys(table: dict[str, Any], known: set[str], where: str, prefix: str) -> None:
+    for key in table:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
+            remedy = f"did you mean {prefix}{near[0]}?" if near else f"known here: {', '.join(sorted(known))}"
+            raise InputError(f"{where}: unknown key {prefix}{key}", remedy=remedy)
+
+
+def _check_choice(path: Path, key: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise _refused(f"{path}: {key}: expected one of {', '.join(choices)}, got {value!r}")

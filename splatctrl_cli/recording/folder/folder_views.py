@@ -1,0 +1,290 @@
+"""The views that a description of an image folder comes to: files, poses, stamps and lenses, matched by name."""
+
+import os
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_APART, UNIT_BASELINE, UNIT_DEPTH
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.recording.folder.folder_description import (
+    CameraTable,
+    Description,
+    ImageFile,
+    ListedView,
+    PosesTable,
+)
+from splatctrl_cli.recording.folder.poses import (
+    READERS,
+    Trajectory,
+    read_matrix_blocks,
+    read_matrix_file,
+    stamp_of_text,
+    world_camera,
+)
+from splatctrl_cli.recording.source_options import SourceOptions, still_note
+from splatctrl_cli.records import MILLIMETRE, SECOND_NS, Float64, LossReport
+
+HOLDOUT = "holdout"
+UNITS = {MILLIMETRE: "millimetres", 0.01: "centimetres"}  # [m] of each, the likelier first
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One pair of files, and a mask where there is one; name is the text that `*` stood for.
+
+    camera: its name, or HOLDOUT; lens: the camera that took it; depth_scale: metres per count; valid: a mask of the
+    pixels to use.
+    """
+
+    name: str
+    color: ImageFile
+    depth: ImageFile | None
+    human: Path | None
+    T_world_camera: Float64
+    stamp_ns: int
+    camera: str
+    lens: CameraTable
+    depth_scale: float
+    valid: Path | None = None
+
+    def in_unit(self, metres: float) -> "View":
+        """The same with lengths of so many metres, of pose and depth."""
+        T = self.T_world_camera.copy()
+        T[:3, 3] *= metres
+        return replace(self, T_world_camera=T, depth_scale=self.depth_scale * metres)
+
+
+def length_unit(median: float, apart: float) -> float:
+    """Metres per length of a recording whose depth has this median, and whose cameras are so far apart.
+
+    1 unless depth is too large for metres and the cameras' places have the same unit: where depth alone is too large
+    its scale is wrong, and the cameras are near each other in comparison. `reconstruct` then compares the views.
+    """
+    if median <= PLAUSIBLE_DEPTH[1] or apart < UNIT_APART * median:
+        return 1.0
+    low, high = UNIT_DEPTH
+    fits = [unit for unit in UNITS if low <= unit * median <= high and unit * apart > UNIT_BASELINE]
+    return fits[0] if fits else 1.0
+
+
+def views_of(description: Description, options: SourceOptions, loss: LossReport) -> list[View]:
+    """By stamp; what has no partner or pose is counted in `loss`. Raises InputError where nothing is left."""
+    listed = _present(description, loss) if description.listed else _listed(description, options, loss)
+    names = [view.name for view in listed]
+    held = _holdout(description, names, options)
+    views = []
+    for position, view in enumerate(listed):
+        lens = view.camera or description.camera
+        assert lens is not None
+        T = _pose(description.poses, view, lens, options)
+        if T is not None:
+            views.append(
+                View(
+                    name=view.name,
+                    color=view.color,
+                    depth=view.depth,
+                    human=view.human,
+                    T_world_camera=T,
+                    stamp_ns=_stamp_ns(description, view, position),
+                    camera=HOLDOUT if view.name in held else lens.name,
+                    lens=lens,
+                    depth_scale=_scale(description, view, options),
+                    valid=view.valid,
+                )
+            )
+    loss.without_pose += len(listed) - len(views)
+    loss.unpaired_color += description.unpaired[0]
+    loss.unpaired_depth += description.unpaired[1]
+    loss.damaged += description.num_damaged
+    loss.notes.extend(description.notes)
+    loss.notes.extend(still_note(name) for name in options.camera_poses if any(v.lens.name == name for v in views))
+    if not views:
+        file = "" if description.poses is None else description.poses.file
+        if file and "*" not in file and not (description.root / file).is_file():
+            raise InputError(
+                f"{description.root / file}: no such file, and no other file has its poses",
+                remedy="copy it too, or give --camera-pose NAME=identity for a camera that stands still",
+            )
+        remedy = "check the clock or the numbers that images and poses share, or give --camera-pose"
+        raise InputError(f"{description.path}: {file} has no pose for any image ({names[0]}, ...)", remedy=remedy)
+    if held and all(view.camera == HOLDOUT for view in views):
+        remedy = "leave some to train with"
+        if options.holdout is not None:
+            raise UsageError(f"--holdout: all {len(views)} views are held out", remedy=remedy)
+        raise InputError(f"{description.path}: [split] holds all {len(views)} views out", remedy=remedy)
+    return sorted(views, key=lambda view: (view.stamp_ns, view.name))
+
+
+def _present(description: Description, loss: LossReport) -> list[ListedView]:
+    """Listed views whose files are there; others are counted as unpaired. Raises InputError for a file outside."""
+    root, present, absent = description.root.absolute(), [], []
+    for view in description.listed:
+        files = [path for path in (view.color, view.depth, view.valid) if path is not None]
+        for path in files:
+            if not Path(os.path.normpath(path.absolute())).is_relative_to(os.path.normpath(root)):
+                raise InputError(
+                    f"{description.path}: {path} is not in {description.root}",
+                    remedy="give the folder that holds all files",
+                )
+        missing = [path for path in files if not path.is_file()]
+        absent += missing[:1]
+        present += [] if missing else [view]
+        loss.unpaired_color += view.depth in missing and view.color not in missing
+        loss.unpaired_depth += view.color in missing and view.depth not in missing
+    if absent:
+        loss.notes.append(f"{len(absent)} of {len(description.listed)} views lack a file ({absent[0]}, ...)")
+    if not present:
+        raise InputError(
+            f"{description.path}: {absent[0]}: no such file, nor any other", remedy="copy the images too"
+        )
+    return present
+
+
+def find_files(root: Path, pattern: str) -> list[tuple[str, Path]]:
+    """Files by the text that the pattern's `*` stands for, sorted; a pattern without `*` is one file, by no text."""
+    if "*" not in pattern:
+        return [("", root / pattern)] if (root / pattern).is_file() else []
+    expression = re.compile(".*".join(re.escape(part) for part in pattern.split("*")).replace(".*", "(.*)", 1))
+    found = ((expression.fullmatch(path.relative_to(root).as_posix()), path) for path in sorted(root.glob(pattern)))
+    return [(match[1], path) for match, path in found if match is not None]
+
+
+def _pose(table: PosesTable | None, view: ListedView, lens: CameraTable, options: SourceOptions) -> Float64 | None:
+    given = options.camera_poses.get(lens.name)
+    if given is not None:
+        return transform_from(given[:3], given[3:])
+    if view.matrix is None:
+        return None
+    assert table is not None
+    return world_camera(view.matrix, table.convention, table.axes, f"{table.file}: pose of {view.name}")
+
+
+def _scale(description: Description, view: ListedView, options: SourceOptions) -> float:
+    """Metres per count. Raises InputError for one that no image has."""
+    if options.depth_scale is not None:
+        return options.depth_scale
+    scale = description.depth.scale if view.depth_scale is None else view.depth_scale
+    if not 0 < scale < np.inf:
+        raise InputError(
+            f"{description.path}: depth of {view.name}: expected metres per count, got {scale}",
+            remedy="correct the file, or give --depth-scale",
+        )
+    return scale
+
+
+def _listed(description: Description, options: SourceOptions, loss: LossReport) -> list[ListedView]:
+    """Views by the globs of [frames]."""
+    frames, camera = description.frames, description.camera
+    assert frames is not None and camera is not None
+    colors = dict(find_files(description.root, frames.color))
+    depths = dict(find_files(description.root, frames.depth))
+    for pattern, found in ((frames.color, colors), (frames.depth, depths)):
+        if not found:
+            raise InputError(
+                f"{description.path}: no file matches {description.root / pattern}", remedy="correct [frames] or root"
+            )
+    masks = _masks(description, list(colors), loss)
+    names = [name for name in colors if name in depths]
+    if not names:
+        raise InputError(
+            f"{description.path}: no colour file has a depth file of the same name"
+            f" ({next(iter(colors))!r}, {next(iter(depths))!r}, ...)",
+            remedy="the * of [frames] color and depth must stand for the same text",
+        )
+    loss.unpaired_color, loss.unpaired_depth = len(colors) - len(names), len(depths) - len(names)
+    poses = {} if camera.name in options.camera_poses else _poses(description, {name: colors[name] for name in names})
+    return [
+        ListedView(name=name, color=colors[name], depth=depths[name], human=masks.get(name), matrix=poses.get(name))
+        for name in names
+    ]
+
+
+def _masks(description: Description, names: list[str], loss: LossReport) -> dict[str, Path]:
+    """Mask files by view name; views without one are noted in `loss`."""
+    assert description.frames is not None
+    pattern = description.frames.human_mask
+    if not pattern:
+        return {}
+    masks = dict(find_files(description.root, pattern))
+    if not any(name in masks for name in names):
+        raise InputError(
+            f"{description.path}: no file of {description.root / pattern} is named like a colour image",
+            remedy="the * of [frames] human_mask and color must stand for the same text",
+        )
+    num_without = sum(name not in masks for name in names)
+    if num_without:
+        loss.notes.append(f"{num_without} of {len(names)} colour images have no mask")
+    return masks
+
+
+def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float64]:
+    """Matrices as written, by view name."""
+    table, root = description.poses, description.root
+    if table is None:
+        raise InputError(
+            f"{description.path}: [poses] is missing",
+            remedy="describe them, or give --camera-pose NAME=identity for a camera that stands still",
+        )
+    if table.format == "matrix-files":
+        files = dict(find_files(root, table.file))
+        if "" in files:  # a camera that does not move
+            return dict.fromkeys(colors, read_matrix_file(files[""]))
+        return {name: read_matrix_file(files[name]) for name in colors if name in files}
+    if table.format == "matrix-blocks":
+        by_key = read_matrix_blocks(root / table.file, table.heading)
+    else:
+        by_key = READERS[table.format](root / table.file)
+    if table.format == "tum":
+        trajectory = Trajectory(by_key)
+        at_stamp = {name: trajectory.at(stamp) for name in colors if (stamp := stamp_of_text(name)) is not None}
+        return {name: pose for name, pose in at_stamp.items() if pose is not None}
+    if table.format == "nerfstudio":
+        keys = {name: path.relative_to(root).as_posix() for name, path in colors.items()}
+        by_key = {key.removeprefix("./"): pose for key, pose in by_key.items()}
+    else:
+        keys = {name: str(_number(name)) for name in colors}
+    return {name: by_key[key] for name, key in keys.items() if key in by_key}
+
+
+def _holdout(description: Description, names: list[str], options: SourceOptions) -> set[str]:
+    """Names held out; an entry is a name, else a position in the sorted list of pairs."""
+    entries = description.split.holdout if options.holdout is None else options.holdout
+    held = set()
+    for entry in entries:
+        if str(entry) in names:
+            held.add(str(entry))
+        elif str(entry).isdigit() and int(entry) < len(names):
+            held.add(names[int(entry)])
+        else:
+            raise InputError(
+                f"{description.path}: holdout {entry!r}: no such frame",
+                remedy=f"use a name ({names[0]} to {names[-1]}) or a position (0 to {len(names) - 1})",
+            )
+    return held
+
+
+def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
+    """From the layout, the file name, the frame number and the rate, or (no clock) one second a frame."""
+    stamps = description.stamps
+    if view.stamp_ns is not None:
+        return view.stamp_ns
+    if stamps.names:
+        stamp_ns = stamp_of_text(view.name)
+        if stamp_ns is None:
+            raise InputError(
+                f"{description.path}: stamps.names: expected seconds, got {view.name!r}",
+                remedy="see splatctrl help input",
+            )
+        return stamp_ns
+    if stamps.rate is not None:
+        return round(_number(view.name) * SECOND_NS / stamps.rate)
+    return position * SECOND_NS
+
+
+def _number(name: str) -> int:
+    numbers = re.findall(r"\d+", name)
+    return int(numbers[-1]) if numbers else -1

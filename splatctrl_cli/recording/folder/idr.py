@@ -1,0 +1,194 @@
+"""DTU scans in the layout of IDR and NeuS.
+
+SCAN/cameras_sphere.npz (or cameras.npz) with world_mat_I, the projection (4, 4) of world points to pixels of image I,
+and scale_mat_I, from the unit sphere around the object to the world; SCAN/image/000000.png; SCAN/mask/000.png.
+Image I is the I-th by name (Totoro97/NeuS, models/dataset.py); where images are missing, the one with that number for
+a name. World lengths are millimetres there, metres here.
+There is no depth: SCAN/depth may hold depth_map_0000.pfm (and depth_visual_0000.png) as MVSNet names them.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import read_arrays, savez
+from splatctrl_cli.files.image_file import write_pfm
+from splatctrl_cli.geometry import invert_transform, pose_at
+from splatctrl_cli.recording.folder.dtu import (
+    DtuScan,
+    DtuView,
+    Shrink,
+    check_lengths,
+    chosen_scan,
+    read_views,
+    write_png,
+)
+from splatctrl_cli.records import MILLIMETRES, Float64, Intrinsics
+
+CAMERAS = ("cameras_sphere.npz", "cameras.npz")
+PLAUSIBLE_RADIUS = (0.02, 20.0)  # [m] of the sphere around the object
+
+
+def idr_scans(root: Path) -> dict[str, Path]:
+    """The folders of scans in this layout, by name: `root` itself, or those in it."""
+    folders = [root] if is_idr(root) else sorted(p for p in root.glob("*") if is_idr(p))
+    return {path.name.removeprefix("dtu_"): path for path in folders}
+
+
+def is_idr(folder: Path) -> bool:
+    """Whether a folder holds a scan in this layout."""
+    return any((folder / name).is_file() for name in CAMERAS)
+
+
+def read_idr(
+    root: Path, scan: str | None = None, depths: Path | None = None, shrink: Shrink = lambda view: view
+) -> DtuScan:
+    """The views of scan `scan` (default: the only one); `depths` holds their depth maps (default: SCAN/depth).
+
+    `shrink` makes of each view the one that is kept. A view without a depth map stays, with a depth of 0 everywhere.
+    Raises InputError naming the file.
+    """
+    scan, folder = chosen_scan(root, idr_scans(root), scan)
+    path = next(folder / name for name in CAMERAS if (folder / name).is_file())
+    projections = _projections(path)
+    images = _numbered(folder / "image", len(projections))
+    if not images:
+        raise InputError(f"{folder / 'image'}: expected images such as 000000.png, got none")
+    masks = _numbered(folder / "mask", len(projections))
+    missing = [number for number in images if number not in masks]
+    if masks and missing:
+        raise InputError(f"{folder / 'mask'}: expected a mask for each image, got none for image {missing[0]}")
+
+    def camera(number: int, size: tuple[int, int]) -> tuple[Intrinsics, Float64]:
+        K, T_world_camera = decompose(projections[number], f"{path}: world_mat_{number}")
+        return _intrinsics(K, size, path), T_world_camera
+
+    def depth_of(number: int) -> Path | None:
+        file = (depths or folder / "depth") / f"depth_map_{number:04d}.pfm"
+        return file if file.is_file() else None
+
+    found = read_views(
+        scan, images, camera, depth_of=depth_of, mask_of=masks.get, shrink=shrink, keeps_without_depth=True
+    )
+    if depths is not None and len(found.without_depth) == len(found.views):
+        raise InputError(f"{depths}: expected depth_map_0000.pfm and so on, got none")
+    check_lengths(f"{folder}", found.views)
+    return replace(found, files=(*found.files, path))
+
+
+def write_idr(root: Path, scan: str, views: Sequence[DtuView]) -> Path:
+    """Write views as the folder of one scan, with a mask for every view that has one; returns it.
+
+    The sphere around the object is about the point that the cameras' axes come nearest to, and half as far from it as
+    the nearest camera.
+    """
+    folder = root / scan
+    (folder / "image").mkdir(parents=True)
+    center, radius = _sphere(views)
+    scale = np.diag([radius, radius, radius, 1.0])
+    scale[:3, 3] = center
+    matrices: dict[str, Float64] = {}
+    for number, view in enumerate(views):
+        matrices |= {f"world_mat_{number}": projection(view), f"scale_mat_{number}": scale}
+        write_png(folder / "image" / f"{number:06d}.png", view.color[:, :, ::-1])
+        if view.mask is not None:
+            (folder / "mask").mkdir(exist_ok=True)
+            write_png(folder / "mask" / f"{number:03d}.png", np.where(view.mask, 255, 0).astype(np.uint8))
+        (folder / "depth").mkdir(exist_ok=True)
+        write_pfm(folder / "depth" / f"depth_map_{number:04d}.pfm", view.depth * np.float32(MILLIMETRES))
+    savez(folder / CAMERAS[0], matrices)
+    return folder
+
+
+def projection(view: DtuView) -> Float64:
+    """World points [mm] to pixels, (4, 4)."""
+    k = view.intrinsics
+    T_camera_world = invert_transform(view.T_world_camera)
+    T_camera_world[:3, 3] *= MILLIMETRES
+    K = np.array([[k.fx, 0.0, k.cx, 0.0], [0.0, k.fy, k.cy, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    return K @ T_camera_world
+
+
+def _sphere(views: Sequence[DtuView]) -> tuple[Float64, float]:
+    """Centre (3,) and radius, [mm]."""
+    centers = MILLIMETRES * np.array([view.T_world_camera[:3, 3] for view in views])
+    axes = np.array([view.T_world_camera[:3, 2] for view in views])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # what of a vector is no way along the axis
+    middle = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centers), rcond=None)[0]
+    return middle, 0.5 * float(np.linalg.norm(centers - middle, axis=1).min())
+
+
+def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
+    """K (3, 3) with K[2, 2] = 1 and T_world_camera (4, 4) [m] of a projection (3, 4) of world points [mm].
+
+    P = s K [R | t] with any scale s, negative ones too; the camera stands where P is 0. Raises InputError for a P
+    that is no camera.
+    """
+    M = P[:, :3]
+    determinant = np.linalg.det(M)
+    if not np.isfinite(P).all() or abs(determinant) < 1e-12 * np.linalg.norm(M) ** 3:
+        raise InputError(f"{where}: expected a camera's projection, got a matrix that cannot be inverted")
+    K, R = cv2.decomposeProjectionMatrix(P if determinant > 0 else -P)[:2]
+    signs = np.where(np.diag(K) < 0, -1.0, 1.0)  # K diag(signs), diag(signs) R: a camera with a positive focal length
+    K, R = np.asarray(K, np.float64) * signs, signs[:, None] * np.asarray(R, np.float64)
+    return K / K[2, 2], pose_at(-np.linalg.solve(M, P[:, 3]) / MILLIMETRES, R.T)
+
+
+def _numbered(folder: Path, num: int) -> dict[int, Path]:
+    """The pictures in `folder` by the number of their camera, of which there are `num`: their places by name where
+    there is one for each, else the numbers that are their names. Raises InputError for a name that is no such number.
+    """
+    paths = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
+    if len(paths) == num:
+        return dict(enumerate(paths))
+    found: dict[int, Path] = {}
+    for path in paths:
+        number = int(path.stem) if path.stem.isdecimal() else num
+        if number >= num or number in found:
+            raise InputError(
+                f"{path}: expected one picture for each of {num} cameras, or their numbers as names, got {len(paths)}"
+                f" and this one" + (f" beside {found[number].name}" if number in found else ""),
+                remedy=f"name it by its camera's number, as {0:06d}.png to {num - 1:06d}.png, or take it away",
+            )
+        found[number] = path
+    return dict(sorted(found.items()))
+
+
+def _projections(path: Path) -> list[Float64]:
+    """World points [mm] to pixels (3, 4), of each camera in the file."""
+    try:
+        arrays = read_arrays(path, most=1 << 24)  # bytes of cameras: 500 each
+        num = sum(1 for name in arrays if re.fullmatch(r"world_mat_\d+", name))
+        world = [np.asarray(arrays[f"world_mat_{i}"], np.float64)[:3, :4] for i in range(max(num, 1))]
+        radius = float(np.asarray(arrays["scale_mat_0"], np.float64)[0, 0]) / MILLIMETRES
+    except KeyError as error:
+        raise InputError(f"{path}: {error.args[0]}; expected world_mat_0 and so on, and scale_mat_0") from None
+    except Exception as error:  # numpy raises many kinds for a file that is not an archive
+        raise InputError(f"{path}: not the cameras of a scan: {error}") from None
+    low, high = PLAUSIBLE_RADIUS
+    if not low <= radius <= high:
+        raise InputError(
+            f"{path}: scale_mat_0: expected a sphere of {low:g} to {high:g} m around the object, got {radius:g} m",
+            remedy="world lengths have to be millimetres, as DTU's; this file may hold cameras in the unit sphere",
+        )
+    return world
+
+
+def _intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
+    width, height = size
+    if abs(K[0, 1]) > 1.0:  # [px]; our cameras have none
+        raise InputError(f"{path}: expected cameras without skew, got one of {K[0, 1]:.2f} px")
+    if not (0.2 < K[0, 2] / width < 0.8 and 0.2 < K[1, 2] / height < 0.8):
+        raise InputError(
+            f"{path}: principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px does not lie about the middle of an image of"
+            f" {width}x{height}",
+            remedy="the images have to have the size that the cameras were made for",
+        )
+    return Intrinsics(
+        fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]), width=width, height=height
+    )

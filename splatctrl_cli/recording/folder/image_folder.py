@@ -1,0 +1,378 @@
+"""Folders of colour and depth images with a TOML description, of one camera or of several, as records."""
+
+import heapq
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config.fixed import UNIT_BASELINE
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import DAMAGE, npy_of
+from splatctrl_cli.files.image_file import decode_file, read_pfm
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.recording.folder.folder_description import (
+    CameraTable,
+    Description,
+    ImageFile,
+    read_description,
+    read_rig,
+)
+from splatctrl_cli.recording.folder.folder_views import HOLDOUT, UNITS, View, find_files, length_unit, views_of
+from splatctrl_cli.recording.folder.layout_nerfstudio import with_transforms
+from splatctrl_cli.recording.log.messages import measured, metres, num_invalid
+from splatctrl_cli.recording.log.registration import DepthToColor, Undistortion, undistortion_of
+from splatctrl_cli.recording.log.state_columns import NO_STATES
+from splatctrl_cli.recording.log.stored_frame import StoredFrame, check_depth, decoded, human_mask, is_kept, is_png
+from splatctrl_cli.recording.source_options import SourceOptions, refuse_unknown_cameras
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, UInt8, by_stamp
+
+__all__ = ["HOLDOUT", "ImageFolderSource"]
+_NOT_FOR_FOLDERS = (
+    *("world_frame", "camera_topics", "camera_pose_topics", "human_topics"),
+    *("joint_topic", "stamps"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Lens:
+    """What a camera's images go through: undistortion and registration, where it needs them."""
+
+    intrinsics: Intrinsics
+    undistortion: Undistortion | None
+    registration: DepthToColor | None
+
+
+class ImageFolderSource:
+    """Records of an image folder; no joint states."""
+
+    joint_names: tuple[str, ...] = ()
+    states = NO_STATES
+    world_frame = "world"
+
+    def __init__(self, path: Path, options: SourceOptions, description: Description | None = None) -> None:
+        options.refuse(_NOT_FOR_FOLDERS, "an image folder", path)
+        if description is None:
+            options.refuse(("intrinsics",), "a folder whose description has [camera]", path)
+        self.name = path.name
+        self._description = with_transforms(description or read_description(path, options.root))
+        self._loss = LossReport()
+        self._damaged: list[str] = []
+        self._num_invalid = 0
+        self._views = views_of(self._description, options, self._loss)
+        self._lenses: dict[str, _Lens] = {}
+        self.guess = "" if self.has_clock else self._in_metres()
+        """In which unit lengths look to be, in words; empty where they may be metres."""
+        lenses = sorted({view.lens.name for view in self._views})
+        refuse_unknown_cameras(path, (*options.camera_poses, *options.intrinsics), lenses)
+        names = tuple(sorted({view.camera for view in self._views}))
+        self.cameras = names if options.cameras is None else options.cameras
+        refuse_unknown_cameras(path, self.cameras, names)
+        self._views = [view for view in self._views if view.camera in self.cameras]
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether the views have depth; without, that of every frame is 0."""
+        return any(view.depth is not None for view in self._views)
+
+    def no_depth(self) -> InputError:
+        """What to say where depth is needed and there is none."""
+        return InputError(
+            f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
+            remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
+        )
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether the description says when the images were taken."""
+        stamps = self._description.stamps
+        return stamps.rate is not None or stamps.names
+
+    @property
+    def loss(self) -> LossReport:
+        """Unpaired and unposed images, and those that did not decode while `records` was read."""
+        loss = self._loss
+        return replace(
+            loss,
+            damaged=loss.damaged + len(self._damaged),
+            invalid_depth=self._num_invalid,
+            notes=[*loss.notes, *self._damaged],
+        )
+
+    def _in_metres(self) -> str:
+        """Take lengths for millimetres or centimetres where depth and the cameras' places both look so; in words."""
+        places = [view.T_world_camera[:3, 3] for view in self._views]
+        apart = float(np.linalg.norm(np.ptp(places, axis=0)))  # the diagonal of their box, in the unit of the poses
+        for view in self._views if apart > UNIT_BASELINE / max(UNITS) else ():
+            depth = self._depth(view, self._lens(view))
+            if depth is None or not (depth > 0).any():
+                continue
+            median = float(np.median(depth[depth > 0]))
+            unit = length_unit(median, apart)
+            if unit == 1.0:
+                return ""
+            self._views = [view.in_unit(unit) for view in self._views]
+            words = (
+                f"lengths are taken as {UNITS[unit]}: the median depth is {median:.4g}, and the cameras are up to"
+                f" {apart:.4g} apart"
+            )
+            self._loss.notes.append(words)
+            return words
+        return ""
+
+    def records(self) -> Iterator[Record]:
+        return decoded(self.stored())
+
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        self._damaged, self._num_invalid = [], 0
+        checked: set[str] = set()
+        for view in self._views:
+            stored = self._stored_frame(view)
+            if stored is None:
+                continue
+            if (
+                view.depth is not None
+                and view.camera not in checked
+                and check_depth(stored.frame.depth, str(view.depth), view.depth_scale)
+            ):
+                checked.add(view.camera)
+            yield stored
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of every view."""
+        return ((view.stamp_ns, view.camera, view.T_world_camera) for view in self._views)
+
+    def count_views(self) -> dict[str, int]:
+        """Views by camera."""
+        return {name: sum(view.camera == name for view in self._views) for name in self.cameras}
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of the description, the pose file and the images, by path below the root."""
+        return dict(self._digests)
+
+    @cached_property
+    def _digests(self) -> dict[str, str]:
+        description = self._description
+        of_views = ((view.color, view.depth, view.human, view.valid) for view in self._views)
+        files = [path for paths in of_views for path in paths if path is not None]
+        if description.poses is not None:
+            files.extend(path for _, path in find_files(description.root, description.poses.file))
+        named = {str(path.relative_to(description.root)): path.absolute() for path in files}
+        first = {description.path.name: description.path} if description.path.is_file() else {}
+        return {name: sha256(path) for name, path in {**first, **dict(sorted(named.items()))}.items()}
+
+    def _stored_frame(self, view: View) -> StoredFrame | None:
+        color_bytes = view.color.read_bytes()
+        color = decode_file(color_bytes, color=True)
+        lens = self._lens(view)
+        depth = self._depth(view, lens)
+        if color is None or depth is None:
+            broken = view.color if color is None else view.depth
+            self._damaged.append(f"{broken}: not an image that can be read")
+            return None
+        _check_size(view.color, color, view.lens)
+        if lens.undistortion is not None:
+            color = lens.undistortion.color(np.asarray(color))
+        human = None if view.human is None else self._human(view.human, lens)
+        valid = self._valid(view, lens)
+        depth = depth if valid is None else np.where(valid, depth, np.float32(0))
+        is_counts = lens.registration is None and not (
+            view.depth is None or _is_float(self._description.depth.encoding, view.depth)
+        )
+        is_plain = lens.undistortion is None
+        return StoredFrame(
+            stamp_ns=view.stamp_ns,
+            camera=view.camera,
+            intrinsics=lens.intrinsics,
+            T_world_camera=view.T_world_camera,
+            read_color=lambda: np.asarray(color, dtype=np.uint8),
+            read_depth=lambda: np.asarray(depth, dtype=np.float32),
+            human=human,
+            valid=valid,
+            color_file=color_bytes if is_plain and is_kept(color_bytes) else None,
+            depth_unit=view.depth_scale if is_counts else None,
+            depth_file=self._depth_file(view) if is_counts and is_plain and valid is None else None,
+            origin=f"{view.color.name} {view.depth.name}" if view.depth else view.color.name,
+        )
+
+    def _depth_file(self, view: View) -> bytes | None:
+        """The PNG of a view's depth, where its counts are the depth as they are."""
+        table = self._description.depth
+        if (
+            view.depth is None
+            or table.encoding != "uint16"
+            or table.invalid > 0
+            or self._description.is_depth_resized
+        ):
+            return None
+        data = view.depth.read_bytes()
+        return data if is_png(data) else None
+
+    def _lens(self, view: View) -> _Lens:
+        """That of a view's camera, made once."""
+        table = view.lens
+        if table.name not in self._lenses:
+            undistortion, depth_camera = _undistortion(table), self._description.depth_camera
+            intrinsics = table.intrinsics if undistortion is None else undistortion.intrinsics
+            registration = None
+            if depth_camera is not None:
+                bent = _undistortion(depth_camera)
+                registration = DepthToColor(
+                    depth_intrinsics=depth_camera.intrinsics if bent is None else bent.intrinsics,
+                    color_intrinsics=intrinsics,
+                    T_color_depth=self._description.T_color_depth,
+                    undistortion=bent,
+                )
+            self._lenses[table.name] = _Lens(
+                intrinsics=intrinsics, undistortion=undistortion, registration=registration
+            )
+        return self._lenses[table.name]
+
+    def _valid(self, view: View, lens: _Lens) -> Bool | None:
+        """Pixels that the lens saw and the view's mask leaves; a mask that cannot be read leaves none."""
+        seen = None if lens.undistortion is None else lens.undistortion.valid
+        if view.valid is None:
+            return seen
+        mask = self._human(view.valid, lens)
+        if mask is None:
+            return np.zeros((lens.intrinsics.height, lens.intrinsics.width), np.bool_)
+        return np.asarray((mask > 0) if seen is None else (mask > 0) & seen)
+
+    def _human(self, path: Path, lens: _Lens) -> UInt8 | None:
+        pixels = decode_file(path.read_bytes(), color=False)
+        if pixels is None:
+            self._damaged.append(f"{path}: not an image that can be read")
+            return None
+        human = human_mask(pixels, lens.intrinsics, str(path))
+        return human if lens.undistortion is None else lens.undistortion.labels(human)
+
+    def _depth(self, view: View, lens: _Lens) -> Float32 | None:
+        """Depth (H, W) [m] at the pixels of colour, 0 where there is none; None where its file cannot be read."""
+        if view.depth is None:
+            return np.zeros((view.lens.height, view.lens.width), np.float32)
+        depth = self._recorded_depth(view.depth, view.depth_scale)
+        if depth is None:
+            return None
+        if self._description.is_depth_resized:
+            size = (view.lens.width, view.lens.height)
+            depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
+        _check_size(view.depth, depth, self._description.depth_camera or view.lens)
+        if lens.registration is not None:
+            return lens.registration.warp(depth)
+        return depth if lens.undistortion is None else lens.undistortion.depth(depth)
+
+    def _recorded_depth(self, path: ImageFile, scale: float) -> Float32 | None:
+        table = self._description.depth
+        if _is_float(table.encoding, path):
+            pixels = _float_pixels(path)
+            if pixels is None:
+                return None
+            self._num_invalid += num_invalid(pixels)
+            return measured(pixels, scale)
+        counts = decode_file(path.read_bytes(), color=False)
+        if counts is None:
+            return None
+        if counts.dtype != np.uint16 or counts.ndim != 2:
+            raise InputError(
+                f"{path}: expected a 16-bit grey image, got {counts.dtype} with {counts.ndim} axes",
+                remedy="see splatctrl help input",
+            )
+        if table.encoding == "uint16-rotated3":
+            counts = (counts >> 3) | (counts << 13)
+        counts = np.where(counts == table.invalid, np.uint16(0), counts)
+        self._num_invalid += num_invalid(counts)
+        return metres(counts, scale)
+
+
+def _is_float(encoding: str, path: ImageFile) -> bool:
+    """Whether a depth file holds floats; a .npy does, whatever the others of its folder are (nerfstudio)."""
+    return encoding == "float32" or path.suffix == ".npy"
+
+
+def _undistortion(camera: CameraTable) -> Undistortion | None:
+    return undistortion_of(camera.intrinsics, camera.distortion_model, np.array(camera.distortion, np.float64))
+
+
+def _float_pixels(path: ImageFile) -> NDArray[np.float32] | None:
+    if path.suffix == ".npy":
+        try:
+            return np.asarray(npy_of(path.read_bytes()), dtype=np.float32)
+        except DAMAGE:
+            return None
+    if path.suffix == ".pfm" and isinstance(path, Path):
+        try:
+            return read_pfm(path)
+        except InputError:
+            return None
+    pixels = decode_file(path.read_bytes(), color=False)
+    return None if pixels is None else pixels.astype(np.float32)
+
+
+def _check_size(path: ImageFile, pixels: NDArray[Any], camera: CameraTable) -> None:
+    if pixels.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            f"{path}: expected {camera.width}x{camera.height} as described, got {pixels.shape[1]}x{pixels.shape[0]}",
+            remedy="correct the size, or describe the depth camera in [depth_camera]",
+        )
+
+
+def open_image_folder(path: Path, options: SourceOptions) -> "ImageFolderSource | RigFolderSource":
+    """The records that a TOML description names."""
+    return RigFolderSource(path, options) if read_rig(path, options.root) else ImageFolderSource(path, options)
+
+
+class RigFolderSource:
+    """Records of several cameras by stamp, each camera an image folder of its own; no joint states."""
+
+    joint_names: tuple[str, ...] = ()
+    states = NO_STATES
+    world_frame = "world"
+
+    def __init__(self, path: Path, options: SourceOptions) -> None:
+        options.refuse(("holdout", "intrinsics", "camera_pose_topics"), "a description with several cameras", path)
+        self.name = path.name
+        by_name = {}
+        for description in read_rig(path, options.root):
+            assert description.camera is not None
+            name = description.camera.name
+            pose = {name: options.camera_poses[name]} if name in options.camera_poses else {}
+            by_name[name] = ImageFolderSource(path, replace(options, cameras=None, camera_poses=pose), description)
+        refuse_unknown_cameras(path, (*(options.cameras or ()), *options.camera_poses), by_name)
+        self.cameras = options.cameras or tuple(by_name)
+        self._parts = [by_name[name] for name in self.cameras]
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether the description says when the images were taken."""
+        return self._parts[0].has_clock
+
+    @property
+    def loss(self) -> LossReport:
+        """That of all cameras together."""
+        total = LossReport()
+        for loss in (part.loss for part in self._parts):
+            total = total.plus(loss, [*total.notes, *loss.notes])
+        return total
+
+    def records(self) -> Iterator[Record]:
+        return decoded(self.stored())
+
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        return by_stamp(*(part.stored() for part in self._parts))
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of every view."""
+        return heapq.merge(*(part.poses() for part in self._parts), key=lambda pose: pose[0])
+
+    def count_views(self) -> dict[str, int]:
+        """Views by camera."""
+        return {name: count for part in self._parts for name, count in part.count_views().items()}
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of the description, the pose files and the images, by path below the root."""
+        return {name: digest for part in self._parts for name, digest in part.digests().items()}

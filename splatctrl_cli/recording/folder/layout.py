@@ -1,0 +1,255 @@
+"""What the readers of dataset layouts share: lenses by name, sizes of images, numbers in names, a description."""
+
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.image_file import decode_file, image_head
+from splatctrl_cli.recording.folder.folder_description import (
+    CameraTable,
+    DepthTable,
+    Description,
+    ImageFile,
+    ImagePart,
+    ListedView,
+    PosesTable,
+    StampsTable,
+    check_camera,
+)
+from splatctrl_cli.recording.folder.poses import read_matrix_file, read_numbers
+from splatctrl_cli.recording.log.survey import pair_by_stamp
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import Float64
+
+CAMERA = "camera"  # the name of a layout's only lens
+Key = TypeVar("Key", int, str)
+_WHOLE = "check that the folder is whole"
+_IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """A layout, in the ``ENTRIES`` of its module: its name, whether a folder has it, and the folder as a description.
+
+    Of layouts that a folder has, that of the lowest `order` counts; a file that ends in `suffix` has it by itself.
+    `docs` are its rows in docs/input.md, cells between bars, an empty line between rows: layout, what it is known by,
+    poses, depth, intrinsics.
+    """
+
+    name: str
+    order: int
+    matches: Callable[[Path], bool]
+    read: Callable[[Path, SourceOptions], Description]
+    suffix: str = ""
+    docs: str = ""
+
+
+def marked(*alternatives: str) -> Callable[[Path], bool]:
+    """Return a test of a folder: it has every name of one alternative (a name that ends in / is a folder)."""
+
+    def has(folder: Path, mark: str) -> bool:
+        return any(path.is_dir() if mark.endswith("/") else path.is_file() for path in folder.glob(mark))
+
+    return lambda folder: any(all(has(folder, mark) for mark in marks.split()) for marks in alternatives)
+
+
+class Lenses:
+    """The different lenses of a layout's views, as cameras ``camera``, ``camera-1``, ``camera-2``, ..."""
+
+    def __init__(self) -> None:
+        self._tables: list[CameraTable] = []
+
+    def __len__(self) -> int:
+        return len(self._tables)
+
+    def named(self, table: CameraTable, where: str) -> CameraTable:
+        """The camera of a lens; a new one where no view before had it. Raises InputError as `check_camera`."""
+        for known in self._tables:
+            if asdict(replace(known, name=table.name)) == asdict(table):
+                return known
+        check_camera(table, where)
+        number = len(self._tables)
+        self._tables.append(replace(table, name=table.name if number == 0 else f"{table.name}-{number}"))
+        return self._tables[-1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pairs:
+    """The views of a layout whose description is at `path`, and how many colour and depth files have no partner.
+
+    Raises InputError where there is no view.
+    """
+
+    path: Path
+    views: Sequence[ListedView]
+    unpaired: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        if not self.views:
+            raise InputError(f"{self.path}: no colour image has a depth image", remedy=_WHOLE)
+
+    def moved(self, change: Callable[[Float64], Float64]) -> "Pairs":
+        """With `change` of the pose of each view that has one."""
+        views = [v if v.matrix is None else replace(v, matrix=change(v.matrix)) for v in self.views]
+        return replace(self, views=views)
+
+
+def paired_by_name(
+    path: Path,
+    colors: Mapping[Key, Path],
+    depths: Mapping[Key, Path],
+    pose: Callable[[Key], Float64 | None],
+    name: Callable[[Key], str] = str,
+) -> Pairs:
+    """Files that have one key, with the pose and the name of it."""
+    views = [
+        ListedView(name=name(key), color=color, depth=depths[key], matrix=pose(key))
+        for key, color in colors.items()
+        if key in depths
+    ]
+    return Pairs(path=path, views=views, unpaired=(len(colors) - len(views), len(depths) - len(views)))
+
+
+def paired_by_stamp(
+    path: Path,
+    colors: Sequence[tuple[int, Path]],
+    depths: Sequence[tuple[int, Path]],
+    pose_at: Callable[[int], Float64 | None],
+    options: SourceOptions,
+) -> Pairs:
+    """Stamps [ns] and files that lie within the pairing tolerance, posed at the colour's stamp."""
+    tolerance_ns = round(options.pairing_tolerance_s * 1e9)
+    pairs = pair_by_stamp([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns)
+    views = [
+        ListedView(
+            name=f"{colors[i][0] / 1e9:.6f}",
+            color=colors[i][1],
+            depth=depths[j][1],
+            matrix=pose_at(colors[i][0]),
+            stamp_ns=colors[i][0],
+        )
+        for i, j in pairs
+    ]
+    return Pairs(path=path, views=views, unpaired=(len(colors) - len(pairs), len(depths) - len(pairs)))
+
+
+def described(
+    pairs: Pairs,
+    root: Path,
+    options: SourceOptions,
+    *,
+    poses: PosesTable,
+    lens: Callable[[ImageFile], CameraTable] | None = None,
+    depth_camera: CameraTable | None = None,
+    depth: DepthTable | None = None,
+    has_stamps: bool = False,
+    is_depth_resized: bool = False,
+    num_damaged: int = 0,
+    supply: str = Description.supply,
+    notes: tuple[str, ...] = (),
+) -> Description:
+    """The description of paired views, all of the lens that --intrinsics gives, else of `lens` (of the first image);
+    without `lens` of one each. Raises InputError where a camera is impossible.
+    """
+    first = pairs.views[0]
+    camera = first.camera if lens is None else given_lens(options, first.color) or lens(first.color)
+    for table in (camera, depth_camera):
+        if table is not None:
+            check_camera(table, str(pairs.path))
+    return Description(
+        path=pairs.path,
+        root=root,
+        poses=poses,
+        camera=camera,
+        depth_camera=depth_camera,
+        depth=depth or DepthTable(),
+        stamps=StampsTable(names=has_stamps),
+        listed=tuple(pairs.views),
+        is_depth_resized=is_depth_resized,
+        unpaired=pairs.unpaired,
+        num_damaged=num_damaged,
+        supply=supply,
+        notes=notes,
+    )
+
+
+def given_lens(options: SourceOptions, image: ImageFile) -> CameraTable | None:
+    """The lens that --intrinsics gives for camera ``camera``, of the size of `image`; None where it gives none."""
+    values = options.intrinsics.get(CAMERA)
+    return None if values is None else pinhole(values[:4], image, values[4:])
+
+
+def pinhole(values: Sequence[float], image: ImageFile, distortion: Sequence[float] = ()) -> CameraTable:
+    """A lens of fx, fy, cx, cy [px] and the size of an image file."""
+    width, height = image_size(image)
+    fx, fy, cx, cy = values
+    return CameraTable(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=list(distortion))
+
+
+def read_K(path: Path) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of a text file with a 3x3 matrix."""
+    values = read_numbers(path)
+    if len(values) != 9:
+        raise InputError(
+            f"{path}: expected a 3x3 matrix, got {len(values)} numbers",
+            remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
+        )
+    return values[0], values[4], values[2], values[5]
+
+
+def own_depth_camera(color: CameraTable, depth: CameraTable, T_color_depth: Float64) -> CameraTable | None:
+    """The depth camera with its place in the colour camera; None where it is the colour camera."""
+    if depth == color and np.abs(T_color_depth - np.eye(4)).max() <= 1e-6:
+        return None
+    return replace(depth, depth_to_color=T_color_depth.tolist())
+
+
+def image_size(path: ImageFile) -> tuple[int, int]:
+    """Columns and rows of an image file. Raises InputError where it is none."""
+    if isinstance(path, ImagePart):
+        return path.size
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}", remedy=_WHOLE) from None
+    if (head := image_head(data)) is not None:
+        return head.width, head.height
+    pixels = decode_file(data, color=False)
+    if pixels is None:
+        raise InputError(f"{path}: not an image that can be read", remedy=_WHOLE)
+    return int(pixels.shape[1]), int(pixels.shape[0])
+
+
+def images_of(folder: Path) -> dict[str, Path]:
+    """Image files by stem, in the order of the numbers in their names."""
+    files = [p for p in folder.iterdir() if p.suffix.lower() in _IMAGES]
+    return {path.stem: path for path in sorted(files, key=lambda p: by_numbers(p.stem))}
+
+
+def by_numbers(name: str) -> tuple[list[int], str]:
+    """Key that sorts names by the numbers in them (2 before 10)."""
+    return [int(number) for number in re.findall(r"\d+", name)], name
+
+
+def pose_or_none(matrix: Float64) -> Float64 | None:
+    """A pose file's matrix, None where it is not finite: how trackers write that they were lost."""
+    return matrix if np.isfinite(matrix).all() else None
+
+
+def read_pose(path: Path) -> Float64 | None:
+    """The matrix (4, 4) of a pose file, None where there is no file or tracking was lost."""
+    return pose_or_none(read_matrix_file(path)) if path.is_file() else None
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file. Raises InputError where it is none."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise InputError(f"{path}: not readable JSON: {error}", remedy=_WHOLE) from None

@@ -1,0 +1,323 @@
+"""Layouts in which each image has its lens: ARKitScenes, BOP scenes, and scenes in MVSNet's text form.
+
+ARKitScenes: ``lowres_wide/``, ``lowres_depth/``, ``lowres_wide_intrinsics/`` and ``lowres_wide.traj``.
+
+Images are named by video and seconds; depth in millimetres; a ``.pincam`` for each image holds width, height, fx, fy,
+cx, cy; a line of the trajectory is seconds, a rotation vector and a translation [m], world to camera
+(apple/ARKitScenes, DATA.md, and threedod/benchmark_scripts/utils/tenFpsDataLoader.py). Poses are interpolated as
+those of tf.
+
+BOP: one scene folder with ``scene_camera.json``, ``rgb/`` (or ``gray/``) and ``depth/``.
+
+Lens, depth unit and pose of each image are its own: cam_K by rows [px], depth_scale counts to millimetres, cam_R_w2c
+by rows and cam_t_w2c in millimetres (thodan/bop_toolkit, docs/bop_datasets_format.md). Images are PNG, JPEG or TIFF.
+Scenes of several sensors name them behind an underscore: ``scene_camera_cam1.json``, ``rgb_cam1/``, ``depth_cam1/``.
+
+A scene in MVSNet's text form: ``cams/NUMBER_cam.txt``, ``pair.txt``, images, and depth (.pfm) where there is any.
+
+By MVSNet's README ("File Formats") a camera file is the world-to-camera matrix, K, and ``DEPTH_MIN DEPTH_INTERVAL
+[DEPTH_NUM [DEPTH_MAX]]``; others end in ``DEPTH_MIN DEPTH_MAX``. Images lie in ``images/`` (DTU's test set, Tanks and
+Temples, ETH3D, colmap2mvsnet.py), in ``blended_images/`` (BlendedMVS) or beside ``cams/``; depth, in the cameras'
+length, in ``rendered_depth_maps/`` (BlendedMVS) or any folder with ``depth`` in its name. No file says what that
+length is.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import invert_transform, pose_at
+from splatctrl_cli.recording.folder.dtu import fitted_intrinsics, read_camera_file
+from splatctrl_cli.recording.folder.folder_description import (
+    CameraTable,
+    DepthTable,
+    Description,
+    ListedView,
+    PosesTable,
+)
+from splatctrl_cli.recording.folder.layout import (
+    CAMERA,
+    Layout,
+    Lenses,
+    Pairs,
+    described,
+    image_size,
+    images_of,
+    marked,
+    paired_by_stamp,
+    read_json,
+)
+from splatctrl_cli.recording.folder.poses import Trajectory, read_numbers, read_rows, stamp_of_text
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import MILLIMETRE, Float64
+
+TRAJECTORY = "lowres_wide.traj"
+
+
+def read_arkit(folder: Path, options: SourceOptions) -> Description:
+    """The folder as a description; lenses that differ become cameras of their own."""
+    options.refuse(("intrinsics",), "a video of ARKitScenes", folder)
+    root = _frames(folder)
+    assert root is not None
+    colors, depths = _by_stamp(root / "lowres_wide"), _by_stamp(root / "lowres_depth")
+    trajectory = Trajectory(_poses(root / TRAJECTORY))
+    pairs = paired_by_stamp(root / TRAJECTORY, colors, depths, trajectory.at, options)
+    lenses = Lenses()
+    pincams = {
+        stamp: path
+        for path in sorted((root / "lowres_wide_intrinsics").glob("*.pincam"))
+        if (stamp := _stamp_ns(path))
+    }
+    views = [replace(view, camera=lenses.named(_arkit_lens(pincams, view), str(root))) for view in pairs.views]
+    return described(
+        replace(pairs, views=views),
+        root,
+        options,
+        poses=PosesTable(format="rotation-vectors", file=TRAJECTORY),
+        has_stamps=True,
+        is_depth_resized=True,
+    )
+
+
+def _frames(folder: Path) -> Path | None:
+    candidates = (folder, *sorted(folder.glob("*_frames")))
+    return next((f for f in candidates if (f / TRAJECTORY).is_file() and (f / "lowres_depth").is_dir()), None)
+
+
+def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder", remedy="download lowres_wide and lowres_depth")
+    return [(stamp_ns, path) for path in images_of(folder).values() if (stamp_ns := _stamp_ns(path)) is not None]
+
+
+def _stamp_ns(path: Path) -> int | None:
+    """Of ``41069021_305.367.png``."""
+    return stamp_of_text(path.stem.rpartition("_")[2])
+
+
+def _poses(path: Path) -> dict[str, Float64]:
+    """T_world_camera by stamp [s] as written."""
+    poses = {}
+    for where, words, values in read_rows(path):
+        if len(values) != 7 or not np.isfinite(values).all():
+            raise InputError(
+                f"{where}: expected seconds, a rotation vector and a translation, got {' '.join(words)!r}",
+                remedy="copy the file again",
+            )
+        poses[words[0]] = invert_transform(pose_at(values[4:], cv2.Rodrigues(np.array(values[1:4]))[0]))
+    return poses
+
+
+def _arkit_lens(pincams: dict[int, Path], view: ListedView) -> CameraTable:
+    assert view.stamp_ns is not None
+    stamp_ns = view.stamp_ns
+    near = min(pincams, key=lambda stamp: abs(stamp - stamp_ns), default=None)
+    if near is None or abs(near - stamp_ns) > 5_000_000:  # the two names are rounded apart
+        raise InputError(
+            f"{view.color}: no .pincam of its stamp in lowres_wide_intrinsics",
+            remedy="download lowres_wide_intrinsics",
+        )
+    values = read_numbers(pincams[near])
+    if len(values) != 6 or not np.isfinite(values).all():
+        raise InputError(
+            f"{pincams[near]}: expected width, height, fx, fy, cx, cy, got {values}", remedy="copy the file again"
+        )
+    width, height, fx, fy, cx, cy = values
+    return CameraTable(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+_ARKIT_DOCS = """
+ARKitScenes | `lowres_wide.traj`, `lowres_depth/`, also in `*_frames/` | world to camera, interpolated | 1 mm, of
+    another size: nearest pixels | a `.pincam` per image
+"""
+
+
+FILE = "scene_camera.json"
+_REMEDY = "see BOP's format of datasets"
+COLOR_FOLDERS = ("rgb", "gray")
+
+
+def read_bop(folder: Path, options: SourceOptions) -> Description:
+    """The scene as a description; a scene without cam_R_w2c has no poses."""
+    options.refuse(("intrinsics",), "a BOP scene", folder)
+    views: list[ListedView] = []
+    num_colors = num_depths = 0
+    files = []
+    for sensor in _sensors(folder):
+        path = folder / f"{Path(FILE).stem}{sensor}.json"
+        color_folder = next((f for name in COLOR_FOLDERS if (f := folder / f"{name}{sensor}").is_dir()), None)
+        if color_folder is None:
+            raise InputError(
+                f"{folder}: expected a folder rgb{sensor} or gray{sensor}, got none", remedy="unpack the whole scene"
+            )
+        colors, depths = images_of(color_folder), images_of(folder / f"depth{sensor}")
+        views += _views(path, sensor, colors, depths)
+        files.append(path)
+        num_colors, num_depths = num_colors + len(colors), num_depths + len(depths)
+    name = FILE if len(files) == 1 else f"{Path(FILE).stem}*.json"
+    return described(
+        Pairs(path=files[0], views=views, unpaired=(num_colors - len(views), num_depths - len(views))),
+        folder,
+        options,
+        poses=PosesTable(format="bop", file=files[0].name if len(files) == 1 else name, convention="world_to_camera"),
+    )
+
+
+def _sensors(folder: Path) -> list[str]:
+    """What stands behind the names of each sensor's files: nothing for an only one, else ``_cam1``."""
+    stem = Path(FILE).stem
+    found = sorted(path.stem.removeprefix(stem) for path in folder.glob(f"{stem}*.json"))
+    return [sensor for sensor in found if (folder / f"depth{sensor}").is_dir()]
+
+
+def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, Path]) -> list[ListedView]:
+    """Those of one sensor."""
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected an object by image number, got {type(content).__name__}", remedy=_REMEDY)
+    entries = {int(key): entry for key, entry in content.items() if key.isdigit()}
+    lenses, views, prefix = Lenses(), [], sensor.removeprefix("_")
+    size = image_size(next(iter(colors.values()))) if colors else (0, 0)  # that of all images of a scene
+    for name, color in colors.items():
+        entry = entries.get(int(name)) if name.isdigit() else None
+        if name not in depths or entry is None:
+            continue
+        where = f"{path}: image {int(name)}"
+        try:
+            lens = _bop_lens(entry, size, prefix or CAMERA)
+            view = ListedView(
+                name=f"{prefix}/{name}" if prefix else name,
+                color=color,
+                depth=depths[name],
+                matrix=_pose(entry),
+                camera=lenses.named(lens, where),
+                depth_scale=float(entry["depth_scale"]) * MILLIMETRE,
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{where}: expected BOP's fields, got no usable {error}", remedy=_REMEDY) from None
+        views.append(view)
+    return views
+
+
+def _bop_lens(entry: dict[str, Any], size: tuple[int, int], name: str) -> CameraTable:
+    fx, _, cx, _, fy, cy, _, _, _ = (float(value) for value in entry["cam_K"])
+    return CameraTable(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy, name=name)
+
+
+def _pose(entry: dict[str, Any]) -> Float64 | None:
+    """World to camera [m], None where the scene does not say."""
+    if "cam_R_w2c" not in entry or "cam_t_w2c" not in entry:
+        return None
+    return pose_at(
+        np.array(entry["cam_t_w2c"], dtype=np.float64) * MILLIMETRE,
+        np.array(entry["cam_R_w2c"], dtype=np.float64).reshape(3, 3),
+    )
+
+
+_BOP_DOCS = """
+BOP scene | `scene_camera.json`, `depth/`; of several sensors `scene_camera_cam1.json`, `depth_cam1/` |
+    `cam_R_w2c`, `cam_t_w2c`; else `--camera-pose` | `depth_scale` of each image | `cam_K` of each image
+"""
+
+
+_CAMERAS = "cams/*_cam.txt"
+_NO_DEPTH = ("prob", "conf")  # in the names of maps beside depth
+_ESTIMATED = ("est", "mvsnet")  # in the names of folders with a network's depth, which stands behind a measured one
+
+
+def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
+    """The folder as a description, a lens for each K; --depth-scale is metres per length of cameras and depth."""
+    options.refuse(("intrinsics",), "an MVSNet scene", folder)
+    files = {path.name.removesuffix("_cam.txt"): path for path in sorted(folder.glob(_CAMERAS))}
+    cameras = {stem: read_camera_file(path) for stem, path in files.items()}
+    nearest = float(np.median([camera.nearest for camera in cameras.values()]))
+    unit, notes = options.depth_scale, []
+    if unit is None:
+        unit = MILLIMETRE if nearest > PLAUSIBLE_DEPTH[1] else 1.0
+        name = "metres" if unit == 1.0 else "millimetres"
+        notes.append(
+            f"lengths are taken as {name}, by a least depth of {nearest:g} in the camera files; they do not say:"
+            " --depth-scale gives metres per unit"
+        )
+    colors = _images(folder, set(files))
+    depths, without = _depths(folder)
+    notes += without
+    lenses, views = Lenses(), []
+    for stem, color in colors.items():
+        camera, depth = cameras[stem], depths.get(int(stem) if stem.isdigit() else -1)
+        if depth is None and depths:
+            continue
+        k = fitted_intrinsics(camera.K, image_size(color), files[stem])
+        matrix = camera.T_camera_world.copy()
+        matrix[:3, 3] *= unit
+        lens = CameraTable(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
+        lens = lenses.named(lens, str(files[stem]))
+        views.append(ListedView(name=stem, color=color, depth=depth, matrix=matrix, camera=lens))
+    return described(
+        Pairs(path=folder, views=views, unpaired=(len(colors) - len(views), len(depths) - len(views))),
+        folder,
+        options,
+        poses=PosesTable(format="matrix-files", file=_CAMERAS, convention="world_to_camera"),
+        depth=DepthTable(encoding="float32", scale=unit),
+        is_depth_resized=True,
+        supply="add a folder depths/ with a .pfm for each number, or describe them in a .toml (splatctrl help input)",
+        notes=tuple(notes),
+    )
+
+
+def _images(folder: Path, stems: set[str]) -> dict[str, Path]:
+    """The image of each camera, from the folder with most of them."""
+    inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and "depth" not in path.name.lower()]
+    found = [{stem: path for stem, path in images_of(place).items() if stem in stems} for place in (*inner, folder)]
+    most = max(found, key=len)
+    if not most:
+        raise InputError(
+            f"{folder}: no image is named like a camera file ({min(stems)}_cam.txt)", remedy="copy the images too"
+        )
+    return most
+
+
+def _depths(folder: Path) -> tuple[dict[int, Path], list[str]]:
+    """Depth by number, and a note where folders with others are left out."""
+    found = {
+        path.name: dict(_maps(path)) for path in folder.iterdir() if path.is_dir() and "depth" in path.name.lower()
+    }
+    names = sorted((any(word in name for word in _ESTIMATED), name) for name, maps in found.items() if maps)
+    if not names:
+        return {}, []
+    first, *others = (name for _, name in names)
+    return found[first], [f"depth is that of {first}/, not of {', '.join(others)}"] if others else []
+
+
+def _maps(folder: Path) -> Iterator[tuple[int, Path]]:
+    for path in sorted(folder.glob("*.pfm")):
+        number = re.search(r"\d+", path.stem)
+        if number is not None and not any(word in path.stem for word in _NO_DEPTH):
+            yield int(number[0]), path
+
+
+_MVSNET_DOCS = """
+MVSNet scene: DTU's test set, BlendedMVS, Tanks and Temples, colmap2mvsnet | `cams/*_cam.txt`, with `images/`,
+    `blended_images/` or images beside it | world to camera, of the camera file | `.pfm` in a folder with `depth` in
+    its name; metres, or millimetres where the files' least depth is over 20, or `--depth-scale` for poses and depth |
+    of the camera file, for the image or a quarter of it
+"""
+
+ENTRIES = (
+    Layout(
+        name="ARKitScenes",
+        order=7,
+        matches=lambda folder: _frames(folder) is not None,
+        read=read_arkit,
+        docs=_ARKIT_DOCS,
+    ),
+    Layout(name="BOP scene", order=1, matches=lambda folder: bool(_sensors(folder)), read=read_bop, docs=_BOP_DOCS),
+    Layout(name="MVSNet scene", order=10, matches=marked(_CAMERAS), read=read_mvsnet, docs=_MVSNET_DOCS),
+)

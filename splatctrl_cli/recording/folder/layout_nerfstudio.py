@@ -1,0 +1,179 @@
+"""nerfstudio's and instant-ngp's ``transforms.json`` with depth: lens, files and pose of each frame, or one lens.
+
+Fields, defaults and axes (OpenGL) are those of nerfstudio's documentation ("Data conventions") and of its
+nerfstudio/data/dataparsers/nerfstudio_dataparser.py and data/utils/data_utils.py: masks are 0 where a pixel is not to
+be used, depth of another size is brought to that of the images by nearest pixels, and poses that were scaled
+(``applied_scale``) are scaled back, so that they fit metric depth. instant-ngp says ``depth_path``,
+``integer_depth_scale`` [m per count], ``camera_angle_x``, ``is_fisheye``, and leaves the centre out where it is the
+image's (NVlabs/instant-ngp, scripts/nerfcapture2nerf.py, and src/nerf_loader.cu).
+"""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.recording.folder.folder_description import CameraTable, Description, ListedView, PosesTable
+from splatctrl_cli.recording.folder.layout import Layout, Lenses, image_size, marked
+from splatctrl_cli.recording.folder.poses import read_nerfstudio
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import Float64
+
+FILES = ("transforms.json", "transforms_train.json")  # the second is Blender's of NeRF, which has no depth
+_RADIAL = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")  # nerfstudio's CAMERA_MODEL_TO_TYPE
+_MODELS = {**dict.fromkeys(_RADIAL, "plumb_bob"), "OPENCV_FISHEYE": "equidistant"}
+_ALL = ("k1", "k2", "p1", "p2", "k3", "k4")
+_COEFFICIENTS = {
+    **dict.fromkeys(_RADIAL[:2], ()),
+    **dict.fromkeys(_RADIAL[2:], _ALL[:5]),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+SUPPLY = "add depth_file_path to each frame (16-bit PNG in mm, or .npy in m), or describe the files in a .toml"
+_DEPTHS = ("depth_file_path", "depth_path")
+_SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
+
+
+def read(folder: Path, options: SourceOptions) -> Description:
+    """The folder as a description; depth is in millimetres unless the file or --depth-scale says otherwise."""
+    options.refuse(("intrinsics",), "a folder with transforms.json", folder)
+    file = next(name for name in FILES if (folder / name).is_file())
+    description = Description(
+        path=folder / file, root=folder, poses=PosesTable(format="nerfstudio", file=file, axes="opengl")
+    )
+    return with_transforms(description)
+
+
+def with_transforms(description: Description) -> Description:
+    """With the camera and the views of a transforms.json where the description leaves them to it."""
+    table = description.poses
+    is_whole = bool(description.listed or (description.camera and description.frames))
+    if is_whole or table is None or table.format != "nerfstudio":
+        return description
+    path = description.root / table.file
+    content, matrices = read_nerfstudio(path)
+    lenses = Lenses()
+    views = [_view(content, entry, path, lenses, description, matrices) for entry in content["frames"]]
+    if not views:
+        raise InputError(f"{path}: no frames", remedy="give a transforms.json with frames")
+    bare = [view.name for view in views if view.depth is None]
+    if bare and len(bare) < len(views):
+        raise InputError(
+            f"{path}: {bare[0]}: depth_file_path is missing ({len(bare)} of {len(views)} frames)",
+            remedy="add it, or leave the frame out",
+        )
+    if description.frames is not None:
+        if len(lenses) > 1:
+            raise InputError(
+                f"{path}: {len(lenses)} different sets of intrinsics beside [frames]",
+                remedy="leave [frames] out, or give [camera]",
+            )
+        return replace(description, camera=views[0].camera)
+    listed = tuple(sorted(_short(views), key=lambda v: v.name))
+    return replace(description, camera=views[0].camera, listed=listed, is_depth_resized=True, supply=SUPPLY)
+
+
+def _view(
+    content: dict[str, Any],
+    entry: dict[str, Any],
+    path: Path,
+    lenses: Lenses,
+    description: Description,
+    matrices: dict[str, Float64],
+) -> ListedView:
+    """A frame; its own values stand before those of the file."""
+    name, said = str(entry["file_path"]), {**content, **entry}
+    color = _image(path.parent / _with_slashes(name))
+    depth, scale = _only(entry, _DEPTHS, path), _only(said, _SCALES, path)
+    mask = entry.get("mask_path")
+    try:
+        applied = float(content.get("applied_scale", 1.0))
+        matrix = matrices[name].copy()
+        matrix[:3, 3] *= 1.0 / applied
+        unit = None if scale is None else float(scale)
+    except (TypeError, ValueError, ZeroDivisionError) as error:
+        raise InputError(f"{path}: {name}: expected numbers, got {error}", remedy="correct the file") from None
+    return ListedView(
+        name=name,
+        color=color,
+        depth=None if depth is None else path.parent / _with_slashes(str(depth)),
+        matrix=matrix,
+        camera=description.camera or lenses.named(_camera(said, color, path), str(path)),
+        depth_scale=unit,
+        valid=None if not mask else path.parent / _with_slashes(str(mask)),
+    )
+
+
+def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
+    """The value under one of the keys, None without any. Raises InputError where two of them differ."""
+    found = {key: said[key] for key in keys if said.get(key) not in (None, "")}
+    if len(set(found.values())) > 1:
+        both = " and ".join(f"{key} = {value}" for key, value in found.items())
+        raise InputError(f"{path}: {both} differ", remedy="leave one of them out")
+    return next(iter(found.values()), None)
+
+
+def _with_slashes(name: str) -> str:
+    """The path with slashes, where Windows wrote backslashes."""
+    return name.replace("\\", "/")
+
+
+def _image(path: Path) -> Path:
+    """An image by a name that may leave `.png` or `.jpg` out, as Blender's scenes do."""
+    if path.suffix:
+        return path
+    return next((file for end in (".png", ".jpg") if (file := path.with_name(path.name + end)).is_file()), path)
+
+
+def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
+    """The lens of a frame."""
+    model = str(said.get("camera_model") or ("OPENCV_FISHEYE" if said.get("is_fisheye") else "OPENCV"))
+    if model not in _MODELS:
+        raise InputError(
+            f"{path}: camera_model: expected one of {', '.join(_MODELS)}, got {model!r}",
+            remedy="undistort the images",
+        )
+    if "is_fisheye" in said and bool(said["is_fisheye"]) != (model == "OPENCV_FISHEYE"):
+        raise InputError(
+            f"{path}: camera_model is {model}, but is_fisheye is {said['is_fisheye']}", remedy="correct one of them"
+        )
+    try:
+        distortion = [float(said.get(key, 0.0)) for key in _COEFFICIENTS[model]]
+        further = sorted(key for key in _ALL if key not in _COEFFICIENTS[model] and float(said.get(key, 0.0)))
+        if further:
+            raise InputError(
+                f"{path}: camera_model {model}: expected no {further[0]}, got {said[further[0]]}",
+                remedy="correct the model, or undistort the images",
+            )
+        width, height = (int(said["w"]), int(said["h"])) if {"w", "h"} <= said.keys() else image_size(image)
+        fx = float(said["fl_x"]) if "fl_x" in said else width / 2 / math.tan(float(said["camera_angle_x"]) / 2)
+        return CameraTable(
+            width=width,
+            height=height,
+            fx=fx,
+            fy=float(said.get("fl_y", fx)),
+            cx=float(said.get("cx", width / 2)),
+            cy=float(said.get("cy", height / 2)),
+            pixel_center=0.5,  # nerfstudio's convention
+            distortion=distortion,
+            distortion_model=_MODELS[model],
+        )
+    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        remedy = "give [camera] and [frames] in a description"
+        raise InputError(f"{path}: no usable {error} in the intrinsics", remedy=remedy) from None
+
+
+def _short(views: list[ListedView]) -> list[ListedView]:
+    """Views by the stem of their colour file where that is theirs alone, else by its path without suffix."""
+    stems = [Path(view.name).stem for view in views]
+    if len(set(stems)) == len(stems):
+        return [replace(view, name=stem) for view, stem in zip(views, stems, strict=True)]
+    return [replace(view, name=str(Path(view.name).with_suffix(""))) for view in views]
+
+
+_DOCS = """
+nerfstudio, instant-ngp, Blender | `transforms.json` or `transforms_train.json`, `depth_file_path` or `depth_path` |
+    `transform_matrix`, without `applied_scale` | 1 mm, or `integer_depth_scale`; `.npy` too; of another size: nearest
+    pixels | of the file or each frame; `mask_path` leaves pixels out
+"""
+ENTRIES = (Layout(name="nerfstudio", order=4, matches=marked(*FILES), read=read, docs=_DOCS),)

@@ -1,0 +1,256 @@
+"""Organised point clouds of PCL: a ``.pcd`` with a point for each pixel of the camera, or a folder of them.
+
+The format is that of PCL's tutorial "The PCD file format" (v0.7; ascii, binary, binary_compressed), read by pypcd4
+(extra `pcd`). The file says no intrinsics, but its grid does: the point of column u and row v lies on the ray of that
+pixel. VIEWPOINT is the camera's pose; the points are in the camera's frame (z forward), or in the world, whichever
+the grid fits.
+"""
+
+import struct
+from dataclasses import dataclass
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.config.fixed import CLOUD_POINTS, CLOUD_RESIDUAL
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.image_file import MOST_PIXELS
+from splatctrl_cli.geometry import invert_transform, project, transform_from, transform_points
+from splatctrl_cli.libraries import of_extra
+from splatctrl_cli.recording.folder.folder_description import (
+    CameraTable,
+    DepthTable,
+    Description,
+    ImagePart,
+    ListedView,
+    PosesTable,
+)
+from splatctrl_cli.recording.folder.layout import CAMERA, Layout, Pairs, by_numbers, described, marked
+from splatctrl_cli.recording.folder.poses import stamp_of_text
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import Bool, Float64, Intrinsics, UInt8
+
+SUFFIX = ".pcd"
+_UNSET = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # VIEWPOINT where nobody set it
+_MOST_LINES = 32  # of a header
+_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+_DAMAGE = (ValueError, TypeError, KeyError, RuntimeError, OSError, MemoryError, struct.error)
+_AGAIN = "copy the file again"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cloud:
+    """A cloud as written: points (H, W, 3) float64, NaN where there is none, color (H, W, 3) uint8 RGB, VIEWPOINT."""
+
+    points: Float64
+    color: UInt8
+    T_world_camera: Float64
+
+    def in_camera(self, *, is_world: bool) -> Float64:
+        """Points (H, W, 3) in the camera's frame, of a file that has them there, or in the world."""
+        return transform_points(invert_transform(self.T_world_camera), self.points) if is_world else self.points
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Camera:
+    """The camera of all clouds, whether their points are in the world, and the cloud that it was fitted to."""
+
+    intrinsics: Intrinsics
+    is_world: bool
+    first: Path
+
+
+def read_cloud(path: Path) -> Cloud:
+    """An organised cloud with colour. Raises InputError for any other file."""
+    said = _head(path)
+    size = (said.height, said.width)
+    try:
+        columns = _library().PointCloud.from_path(path).pc_data
+        points = np.stack([columns[axis].astype(np.float64).reshape(size) for axis in "xyz"], axis=-1)
+        packed = columns["rgb" if "rgb" in said.fields else "rgba"].view(np.uint32).reshape(size)
+    except _DAMAGE as error:
+        raise _unreadable(path, error) from None
+    rgb = np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
+    return Cloud(points=points, color=rgb, T_world_camera=_viewpoint(said))
+
+
+def pinhole_of(points: Float64) -> Intrinsics | None:
+    """The pinhole camera whose pixel (u, v) the point (H, W, 3) of row v and column u lies in, by least squares over
+    u and v; None where there are too few points before it, or none fits.
+    """
+    valid = _is_seen(points)
+    v, u = np.nonzero(valid)
+    if len(u) < CLOUD_POINTS:
+        return None
+    rays = points[valid][:, :2] / points[valid][:, 2:]
+    lines = [np.linalg.lstsq(np.stack([rays[:, i], np.ones(len(u))], axis=1), (u, v)[i])[0] for i in range(2)]
+    (fx, cx), (fy, cy) = (map(float, line) for line in lines)
+    if not (fx > 0 and fy > 0):
+        return None
+    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=points.shape[1], height=points.shape[0])
+
+
+def residual(points: Float64, camera: Intrinsics | None) -> float:
+    """How far [px] the points (H, W, 3) lie from their pixels: 95 % of them at most so far; inf without a camera."""
+    valid = _is_seen(points)
+    if camera is None or not valid.any():
+        return float("inf")
+    v, u = np.nonzero(valid)
+    return float(np.percentile(np.linalg.norm(project(camera, points[valid]) - np.stack([u, v], axis=1), axis=1), 95))
+
+
+def read(path: Path, options: SourceOptions) -> Description:
+    """A cloud, or those of a folder, as a description; --depth-scale is metres per length of points and VIEWPOINT."""
+    files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"), key=lambda p: by_numbers(p.stem))
+    heads, unit = [_head(file) for file in files], options.depth_scale or 1.0
+    camera, notes = _fitted(files[0], options)
+    stamps = [stamp_of_text(file.stem) if "." in file.stem else None for file in files]
+    has_stamps = None not in stamps
+    views = []
+    for number, (file, head) in enumerate(zip(files, heads, strict=True)):
+        T, size = _viewpoint(head), (head.width, head.height)
+        T[:3, 3] *= unit
+        color, depth = partial(_color_file, file), partial(_depth_file, file, camera)
+        views.append(
+            ListedView(
+                name=file.stem,
+                color=ImagePart(file=file, number=number, size=size, suffix=".png", read_bytes=color),
+                depth=ImagePart(file=file, number=number, size=size, suffix=".npy", read_bytes=depth),
+                matrix=T,
+                stamp_ns=stamps[number] if has_stamps else None,
+            )
+        )
+    if all(tuple(head.viewpoint) == _UNSET for head in heads) and CAMERA not in options.camera_poses:
+        if len(files) > 1:
+            raise InputError(
+                f"{path}: no poses: VIEWPOINT is the origin in all {len(files)} clouds",
+                remedy="write poses as VIEWPOINT, or give --camera-pose camera=identity where it stands still",
+            )
+        notes.append("VIEWPOINT is the origin: the camera's own frame is the world")
+    others = sorted({name for head in heads for name in head.fields} - {"x", "y", "z", "rgb", "rgba"})
+    notes += [f"fields {', '.join(others)} are not used"] if others else []
+    k = camera.intrinsics
+    lens = CameraTable(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
+    return described(
+        Pairs(path=path, views=views, unpaired=(0, 0)),
+        path.parent if path.is_file() else path,
+        options,
+        poses=PosesTable(format="pcd", file=f"*{SUFFIX}" if path.is_dir() else path.name),
+        lens=lambda _: lens,
+        depth=DepthTable(encoding="float32", scale=unit),
+        has_stamps=has_stamps,
+        notes=tuple(notes),
+    )
+
+
+def _fitted(path: Path, options: SourceOptions) -> tuple[_Camera, list[str]]:
+    """The camera that a cloud's grid is of, or that --intrinsics gives, and what to say of it."""
+    cloud, given = read_cloud(path), options.intrinsics.get(CAMERA)
+    fits = []
+    for is_world in (False, True):
+        points = cloud.in_camera(is_world=is_world)
+        height, width = points.shape[:2]
+        camera = pinhole_of(points)
+        if given is not None:
+            fx, fy, cx, cy = given
+            camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+        fits.append((residual(points, camera), is_world, camera))
+    far, is_world, camera = min(fits, key=lambda fit: fit[0])
+    if camera is None or far > CLOUD_RESIDUAL:
+        raise _unfit(path, far, "of a pinhole camera" if given is None else "that of --intrinsics")
+    k = f"fx {camera.fx:.2f}, fy {camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f} px"
+    note = f"intrinsics are those of the grid of {path.name}: {k}, within {far:.2g} px"
+    return _Camera(intrinsics=camera, is_world=is_world, first=path), [] if given is not None else [note]
+
+
+def _unfit(path: Path, far: float, what: str) -> InputError:
+    return InputError(
+        f"{path}: the grid is not {what}: 5 % of the points are farther than {far:.3g} px from their pixels, expected"
+        f" {CLOUD_RESIDUAL:g}",
+        remedy="save clouds in the camera's frame (z forward), or its pose as VIEWPOINT; undistorted, not cropped",
+    )
+
+
+def _library() -> Any:
+    return of_extra("pypcd4", "pcd", "point clouds (.pcd)")
+
+
+def _head(path: Path) -> Any:
+    """What a cloud says before its points. Raises InputError for one that is not organised or without colour."""
+    lines: list[str] = []
+    try:
+        with path.open("rb") as stream:
+            for _ in range(_MOST_LINES):
+                line = stream.readline(1 << 12).decode("ascii").strip()
+                lines += [line] if line and not line.startswith("#") else []
+                if line.startswith("DATA"):
+                    break
+        said = _library().MetaData.parse_header(lines)
+    except _DAMAGE as error:
+        raise _unreadable(path, error) from None
+    if said.height <= 1:
+        raise InputError(
+            f"{path}: not organised: {said.width} points in one row",
+            remedy="record clouds before any filter, in the rows and columns of the image, NaN where nothing is seen",
+        )
+    if not 0 < said.width * said.height <= MOST_PIXELS or said.points != said.width * said.height:
+        raise InputError(f"{path}: {said.points} points of {said.width}x{said.height}", remedy=_AGAIN)
+    if not np.linalg.norm(said.viewpoint[3:]) > 0.5:
+        raise InputError(f"{path}: VIEWPOINT: expected a quaternion, got {said.viewpoint[3:]}", remedy=_AGAIN)
+    if not {"rgb", "rgba"} & set(said.fields):
+        raise InputError(
+            f"{path}: no colour: expected a field rgb or rgba, got {' '.join(said.fields)}",
+            remedy="save clouds with colour (PCL: PointXYZRGB, PointXYZRGBL)",
+        )
+    return said
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    said = " ".join(str(error).split())[:200] or type(error).__name__
+    return InputError(f"{path}: not a PCD that can be read: {said}", remedy=_AGAIN)
+
+
+def _viewpoint(said: Any) -> Float64:
+    """T_world_camera (4, 4) of VIEWPOINT: x, y, z, then qw, qx, qy, qz."""
+    x, y, z, qw, qx, qy, qz = said.viewpoint
+    return transform_from((x, y, z), (qx, qy, qz, qw))
+
+
+def _is_seen(points: Float64) -> Bool:
+    return np.asarray(np.isfinite(points).all(axis=2) & (points[..., 2] > 0))
+
+
+def _color_file(path: Path) -> bytes:
+    """The colour of a cloud as a PNG, nothing where it does not read."""
+    try:
+        color = read_cloud(path).color
+    except InputError:
+        return b""
+    return cv2.imencode(".png", color[..., ::-1], _FAST)[1].tobytes()
+
+
+def _depth_file(path: Path, camera: _Camera) -> bytes:
+    """The depth of a cloud in its own length, 0 for none, as .npy. Raises InputError for another camera."""
+    try:
+        points = read_cloud(path).in_camera(is_world=camera.is_world)
+    except InputError:
+        return b""
+    seen = _is_seen(points)
+    far = residual(points, camera.intrinsics)
+    if seen.any() and far > CLOUD_RESIDUAL:
+        raise _unfit(path, far, f"that of {camera.first.name}")
+    stream = BytesIO()
+    np.save(stream, np.where(seen, points[..., 2], 0.0).astype(np.float32), allow_pickle=False)
+    return stream.getvalue()
+
+
+_DOCS = """
+organised point clouds (extra `pcd`) | `X.pcd` of HEIGHT over 1, or a folder of them; ascii, binary, compressed |
+    `VIEWPOINT` | z of the points in the camera; metres, or `--depth-scale` | fitted to the grid, to 0.5 px; so are
+    `--intrinsics` checked
+"""
+ENTRIES = (Layout(name="PCD clouds", order=12, matches=marked(f"*{SUFFIX}"), read=read, suffix=SUFFIX, docs=_DOCS),)

@@ -1,0 +1,271 @@
+"""Layouts that pair images by their stamps: TUM RGB-D and what is published in its form, SUN3D.
+
+TUM RGB-D and what others publish in its form: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``, all by stamps.
+
+Depth counts 1/5000 m. Files, factor and cameras are those of the dataset's page (Sturm et al., A benchmark for the
+evaluation of RGB-D SLAM systems, IROS 2012; "File Formats" and "Intrinsic Camera Calibration"; the same in
+raulmur/ORB_SLAM2, Examples/RGB-D/TUM1.yaml to TUM3.yaml). Poses are those of the colour camera. Depth is registered
+to the colour image as it was taken, so both are undistorted alike.
+
+Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): its page gives the lens, and the camera in the frame of the markers
+that groundtruth.txt follows, T_camera = T_ros^-1 T_groundtruth T_ros T_m. The rotation of T_m has a scale of 1.059
+there, which is left out. ETH3D SLAM (Schöps et al., CVPR 2019): ``calibration.txt`` with fx, fy, cx, cy.
+
+ICL-NUIM in its TUM-compatible form: ``rgb/N.png``, ``depth/N.png`` and a ``*.gt.freiburg``, all by the number N. The
+renderer's camera is left-handed, which its page writes as a negative focal length (481.20, -480.00, 319.50, 239.50):
+y points up, in the camera and in the world. Both are mirrored here, so that poses stay rigid and fy is positive, as
+in theNded/MeshHashing (src/io/config_manager.cc). The trajectory begins with image 1; image 0 has no pose.
+
+SUN3D: ``image/NUMBER-MICROSECONDS.jpg``, ``depth/NUMBER-MICROSECONDS.png``, ``intrinsics.txt``, ``extrinsics/``.
+
+As the dataset's own reader takes them (SUN3DreaderWithAnnotation, readSUN3Dannotation.m): depth with its bits rotated
+left by three, in millimetres, registered to colour; the depth nearest in time belongs to an image; the last file of
+``extrinsics/`` holds a 3x4 matrix for each image in order, camera to world; the first pixel's centre is at 1.
+"""
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.recording.folder.folder_description import (
+    CameraTable,
+    DepthTable,
+    Description,
+    ImageFile,
+    PosesTable,
+)
+from splatctrl_cli.recording.folder.layout import (
+    Layout,
+    described,
+    images_of,
+    marked,
+    paired_by_name,
+    paired_by_stamp,
+    pinhole,
+    pose_or_none,
+    read_K,
+)
+from splatctrl_cli.recording.folder.poses import Trajectory, read_numbers, read_tum, rigid, stamp_of_text, tum_rows
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import Float64
+
+SCALE = 1.0 / 5000.0  # [m] per count
+ICL_LENS = (481.2, 480.0, 319.5, 239.5)
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_TRAJECTORY = "*.gt.freiburg"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Series:
+    """A series of recordings: the pattern of its names, fx, fy, cx, cy and k1, k2, p1, p2, k3."""
+
+    pattern: str
+    lens: tuple[float, float, float, float]
+    distortion: tuple[float, ...] = ()
+
+
+SERIES = (
+    Series(
+        pattern="(freiburg|fr)_?1",
+        lens=(517.3, 516.5, 318.6, 255.3),
+        distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    ),
+    Series(
+        pattern="(freiburg|fr)_?2",
+        lens=(520.9, 521.0, 325.1, 249.7),
+        distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    ),
+    Series(pattern="(freiburg|fr)_?3", lens=(535.4, 539.2, 320.1, 247.6)),
+    Series(
+        pattern="bonn",
+        lens=(542.822841, 542.576870, 315.593520, 237.756098),
+        distortion=(0.039903, -0.099343, -0.000730, -0.000144, 0.0),
+    ),
+)
+
+
+_BONN = SERIES[-1]
+
+
+_BONN_T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+_BONN_SCALE = 1.0593  # of the rotation below, as published
+
+
+_BONN_T_M = np.array(
+    [
+        [1.0157 / _BONN_SCALE, 0.1828 / _BONN_SCALE, -0.2389 / _BONN_SCALE, 0.0113],
+        [0.0009 / _BONN_SCALE, -0.8431 / _BONN_SCALE, -0.6413 / _BONN_SCALE, -0.0098],
+        [-0.3009 / _BONN_SCALE, 0.6147 / _BONN_SCALE, -0.8085 / _BONN_SCALE, 0.0111],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+
+
+_BONN_NOTE = (
+    "Bonn: poses are moved from the markers to the camera as its page says, without the scale of 1.059 in that"
+    " transform; depth is as published (--depth-scale 2.1186e-4 scales it by as much)"
+)
+
+
+def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
+    """The folder as a description: pairs within the pairing tolerance, poses interpolated."""
+    colors, depths = listed(folder / "rgb.txt"), listed(folder / "depth.txt")
+    series = _series(folder)
+    file = folder / "groundtruth.txt"
+    rows = tum_rows(file) if file.is_file() else {}
+    trajectory, num_lost = Trajectory(rows), sum(T is None for T in rows.values())
+    lost = (f"{file.name}: {num_lost} of {len(rows)} lines are no pose (nan)",) if num_lost else ()
+    pairs = paired_by_stamp(folder / "rgb.txt", colors, depths, trajectory.at, options)
+    return described(
+        pairs.moved(marker_to_camera) if series is _BONN else pairs,
+        folder,
+        options,
+        poses=PosesTable(format="tum", file=file.name),
+        lens=lambda image: _lens(folder, series, image),
+        depth=DepthTable(scale=SCALE),
+        has_stamps=True,
+        notes=((_BONN_NOTE,) if series is _BONN else ()) + lost,
+    )
+
+
+def listed(path: Path) -> list[tuple[int, Path]]:
+    """Stamp [ns] and file of each line ``stamp path``."""
+    found = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        words = line.split()
+        if words and not line.startswith("#"):
+            stamp_ns = stamp_of_text(words[0])
+            if stamp_ns is None or len(words) != 2:
+                raise InputError(f"{path}:{number}: expected 'stamp file', got {line!r}", remedy="correct the line")
+            found.append((stamp_ns, path.parent / words[1].replace("\\", "/")))
+    return found
+
+
+def _series(folder: Path) -> Series | None:
+    """The series of recordings that a folder's name is of, else the name in the heads of its lists."""
+    names = [folder.resolve().name]
+    for file in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        if (folder / file).is_file():
+            with (folder / file).open(encoding="utf-8", errors="replace") as stream:
+                names += [line for line in stream.readlines(1000)[:4] if line.startswith("#")]
+    pairs = ((name.lower(), series) for name in names for series in SERIES)
+    return next((series for name, series in pairs if re.search(rf"(?<![a-z]){series.pattern}(?!\d)", name)), None)
+
+
+def _lens(folder: Path, series: Series | None, image: ImageFile) -> CameraTable:
+    calibration = folder / "calibration.txt"
+    if calibration.is_file():
+        values = read_numbers(calibration)
+        if len(values) != 4:
+            raise InputError(
+                f"{calibration}: expected fx fy cx cy, got {len(values)} numbers",
+                remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
+            )
+        return pinhole(values, image)
+    if series is not None:
+        return pinhole(series.lens, image, series.distortion)
+    raise InputError(
+        f"{folder}: expected calibration.txt, or a name with one of freiburg1, freiburg2, freiburg3, bonn, whose"
+        f" cameras are known, got {folder.name!r}",
+        remedy="give --intrinsics camera=FX,FY,CX,CY (the Kinect's default: 525,525,319.5,239.5)",
+    )
+
+
+def marker_to_camera(T_ground_truth: Float64) -> Float64:
+    """T_world_camera (4, 4) of a pose in Bonn's groundtruth.txt."""
+    return np.asarray(_BONN_T_ROS.T @ T_ground_truth @ _BONN_T_ROS @ rigid(_BONN_T_M, "Bonn's T_m"))
+
+
+def read_icl(folder: Path, options: SourceOptions) -> Description:
+    """The folder as a description, right-handed."""
+    colors, depths = images_of(folder / "rgb"), images_of(folder / "depth")
+    file = sorted(folder.glob(_TRAJECTORY))[0]
+    poses = {_number(name): MIRROR @ T @ MIRROR for name, T in read_tum(file).items()}
+    return described(
+        paired_by_name(file, colors, depths, lambda name: poses.get(_number(name))),
+        folder,
+        options,
+        poses=PosesTable(format="tum", file=file.name),
+        lens=lambda image: pinhole(ICL_LENS, image),
+        depth=DepthTable(scale=SCALE),
+    )
+
+
+def _number(name: str) -> int:
+    """The number that a stem or a stamp is, -1 where it is none."""
+    try:
+        return int(float(name))
+    except (ValueError, OverflowError):
+        return -1
+
+
+_ICL_DOCS = """
+ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by number; mirrored to right-handed | 1/5000 m |
+    481.2, 480, 319.5, 239.5
+"""
+
+_TUM_DOCS = """
+TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated at the colour's stamp | 1/5000 m, paired
+    within 20 ms | by freiburg1, 2 or 3 (fr1, ...) in the folder's name or the heads of its lists, else
+    `--intrinsics`
+
+Bonn RGB-D Dynamic | the same, `bonn` in the name | moved from the markers to the camera | as TUM; the published
+    transform's scale of 1.059 is left out | of its page
+
+ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
+"""
+
+
+def read_sun3d(folder: Path, options: SourceOptions) -> Description:
+    """The folder as a description; images within the pairing tolerance of a depth image."""
+    colors, depths = _by_stamp(folder / "image"), _by_stamp(folder / "depth")
+    extrinsics = sorted((folder / "extrinsics").glob("*.txt"))
+    poses = _poses(extrinsics[-1]) if extrinsics else []
+    at = {stamp_ns: pose_or_none(poses[index]) for index, (stamp_ns, _) in enumerate(colors) if index < len(poses)}
+    return described(
+        paired_by_stamp(folder, colors, depths, at.get, options),
+        folder,
+        options,
+        poses=PosesTable(format="matrix-rows", file="extrinsics/*.txt"),
+        lens=lambda image: replace(pinhole(read_K(folder / "intrinsics.txt"), image), pixel_center=1.0),
+        depth=DepthTable(encoding="uint16-rotated3"),
+        has_stamps=True,
+    )
+
+
+def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
+    found = [(stamp_of_text(f"{path.stem.partition('-')[2]}e-6"), path) for path in images_of(folder).values()]
+    return [(stamp_ns, path) for stamp_ns, path in found if stamp_ns is not None]
+
+
+def _poses(path: Path) -> list[Float64]:
+    """T_world_camera (4, 4) of each image."""
+    values = read_numbers(path)
+    if len(values) % 12:
+        raise InputError(f"{path}: expected 3x4 matrices, got {len(values)} numbers", remedy="copy the file again")
+    rows = np.array(values).reshape(-1, 3, 4)
+    bottom = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 4))
+    return list(np.concatenate([rows, bottom], axis=1))
+
+
+_SUN3D_DOCS = """
+SUN3D | `image/`, `depth/`, `extrinsics/`, `intrinsics.txt` | the newest file of `extrinsics/`, by order | 1 mm,
+    bits rotated by three, paired within 20 ms | `intrinsics.txt`, the first pixel's centre at 1
+"""
+
+ENTRIES = (
+    Layout(name="TUM RGB-D", order=0, matches=marked("rgb.txt depth.txt"), read=read_tum_folder, docs=_TUM_DOCS),
+    Layout(name="ICL-NUIM", order=5, matches=marked(f"rgb/ depth/ {_TRAJECTORY}"), read=read_icl, docs=_ICL_DOCS),
+    Layout(
+        name="SUN3D",
+        order=8,
+        matches=marked("image/ depth/ extrinsics/ intrinsics.txt"),
+        read=read_sun3d,
+        docs=_SUN3D_DOCS,
+    ),
+)

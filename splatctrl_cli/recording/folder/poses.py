@@ -1,0 +1,212 @@
+"""Camera poses from text and JSON files, as T_world_camera of optical cameras (z forward)."""
+
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.config.fixed import POSE_TOLERANCE_NS
+from splatctrl_cli.config.ranges import MAX_PLACE
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import invert_transform, pose_at, quat_from_rotation, transform_from
+from splatctrl_cli.recording.log.registration import TfTree
+from splatctrl_cli.records import Float64
+
+FORMATS = ("matrix-blocks", "trajectory-log", "tum", "nerfstudio", "matrix-files")
+CONVENTIONS = ("camera_to_world", "world_to_camera")
+AXES = ("opencv", "opengl")
+OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
+_MOST_NS = 1 << 62
+_MSVC_NAN = re.compile(r"[+-]?1\.#(INF|IND|QNAN|SNAN)\d*")  # how Windows writes NaN and infinity (12-Scenes)
+MAX_SKEW = 1e-3  # largest entry of R^T R - I that is rounding of a text file
+_CORRECT = "correct the file, or [poses] where a .toml names it"
+
+
+def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Float64:
+    """T_world_camera (4, 4), optical, of a matrix as written in a file.
+
+    Raises InputError where it is not a rigid transform.
+    """
+    T = rigid(matrix, where)
+    if convention == "world_to_camera":
+        T = invert_transform(T)
+    return T @ OPENGL_FROM_OPTICAL if axes == "opengl" else T
+
+
+def rigid(matrix: Float64, where: str) -> Float64:
+    """The matrix (4, 4) with its rotation replaced by the nearest one, which undoes the rounding of text.
+
+    Raises InputError where it is none: scale, shear, mirror, NaN.
+    """
+    is_finite = matrix.shape == (4, 4) and bool((np.abs(matrix) < MAX_PLACE).all())
+    if not is_finite or np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max() > MAX_SKEW:
+        raise InputError(
+            f"{where}: expected a rigid transform (4x4), got one with scale, shear or NaN",
+            remedy="correct the matrix",
+        )
+    U, _, Vt = np.linalg.svd(matrix[:3, :3])
+    if np.linalg.det(U @ Vt) < 0:
+        raise InputError(f"{where}: expected a rotation, got a mirror image", remedy="check [poses] axes")
+    return pose_at(matrix[:3, 3], U @ Vt)
+
+
+def read_matrix_blocks(path: Path, heading: str) -> dict[str, Float64]:
+    """4x4 blocks under ``# heading ... NUMBER`` lines, by that number; other headings are passed over."""
+    poses: dict[str, Float64] = {}
+    lines = _lines(path)
+    for index, line in enumerate(lines):
+        number = re.search(r"(\d+)\s*$", line)
+        if line.startswith("#") and heading in line and number:
+            poses[str(int(number[1]))] = _matrix(lines[index + 1 : index + 5], f"{path}:{index + 2}")
+    return poses
+
+
+def read_trajectory_log(path: Path) -> dict[str, Float64]:
+    """Open3D's .log: a line of three numbers, the first of which is the frame's, then a 4x4 matrix."""
+    poses: dict[str, Float64] = {}
+    lines = [line for line in _lines(path) if line]
+    for index in range(0, len(lines), 5):
+        where = f"{path}: pose {index // 5}"
+        head = lines[index].split()
+        if len(head) != 3 or not head[0].isdigit():
+            raise InputError(f"{where}: expected three integers, got {lines[index]!r}", remedy=_CORRECT)
+        poses[str(int(head[0]))] = _matrix(lines[index + 1 : index + 5], where)
+    return poses
+
+
+def read_tum(path: Path) -> dict[str, Float64]:
+    """``stamp tx ty tz qx qy qz qw`` lines, by stamp [s] as written; a line with NaN is no pose."""
+    return {stamp: T for stamp, T in tum_rows(path).items() if T is not None}
+
+
+def tum_rows(path: Path) -> dict[str, Float64 | None]:
+    """The lines that `read_tum` reads, None for one whose pose is NaN."""
+    poses: dict[str, Float64 | None] = {}
+    for where, words, values in read_rows(path):
+        if len(values) == 8 and np.isfinite(values[0]) and np.isnan(values[1:]).any():
+            poses[words[0]] = None
+            continue
+        is_pose = len(values) == 8 and bool((np.abs(values[1:]) < MAX_PLACE).all())
+        if not is_pose or not any(values[4:]):
+            raise InputError(
+                f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}", remedy=_CORRECT
+            )
+        poses[words[0]] = transform_from(values[1:4], values[4:8])
+    return poses
+
+
+def read_matrix_lines(path: Path) -> list[Float64]:
+    """A 4x4 matrix in each line, by rows."""
+    poses = []
+    for where, _, values in read_rows(path):
+        if len(values) != 16:
+            raise InputError(
+                f"{where}: expected the 16 numbers of a 4x4 matrix, got {len(values)}", remedy="copy the file again"
+            )
+        poses.append(np.array(values).reshape(4, 4))
+    return poses
+
+
+def read_rows(path: Path) -> Iterator[tuple[str, list[str], list[float]]]:
+    """Place, words and numbers of each line that is neither empty nor a comment."""
+    for index, line in enumerate(_lines(path)):
+        if line and not line.startswith("#"):
+            words, where = line.split(), f"{path}:{index + 1}"
+            yield where, words, _numbers(words, where)
+
+
+def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
+    """The whole transforms.json, and its matrices by file_path."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        matrices = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=np.float64) for f in content["frames"]}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not a transforms.json: {error}", remedy=_CORRECT) from None
+    for name, matrix in matrices.items():
+        if matrix.shape != (4, 4):
+            raise InputError(f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}", remedy=_CORRECT)
+    return content, matrices
+
+
+def read_matrix_file(path: Path) -> Float64:
+    """A 4x4 matrix alone in a text file."""
+    return _matrix([line for line in _lines(path) if line and not line.startswith("#")][:4], str(path))
+
+
+def read_numbers(path: Path) -> list[float]:
+    """All numbers of a text file, in order."""
+    return [value for line in _lines(path) if not line.startswith("#") for value in _numbers(line.split(), str(path))]
+
+
+class Trajectory:
+    """Poses of one camera by stamp [s, as text], interpolated as those of tf, but not past a stamp without a pose
+    (None).
+    """
+
+    def __init__(self, poses: Mapping[str, Float64 | None]) -> None:
+        self._tree = TfTree()
+        known, lost = [], []
+        for text, T in poses.items():
+            stamp_ns = stamp_of_text(text)
+            if stamp_ns is not None and T is not None:
+                known.append(stamp_ns)
+                self._tree.add("world", "camera", stamp_ns, T[:3, 3], quat_from_rotation(T[:3, :3]), static=False)
+            elif stamp_ns is not None:
+                lost.append(stamp_ns)
+        self._known, self._lost = np.array(sorted(known), dtype=np.int64), np.array(sorted(lost), dtype=np.int64)
+
+    def at(self, stamp_ns: int) -> Float64 | None:
+        """T_world_camera (4, 4); None where the trajectory does not reach."""
+        after = np.searchsorted(self._known, stamp_ns)
+        is_known = after < len(self._known) and self._known[after] == stamp_ns
+        before = self._known[after : after + 1] if is_known else self._known[max(after - 1, 0) : after]
+        later = self._known[after : after + 1]
+        first, last = (part[0] if len(part) else stamp_ns for part in (before, later))
+        if ((self._lost >= first) & (self._lost <= last)).any():
+            return None
+        return self._tree.lookup("world", "camera", stamp_ns, POSE_TOLERANCE_NS)
+
+
+def stamp_of_text(text: str, unit_ns: int = 1_000_000_000) -> int | None:
+    """Nanoseconds of a time as written in units of so many (default: seconds), without the rounding of floats; None
+    where the text is not a time.
+    """
+    try:
+        stamp_ns = Decimal(text) * unit_ns
+        return round(stamp_ns) if abs(stamp_ns) < _MOST_NS else None  # rounding 1e999 writes out its digits
+    except (InvalidOperation, ValueError, OverflowError):
+        return None
+
+
+READERS: dict[str, Callable[[Path], dict[str, Float64]]] = {
+    "trajectory-log": read_trajectory_log,
+    "tum": read_tum,
+    "nerfstudio": lambda path: read_nerfstudio(path)[1],
+}
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}", remedy="check [poses] file and root") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file", remedy="check [poses] file") from None
+
+
+def _matrix(lines: list[str], where: str) -> Float64:
+    rows = [_numbers(line.split(), where) for line in lines]
+    if len(rows) != 4 or any(len(row) != 4 for row in rows):
+        raise InputError(f"{where}: expected a 4x4 matrix", remedy=_CORRECT)
+    return np.array(rows)
+
+
+def _numbers(words: list[str], where: str) -> list[float]:
+    try:
+        return [np.nan if _MSVC_NAN.fullmatch(word) else float(word) for word in words]
+    except ValueError:
+        raise InputError(f"{where}: expected numbers, got {' '.join(words)!r}", remedy=_CORRECT) from None

@@ -1,0 +1,459 @@
+"""RGB-D cameras in a log: which colour, depth and CameraInfo topics belong together, or why there are none; and poses
+that a log has as messages of their own instead of tf: odometry, tracked poses, stamped transforms.
+
+Fields of poses are those of nav_msgs/Odometry (the pose of child_frame_id in header.frame_id),
+geometry_msgs/PoseStamped, PoseWithCovarianceStamped and TransformStamped.
+"""
+
+import re
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import takewhile
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.image_file import JPEG
+from splatctrl_cli.libraries import is_installed
+from splatctrl_cli.recording.container.log_formats import told_formats
+from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.recording.log.decoder import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    VIDEO,
+    MessageDecoder,
+    UndecodableMessageError,
+    device_of,
+    is_ros,
+    stamp_ns,
+)
+from splatctrl_cli.recording.log.image_names import DEPTH, is_other, word_of
+from splatctrl_cli.recording.log.messages import ImageMessage
+from splatctrl_cli.recording.log.registration import is_distorted, lens_model
+from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey
+from splatctrl_cli.recording.log.video import EXTRA, KEY_FRAME, LIBRARY, OFTENER, is_video
+from splatctrl_cli.recording.source_options import CameraTopics, PoseTopic, SourceOptions
+from splatctrl_cli.records import Float64
+
+_TRANSPORTS = {"compressed", "compressedDepth"}
+_REGISTERED_WORDS = ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb")
+_ENCODINGS = ("cdr", "ros1", "protobuf", "json")  # of messages
+
+
+def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
+    """Topics whose first image is of this kind: color, depth or other; ``unlike`` are those whose name says that they
+    are not what they look like, as infrared of sixteen bits or depth in a JPEG.
+    """
+    topics = [(t, t.first_image) for t in survey.of_type(IMAGE, COMPRESSED_IMAGE)]
+    return [t for t, image in topics if image is not None and kind == ("unlike" if _unlike(t) else image.kind)]
+
+
+def _unlike(topic: TopicSurvey) -> str:
+    """The word in the names of a topic or its frame that says that its images are neither depth nor colour."""
+    image, parts = topic.image, _parts(topic.topic.name)
+    if image.kind == "depth":
+        word = word_of(parts) or word_of((image.frame_id,))
+        return word if is_other(word) else ""
+    word = word_of(parts, is_device=False)
+    return word if image.kind == "color" and word == DEPTH else ""
+
+
+def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraTopics, ...]:
+    """Cameras by name: colour and depth topics that share a namespace, deepest namespaces first.
+
+    /cam0/color/image_raw and /cam0/depth/image_raw make camera `cam0`. Registered depth is preferred to raw depth,
+    colour to grey, rectified images to raw ones, uncompressed to compressed. Topics in `without` are left out.
+    """
+    colors = [topic for topic in image_topics(survey, "color") if topic.topic.name not in without]
+    depths = image_topics(survey, "depth")
+    groups: dict[tuple[str, ...], list[TopicSurvey]] = {}
+    for depth in depths:
+        prefixes = [common_prefix(depth.topic.name, color.topic.name) for color in colors]
+        device = device_of(depth.topic.name)
+        if prefixes:
+            groups.setdefault((device,) if device else max(prefixes, key=len), []).append(depth)
+    cameras: list[CameraTopics] = []
+    taken: set[str] = set()
+    for namespace in sorted(groups, key=lambda parts: (-len(parts), parts)):
+        free = [
+            c for c in colors if c.topic.name not in taken and _parts(c.topic.name)[: len(namespace)] == namespace
+        ]
+        if not free:
+            continue
+        taken.update(c.topic.name for c in free)
+        color = min(free, key=_color_rank)
+        cameras.append(_camera(survey, namespace, color, groups[namespace]))
+    return _with_unique_names(cameras)
+
+
+def _camera(
+    survey: Survey, namespace: tuple[str, ...], color: TopicSurvey, depths: list[TopicSurvey]
+) -> CameraTopics:
+    info = find_info(survey, color, namespace)
+    depths = [d for d in depths if word_of(_parts(d.topic.name)) == DEPTH] or depths
+    names = {_family(d.topic.name): d.topic.name for d in reversed(depths) if word_of(_parts(d.topic.name)) != DEPTH}
+    depth, depth_info = min(
+        [(depth, find_info(survey, depth, namespace)) for depth in depths],
+        key=lambda item: (
+            not is_registered(survey, color.topic.name, item[0].topic.name, info, item[1]),
+            not _says_registered(item[0].topic.name),
+            item[0].topic.type_name == COMPRESSED_IMAGE,
+            item[0].topic.name,
+        ),
+    )
+    name = "/".join(namespace)
+    info = info or (depth_info if _is_of_file(color) else "")
+    return CameraTopics(
+        name=name,
+        color=color.topic.name,
+        depth=depth.topic.name,
+        info=info or "",
+        depth_info=depth_info or "",
+        rivals=tuple(sorted(names.values())) if len(names) > 1 else (),
+    )
+
+
+def _family(name: str) -> tuple[str, ...]:
+    """What raw, rectified and compressed images of one sensor share of their topics."""
+    parts = _parts(name)
+    return (*parts[:-1], re.sub("_?(rect|raw)", "", parts[-1]))
+
+
+def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | None = None) -> str:
+    """The CameraInfo topic of an image topic, "" if there is none.
+
+    It shares more of its path than the camera's namespace, or lies in the image's own folder or the namespace's, or
+    has the image's frame and size.
+    """
+    folder = _parts(image.topic.name)[:-1]
+    level = len(folder) - 1 if namespace is None else len(namespace)
+    found: list[tuple[int, int, str]] = []
+    for info in survey.of_type(CAMERA_INFO):
+        calibration = info.calibration
+        if calibration is None:
+            continue
+        info_folder = _parts(info.topic.name)[:-1]
+        shared = len(common_prefix(info.topic.name, image.topic.name))
+        is_near = shared > level or info_folder in {folder, folder[:level]}
+        if is_near or (image.first_image is not None and _fits(calibration, image.first_image)):
+            found.append((-shared, len(info_folder), info.topic.name))
+    return min(found)[2] if found else ""
+
+
+def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info: str) -> bool:
+    """Whether depth pixels already lie on colour pixels: of one size, frame (or a name says so), K and distortion."""
+    color_image, depth_image = survey.topics[color].image, survey.topics[depth].image
+    if (color_image.width, color_image.height) != (depth_image.width, depth_image.height):
+        return False
+    T_color_depth = survey.realsense.T_between(color, depth)
+    if T_color_depth is not None and not np.allclose(T_color_depth, np.eye(4), atol=1e-6):
+        return False
+    if frame_of(survey, color, depth) != depth_image.frame_id and not _says_registered(depth):
+        return False
+    calibration = survey.topics[info].calibration if info else None
+    depth_calibration = survey.topics[depth_info].calibration if depth_info else None
+    if calibration is None or depth_calibration is None:
+        return True
+    is_same_K = bool(abs(calibration.K - depth_calibration.K).max() <= 0.01 * calibration.K[0, 0])
+    return is_same_K and _same_distortion(calibration, depth_calibration)
+
+
+def _same_distortion(one: Calibration, two: Calibration) -> bool:
+    """Whether two lenses bend alike, coefficients that are left out being 0."""
+    bent = [is_distorted(c.distortion_model, c.distortion) for c in (one, two)]
+    if not all(bent):
+        return not any(bent)
+    a, b = (np.pad(c.distortion, (0, 14))[:14] for c in (one, two))
+    return lens_model(one.distortion_model) == lens_model(two.distortion_model) and bool(np.allclose(a, b, atol=1e-6))
+
+
+def frame_of(survey: Survey, color: str, depth: str) -> str:
+    """The frame of a colour topic's images; a video file names none: that of its depth, which is aligned to it."""
+    return survey.topics[depth if _is_of_file(survey.topics[color]) else color].image.frame_id
+
+
+def _is_of_file(topic: TopicSurvey) -> bool:
+    """Whether images are those of a video file beside a log."""
+    return topic.topic.encoding == VIDEO and topic.first_image is not None and not topic.first_image.frame_id
+
+
+def common_prefix(name: str, other: str) -> tuple[str, ...]:
+    """The leading path parts that two topics share, their last parts left out."""
+    pairs = zip(_parts(name)[:-1], _parts(other)[:-1], strict=False)
+    return tuple(a for a, _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+
+def _fits(calibration: Calibration, image: ImageMessage) -> bool:
+    same_size = (calibration.width, calibration.height) == (image.width, image.height)
+    return same_size and calibration.frame_id == image.frame_id and image.frame_id != ""
+
+
+def _says_registered(topic: str) -> bool:
+    return any(word in topic for word in _REGISTERED_WORDS)
+
+
+def _color_rank(topic: TopicSurvey) -> tuple[bool, bool, bool, bool, str]:
+    name = topic.topic.name
+    is_infrared = any(part.startswith(("infra", "ir")) for part in _parts(name))
+    return (topic.image.is_gray, is_infrared, "rect" not in name, topic.topic.type_name == COMPRESSED_IMAGE, name)
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    parts = tuple(part for part in name.split("/") if part)
+    return parts[:-1] if len(parts) > 1 and parts[-1] in _TRANSPORTS else parts
+
+
+def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
+    """The last part of the namespace where that is unique, else all of it; `camera` where there is none.
+
+    A name becomes a folder: characters but letters, digits, ``_``, ``-`` and ``.`` become ``_``, and it begins with
+    none of the last two.
+    """
+    short = [_folder_name(camera.name.rpartition("/")[2]) for camera in cameras]
+    long = [_folder_name(camera.name.replace("/", "_")) for camera in cameras]
+    names = [name if short.count(name) == 1 else long[i] for i, name in enumerate(short)]
+    named = [
+        replace(camera, name=name if names.count(name) == 1 else f"{name}_{i}")
+        for i, (camera, name) in enumerate(zip(cameras, names, strict=True))
+    ]
+    return tuple(sorted(named, key=lambda camera: camera.name))
+
+
+def _folder_name(name: str) -> str:
+    return re.sub(r"[^\w.-]", "_", name).lstrip(".-")[:80] or "camera"
+
+
+def no_camera(log: RawLog, survey: Survey) -> InputError:
+    """The refusal of a log in which no colour and depth belong together."""
+    colors = [t.topic.name for t in image_topics(survey, "color")]
+    depths = [t.topic.name for t in image_topics(survey, "depth")]
+    broken = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
+    rgbd = [t for t in survey.topics.values() if t.count and t.topic.type_name.rpartition("/")[2].startswith("RGBD")]
+    if rgbd and not (colors and depths):
+        return InputError(
+            f"{log.path}: colour and depth are in one message, which is not read: {rgbd[0].topic.type_name} on"
+            f" {rgbd[0].topic.name}",
+            remedy="record the camera's own topics instead: colour and aligned depth images, their camera_info, tf",
+        )
+    named = _named_unlike(survey)
+    if not depths and (colors or named):
+        chosen = "; if one of these is depth, give --camera NAME=COLOR,DEPTH" if "(named " in named else ""
+        unread = "".join(f"; {note}" for note in survey.damage.remarks if any(name in note for name in broken))
+        return InputError(
+            f"{log.path}: no depth topic{named}{unread}; colour topics there: {listed(colors)}",
+            remedy="record 16UC1, mono16 or 32FC1 depth images (info and replay of joint states work without)"
+            f"{chosen}",
+        )
+    videos = sorted(t.topic.name for t in survey.topics.values() if t.count and is_video(t.topic))
+    if videos and not colors:
+        return _unread_video(f"{log.path}: colour is video ({', '.join(videos)})", has_depth=bool(depths))
+    lost = next((note for note in survey.damage.notes if KEY_FRAME in note), "")
+    if lost and not colors:
+        return InputError(f"{log.path}: no image of the video can be decoded ({lost})", remedy=OFTENER)
+    if broken:
+        notes = survey.damage.all_notes
+        why = next((note for note in notes if "image" in note or broken[0] in note), "see `splatctrl info`")
+        return InputError(
+            f"{log.path}: no image of {listed(broken)} can be decoded ({why.removeprefix(f'{broken[0]}: ')})",
+            remedy="record raw images, JPEG or PNG; decode video to images first",
+        )
+    if depths and not colors:
+        return InputError(
+            f"{log.path}: no colour topic{named}; depth topics there: {listed(depths)}",
+            remedy="record the colour images",
+        )
+    topics = [t.topic for t in survey.topics.values() if t.count]
+    kinds = sorted({_kind(topic) for topic in topics})
+    formats = told_formats(log.path) or {topic.encoding for topic in topics}
+    alien = sorted(formats - set(_ENCODINGS))
+    if alien and len(alien) == len(formats):
+        return InputError(
+            f"{log.path}: expected messages in {', '.join(_ENCODINGS)}, got {', '.join(alien)}: {listed(kinds)}",
+            remedy="convert the log, for example with `ros2 bag convert`",
+        )
+    return InputError(
+        f"{log.path}: no image topics; message types there: {listed(kinds)}",
+        remedy="expected sensor_msgs Image or CompressedImage",
+    )
+
+
+def _named_unlike(survey: Survey) -> str:
+    """The topics whose names say that they are neither depth nor colour, and why; begins with a semicolon."""
+    found = []
+    for topic in image_topics(survey, "unlike"):
+        image, name = topic.image, topic.topic.name
+        is_jpeg = image.compressed is not None and image.compressed.startswith(JPEG)
+        lossy = (
+            "depth in a JPEG: JPEG loses depth: record PNG" if is_jpeg else f"{image.encoding} that is named depth"
+        )
+        found.append(f"{name} ({f'named {_unlike(topic)}' if image.kind == 'depth' else lossy})")
+    return f"; neither depth nor colour: {listed(found)}" if found else ""
+
+
+def _unread_video(what: str, *, has_depth: bool) -> InputError:
+    lacks = "" if has_depth else "; and there is no depth topic"
+    if not is_installed(LIBRARY):
+        return InputError(
+            f"{what}, for which the library {LIBRARY} is not installed{lacks}",
+            remedy=f"pip install 'splatctrl-cli[{EXTRA}]'",
+        )
+    return InputError(
+        f"{what}, which is neither H.264 nor H.265{lacks}",
+        remedy="decode it to images first: `ros2 run image_transport republish` for ROS topics, else ffmpeg",
+    )
+
+
+def listed(names: Sequence[str]) -> str:
+    """Up to eight names, then how many more."""
+    shown = ", ".join(names[:8]) or "none"
+    return f"{shown} and {len(names) - 8} more" if len(names) > 8 else shown
+
+
+def _kind(topic: Topic) -> str:
+    """The type of a topic's messages, and their encoding where it is none of ROS."""
+    name = topic.schema or topic.type_name
+    return name if is_ros(topic) and name else f"{name} ({topic.encoding})".strip()
+
+
+ODOMETRY, TRANSFORM_STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped"
+POSE_TYPES = (
+    ODOMETRY,
+    TRANSFORM_STAMPED,
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StampedPose:
+    """T_parent_child as one message says it; child is "" where the message names none."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    position: Float64
+    quat_xyzw: Float64
+
+
+def join_pose_topics(
+    log: RawLog, survey: Survey, options: SourceOptions, cameras: Sequence[CameraTopics], *, only_first: bool = False
+) -> None:
+    """Add to the tf tree of a survey what pose topics say of its cameras; what is used without being asked is noted.
+
+    A person names topics by camera. Else an odometry is taken whose child is a camera's frame that tf does not know,
+    or whose parent is the world frame asked for. only_first: the first pose alone, enough to see what joins what.
+    Raises InputError where a topic cannot place its camera, and where several odometries could.
+    """
+    frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
+    asked = {name: given for name, given in options.camera_pose_topics.items() if name in frames}
+    children = {
+        given.topic: _child_of(log, survey, name, given, frames[name]) for name, given in asked.items()
+    } or _odometries(log, survey, options, set(frames.values()))
+    for topic, child in children.items():
+        _add(log, survey, topic, child, only_first=only_first)
+
+
+def pose_topics(survey: Survey) -> list[str]:
+    """The topics that hold poses."""
+    return [topic.topic.name for topic in survey.of_type(*POSE_TYPES)]
+
+
+def _child_of(log: RawLog, survey: Survey, camera: str, given: PoseTopic, frame: str) -> str:
+    """The frame that a topic poses. Raises InputError where that does not place the camera."""
+    where = f"{log.path}: --camera-pose {camera}={given.topic}"
+    if given.topic not in pose_topics(survey):
+        raise InputError(
+            f"{where}: no poses on that topic",
+            remedy=f"expected {', '.join(name.rpartition('/')[2] for name in POSE_TYPES)}; pose topics there:"
+            f" {', '.join(pose_topics(survey)) or 'none'}",
+        )
+    first = next(_poses(log, survey, given.topic, Damage()), None)
+    child = given.frame or (first.child if first is not None and first.child else frame)
+    tf = survey.tf
+    if child != frame and not tf.connects(child, frame):
+        raise InputError(
+            f"{where}: poses frame {child!r}, which tf does not join to the camera's frame {frame!r}",
+            remedy=f"record /tf_static, or give --camera-pose {camera}={given.topic}@{frame} if it poses the camera",
+        )
+    if tf.root_of(child) != child:
+        raise InputError(
+            f"{where}: tf has frame {child!r} in {tf.root_of(child)!r} already", remedy="leave the option out"
+        )
+    return child
+
+
+def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set[str]) -> dict[str, str]:
+    """The frame that each odometry poses that nothing else places."""
+    known = set(survey.tf.frames)
+    found: dict[str, str] = {}
+    for topic in survey.of_type(ODOMETRY):
+        first = next(_poses(log, survey, topic.topic.name, Damage()), None)
+        if (
+            first is None
+            or not first.child
+            or first.child == first.parent
+            or survey.tf.root_of(first.child) != first.child
+        ):
+            continue
+        places_camera = first.child in frames - known
+        reaches_world = options.world_frame not in known and options.world_frame == first.parent
+        if places_camera or (reaches_world and first.child in known | frames):
+            found[topic.topic.name] = first.child
+        elif first.child in known and any(survey.tf.root_of(frame) == first.child for frame in frames & known):
+            survey.tf.note(
+                f"{topic.topic.name} says where {first.child!r} is in {first.parent!r}; to use it give"
+                f" --world-frame {first.parent}"
+            )
+    for child in sorted(set(found.values())):
+        topics = sorted(name for name, posed in found.items() if posed == child)
+        if len(topics) > 1:
+            raise InputError(
+                f"{log.path}: {len(topics)} odometries place frame {child!r}: {', '.join(topics)}",
+                remedy=f"choose one with --camera-pose NAME={topics[0]}",
+            )
+    for name, child in found.items():
+        survey.tf.note(f"poses of frame {child!r} are those of {name}: tf does not say where it is")
+    return found
+
+
+def _add(log: RawLog, survey: Survey, topic: str, child: str, *, only_first: bool) -> None:
+    """The poses of a topic as those of a frame."""
+    if survey.tf.root_of(child) != child:
+        return  # added before
+    for pose in _poses(log, survey, topic, survey.damage):
+        try:
+            survey.tf.add(
+                pose.parent, child, pose.stamp_ns, pose.position, pose.quat_xyzw, static=False, holds=only_first
+            )
+        except ValueError as error:
+            survey.damage.add(f"{topic}: {error}")
+        if only_first:
+            return
+
+
+def _poses(log: RawLog, survey: Survey, topic: str, damage: Damage) -> Iterator[StampedPose]:
+    """The poses of a topic; messages that do not decode go to `damage`."""
+    decoder = MessageDecoder()
+    for message in log.messages(Damage(), {topic}):  # the survey has counted this damage
+        try:
+            yield _pose(message, decoder.decode(message), by_log_time=survey.by_log_time)
+        except (UndecodableMessageError, AttributeError) as error:
+            damage.add(f"{topic}: {error}")
+
+
+def _pose(message: RawMessage, decoded: Any, *, by_log_time: bool) -> StampedPose:
+    kind = message.topic.type_name
+    if kind == TRANSFORM_STAMPED:
+        position, orientation = decoded.transform.translation, decoded.transform.rotation
+    else:
+        pose = decoded.pose if kind == "geometry_msgs/msg/PoseStamped" else decoded.pose.pose
+        position, orientation = pose.position, pose.orientation
+    return StampedPose(
+        stamp_ns=message.log_time_ns if by_log_time else stamp_ns(decoded.header),
+        parent=decoded.header.frame_id.strip("/") or "world",
+        child=str(getattr(decoded, "child_frame_id", "")).strip("/"),
+        position=np.array([position.x, position.y, position.z], dtype=np.float64),
+        quat_xyzw=np.array([orientation.x, orientation.y, orientation.z, orientation.w], dtype=np.float64),
+    )

@@ -1,0 +1,199 @@
+"""Which images of a log become frames, and the second pass that brings them together in the plan's order.
+
+The plan takes some fifty bytes of memory a frame.
+"""
+
+import tempfile
+import weakref
+from array import array
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, scratch_folder
+from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage
+from splatctrl_cli.recording.log.rig import Camera
+from splatctrl_cli.records import Float64, Index
+
+NO_MASK = -1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planned:
+    """A frame to be: message numbers within the colour, depth and mask topics (None: no mask), and the pose."""
+
+    stamp_ns: int
+    camera: Camera
+    color_index: int
+    depth_index: int
+    human_index: int | None
+    T_world_camera: Float64
+
+    @property
+    def keys(self) -> list[tuple[str, int]]:
+        """Topic and number of each of its images."""
+        camera = self.camera
+        keys = [(camera.color_topic, self.color_index), (camera.depth_topic, self.depth_index)]
+        return keys if self.human_index is None else [*keys, (camera.human_topic, self.human_index)]
+
+
+class FramePlan:
+    """The frames of a log, by stamp, then camera, then number of the colour image."""
+
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        self._cameras = tuple(sorted(cameras, key=lambda camera: camera.name))
+        self._columns = np.zeros((6, 0), dtype=np.int64)  # stamp, camera, colour, depth and mask number, row of pose
+        self._poses = RowFile((3, 4))
+
+    def __len__(self) -> int:
+        return self._columns.shape[1]
+
+    def __iter__(self) -> Iterator[Planned]:
+        return (self[number] for number in range(len(self)))
+
+    def __getitem__(self, number: int) -> Planned:
+        stamp, camera, color, depth, human, row = self._columns[:, number].tolist()
+        return Planned(
+            stamp_ns=stamp,
+            camera=self._cameras[camera],
+            color_index=color,
+            depth_index=depth,
+            human_index=None if human == NO_MASK else human,
+            T_world_camera=np.vstack([self._poses.read(row, row + 1)[0], [[0.0, 0.0, 0.0, 1.0]]]),
+        )
+
+    def add(
+        self,
+        camera: Camera,
+        stamp_ns: Index,
+        color: Index,
+        depth: Index,
+        masks: Mapping[int, int],
+        poses: Iterable[Float64 | None],
+    ) -> int:
+        """Take those frames (K,) of a camera whose pose (4, 4) is known, masks by colour number; returns how many."""
+        first = len(self._poses)
+        is_known = self._written(poses)
+        number = self._cameras.index(camera)
+        human = np.array([masks.get(index, NO_MASK) for index in color[is_known].tolist()], dtype=np.int64)
+        num = int(is_known.sum())
+        rows = first + np.arange(num)
+        fresh = np.stack([stamp_ns[is_known], np.full(num, number), color[is_known], depth[is_known], human, rows])
+        columns = np.concatenate([self._columns, fresh], axis=1)
+        self._columns = columns[:, np.lexsort((columns[2], columns[1], columns[0]))]
+        return num
+
+    def _written(self, poses: Iterable[Float64 | None]) -> NDArray[np.bool_]:
+        """Write the poses that are known; which these are (K,)."""
+        is_known, waiting = array("b"), []
+        for T in poses:
+            is_known.append(T is not None)
+            if T is not None:
+                waiting.append(T[:3])
+            if len(waiting) == BLOCK:
+                self._poses.append(np.array(waiting))
+                waiting = []
+        if waiting:
+            self._poses.append(np.array(waiting))
+        return np.array(is_known, dtype=np.bool_)
+
+    def uses(self) -> dict[str, Index]:
+        """How many frames need each image, by topic and number."""
+        found: dict[str, Index] = {}
+        for number, camera in enumerate(self._cameras):
+            of_camera = self._columns[:, self._columns[1] == number]
+            for topic, row in ((camera.color_topic, 2), (camera.depth_topic, 3), (camera.human_topic, 4)):
+                indices = of_camera[row][of_camera[row] != NO_MASK]
+                if len(indices):
+                    counts = np.bincount(indices)
+                    before = found.get(topic, np.zeros(0, dtype=np.int64))
+                    longer = np.zeros(max(len(before), len(counts)), dtype=np.int64)
+                    longer[: len(before)] = before
+                    longer[: len(counts)] += counts
+                    found[topic] = longer
+        return found
+
+
+HELD_BYTES = 96 << 20  # of images that wait for others, in memory; more of them wait in a file without a name
+Key = tuple[str, int]  # topic, number of the message within it
+
+
+class HeldMessages:
+    """Messages that wait for others; where a log keeps its topics apart, these can be half of it."""
+
+    def __init__(self) -> None:
+        self._messages: dict[Key, RawMessage] = {}
+        self._places: dict[Key, tuple[int, int]] = {}  # first byte and length in the file
+        self._num_bytes = 0
+        self._file = tempfile.TemporaryFile(dir=str(scratch_folder()))  # noqa: SIM115
+        weakref.finalize(self, self._file.close)
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self._messages
+
+    def add(self, key: Key, message: RawMessage) -> None:
+        """Keep a message."""
+        if self._num_bytes + len(message.data) > HELD_BYTES:
+            first = self._file.seek(0, 2)
+            self._file.write(message.data)
+            self._places[key] = (first, len(message.data))
+            message = replace(message, data=b"")
+        self._num_bytes += len(message.data)
+        self._messages[key] = message
+
+    def get(self, key: Key) -> RawMessage:
+        """A message, which stays."""
+        message, place = self._messages[key], self._places.get(key)
+        if place is None:
+            return message
+        self._file.seek(place[0])
+        return replace(message, data=self._file.read(place[1]))
+
+    def pop(self, key: Key) -> RawMessage:
+        """A message, which goes."""
+        found = self.get(key)
+        self._num_bytes -= len(self._messages.pop(key).data)
+        self._places.pop(key, None)
+        if not self._places:
+            self._file.seek(0)
+            self._file.truncate()
+        return found
+
+
+class PlannedImages:
+    """The messages of the frames of a plan, which a log may hold in another order."""
+
+    def __init__(self, log: RawLog, plan: FramePlan) -> None:
+        self._log = log
+        self._plan = plan
+        self._held = HeldMessages()
+        self._uses = plan.uses()
+
+    def of_frames(self, damage: Damage) -> Iterator[tuple[Planned, list[RawMessage]]]:
+        """Yield each planned frame with the messages of its colour, depth and mask; frames that are gone go to
+        `damage`.
+        """
+        numbers = dict.fromkeys(self._uses, 0)
+        position, num = 0, len(self._plan)
+        planned = self._plan[0]
+        for message in self._log.messages(Damage(), set(self._uses)):  # the survey has counted this damage
+            topic, number = message.topic.name, numbers[message.topic.name]
+            numbers[topic] = number + 1
+            if number >= len(self._uses[topic]) or not self._uses[topic][number]:
+                continue
+            self._held.add((topic, number), message)
+            while position < num and all(key in self._held for key in planned.keys):
+                yield planned, [self._take(key) for key in planned.keys]
+                position += 1
+                if position < num:
+                    planned = self._plan[position]
+        if position < num:
+            name = self._log.path.name
+            damage.add(f"{name}: {num - position} frames that were there are gone: it changed while it was read")
+
+    def _take(self, key: Key) -> RawMessage:
+        topic, number = key
+        self._uses[topic][number] -= 1
+        return self._held.get(key) if self._uses[topic][number] else self._held.pop(key)

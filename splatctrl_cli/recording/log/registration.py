@@ -1,0 +1,392 @@
+"""The tree of frames of /tf and /tf_static, asked at any time; depth seen from the colour camera, and images
+without lens distortion. The tree takes 16 bytes of memory a sample.
+"""
+
+import re
+from array import array
+from bisect import bisect_left
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.config.fixed import (
+    FARTHEST_RAY,
+    REGISTERED_SHARE,
+    TF_GAP_NS,
+    TF_STILL_POSITION,
+    TF_STILL_ROTATION,
+    WIDEST_RAY,
+)
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile
+from splatctrl_cli.geometry import (
+    back_project,
+    interpolate_transform,
+    invert_transform,
+    transform_from,
+    transform_points,
+)
+from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS
+from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
+
+
+class _Transforms:
+    """Transforms by number, most of them in a file without a name."""
+
+    def __init__(self) -> None:
+        self._file = RowFile((3, 4))
+        self._waiting: list[Float64] = []
+
+    def add(self, T: Float64) -> int:
+        """Keep one; its number."""
+        self._waiting.append(T[:3])
+        if len(self._waiting) == BLOCK:
+            self._file.append(np.array(self._waiting))
+            self._waiting = []
+        return len(self._file) + len(self._waiting) - 1
+
+    def __getitem__(self, number: int) -> Float64:
+        waiting = number - len(self._file)
+        T = np.eye(4)
+        T[:3] = self._waiting[waiting] if waiting >= 0 else self._file.read(number, number + 1)[0]
+        return T
+
+
+class _Edge:
+    """T_parent_child over time, in `transforms` by number."""
+
+    def __init__(self, parent: str, transforms: _Transforms) -> None:
+        self.parent = parent
+        self.stamps, self.numbers = array("q"), array("q")
+        self.static: dict[int, Float64] = {}  # by the stamp [ns] from which on each holds, ascending
+        self.holds = False
+        self._transforms = transforms
+        self._is_sorted = True
+
+    def add(self, stamp_ns: int, T: Float64) -> None:
+        self._is_sorted = self._is_sorted and (not self.stamps or stamp_ns >= self.stamps[-1])
+        self.stamps.append(stamp_ns)
+        self.numbers.append(self._transforms.add(T))
+
+    def at(self, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
+        if self.static:
+            since = [stamp for stamp in self.static if stamp <= stamp_ns]
+            return self.static[since[-1] if since else next(iter(self.static))]
+        if self.holds and len(self.stamps) == 1:
+            return self._at(0)
+        self._sort()
+        after = bisect_left(self.stamps, stamp_ns)
+        if after == len(self.stamps):
+            return self._at(-1) if stamp_ns - self.stamps[-1] <= tolerance_ns else None
+        if self.stamps[after] == stamp_ns:
+            return self._at(after)
+        if after == 0:
+            return self._at(0) if self.stamps[0] - stamp_ns <= tolerance_ns else None
+        gap = self.stamps[after] - self.stamps[after - 1]
+        T_before, T_after = self._at(after - 1), self._at(after)
+        if gap > TF_GAP_NS and not _is_still(T_before, T_after):
+            return None
+        return interpolate_transform(T_before, T_after, (stamp_ns - self.stamps[after - 1]) / gap)
+
+    def _at(self, sample: int) -> Float64:
+        return self._transforms[self.numbers[sample]]
+
+    def _sort(self) -> None:
+        if not self._is_sorted:
+            order = np.argsort(np.frombuffer(self.stamps, dtype=np.int64), kind="stable")
+            self.stamps = array("q", np.frombuffer(self.stamps, dtype=np.int64)[order].tobytes())
+            self.numbers = array("q", np.frombuffer(self.numbers, dtype=np.int64)[order].tobytes())
+            self._is_sorted = True
+
+
+def _is_still(T_a: Float64, T_b: Float64) -> bool:
+    change = np.abs(T_a - T_b)
+    return bool(change[:3, 3].max() <= TF_STILL_POSITION and change[:3, :3].max() <= TF_STILL_ROTATION)
+
+
+class TfTree:
+    """Frames by their parent; moving edges interpolated in time, static ones valid always."""
+
+    def __init__(self) -> None:
+        self._edges: dict[str, _Edge] = {}
+        self._transforms = _Transforms()
+        self.notes: list[str] = []
+
+    def add(
+        self,
+        parent: str,
+        child: str,
+        stamp_ns: int,
+        position: Float64,
+        quat_xyzw: Float64,
+        *,
+        static: bool,
+        holds: bool = False,
+    ) -> None:
+        """Add T_parent_child at a time; a static one holds always, one that `holds` as long as it is the only one.
+
+        The first parent of a frame stays its parent, what would close a loop is left out, each of different static
+        transforms holds from its stamp on (of one stamp the last, before all the first); all of this is noted.
+        Raises ValueError for a rotation or position that is not one (a zero quaternion, NaN).
+        """
+        parent, child = parent.strip("/"), child.strip("/")
+        if not (np.isfinite(position).all() and 0.5 < float(np.linalg.norm(quat_xyzw)) < 2.0):
+            raise ValueError(f"transform {parent} -> {child} is not a rigid transform")
+        if child not in self._edges and child in self._ancestors(parent):
+            self.note(f"tf: {parent} -> {child} would close a loop, as {child} is above {parent}; it is left out")
+            return
+        edge = self._edges.setdefault(child, _Edge(parent, self._transforms))
+        if edge.parent != parent:
+            self.note(f"tf: frame {child} has parents {edge.parent} and {parent}; {edge.parent} is kept")
+            return
+        T = transform_from(position, quat_xyzw)
+        edge.holds = edge.holds or holds
+        if not static:
+            edge.add(stamp_ns, T)
+        else:
+            before = edge.at(stamp_ns, 0) if edge.static else None
+            if before is not None and _is_still(before, T):
+                return  # said again
+            if before is not None:
+                self.note(f"tf: {parent} -> {child} is static and changes; each holds from its stamp on")
+            edge.static = dict(sorted((edge.static | {stamp_ns: T}).items()))
+        if edge.static and edge.stamps:
+            self.note(f"tf: {parent} -> {child} is both static and moving; the static one holds")
+
+    def note(self, note: str) -> None:
+        """Keep a remark on the tree, once."""
+        if note not in self.notes:
+            self.notes.append(note)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """All frames, sorted by name."""
+        return tuple(sorted(set(self._edges) | {edge.parent for edge in self._edges.values()}))
+
+    @property
+    def roots(self) -> tuple[str, ...]:
+        """Frames without a parent, sorted by name."""
+        return tuple(frame for frame in self.frames if frame not in self._edges)
+
+    def root_of(self, frame: str) -> str:
+        """The topmost ancestor of `frame` (itself, where it has no parent)."""
+        return self._ancestors(frame)[-1]
+
+    def span_ns(self, frame: str) -> tuple[int, int] | None:
+        """First and last stamp for which the moving edges above `frame` are all known; None if none moves."""
+        edges = [self._edges[f] for f in self._ancestors(frame)[:-1]]
+        moving = [edge.stamps for edge in edges if not edge.static]
+        return (max(min(s) for s in moving), min(max(s) for s in moving)) if moving else None
+
+    def connects(self, target: str, source: str) -> bool:
+        """Whether a chain of edges joins the two frames."""
+        return self.root_of(target.strip("/")) == self.root_of(source.strip("/"))
+
+    def lookup(self, target: str, source: str, stamp_ns: int, tolerance_ns: int = 0) -> Float64 | None:
+        """T_target_source (4, 4) at a time; None where unconnected or unknown at that time."""
+        target, source = target.strip("/"), source.strip("/")
+        up_target, up_source = self._ancestors(target), self._ancestors(source)
+        common = next((frame for frame in up_source if frame in up_target), None)
+        if common is None:
+            return None
+        T_common_source = self._chain(up_source, common, stamp_ns, tolerance_ns)
+        T_common_target = self._chain(up_target, common, stamp_ns, tolerance_ns)
+        if T_common_source is None or T_common_target is None:
+            return None
+        return invert_transform(T_common_target) @ T_common_source
+
+    def _chain(self, ancestors: list[str], top: str, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
+        T = np.eye(4)
+        for frame in ancestors[: ancestors.index(top)]:
+            T_parent_frame = self._edges[frame].at(stamp_ns, tolerance_ns)
+            if T_parent_frame is None:
+                return None
+            T = T_parent_frame @ T
+        return T
+
+    def _ancestors(self, frame: str) -> list[str]:
+        chain = [frame]
+        while chain[-1] in self._edges and self._edges[chain[-1]].parent not in chain:
+            chain.append(self._edges[chain[-1]].parent)
+        return chain
+
+
+DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
+_SAME_MODELS = {  # lower case, letters and digits alone: what others call them
+    **dict.fromkeys(("plumbbob", "brownconrady", "radtan", "opencv"), "plumb_bob"),
+    **dict.fromkeys(("rationalpolynomial", "rational"), "rational_polynomial"),
+    **dict.fromkeys(("equidistant", "equi", "fisheye", "opencvfisheye"), "equidistant"),
+    **dict.fromkeys(("kannalabrandt", "kannalabrandt4"), "equidistant"),
+}
+_PINHOLES = ("", "none", "pinhole", "perspective", "rectilinear", "inversebrownconrady", "modifiedbrownconrady")
+"""Further models that are pinholes where all coefficients are zero."""
+
+
+def lens_model(name: str) -> str:
+    """Translate a driver's name into one of `DISTORTION_MODELS`; other names come back unchanged."""
+    return _SAME_MODELS.get(_letters(name), name)
+
+
+def is_distorted(model: str, coefficients: Float64) -> bool:
+    """False where a lens is a pinhole. An equidistant lens never is, nor one of a model that is not known."""
+    is_radial = lens_model(model) in DISTORTION_MODELS[:2] or _letters(model) in _PINHOLES
+    return not is_radial or bool(np.any(np.abs(coefficients) > 1e-9))
+
+
+def _letters(name: str) -> str:
+    return re.sub("[^a-z0-9]", "", name.lower())
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthToColor:
+    """Warps depth images of one camera into another's view; undistortion: of the depth camera's own lens."""
+
+    depth_intrinsics: Intrinsics
+    color_intrinsics: Intrinsics
+    T_color_depth: Float64
+    undistortion: "Undistortion | None" = None
+
+    def warp(self, depth: Float32) -> Float32:
+        """Depth (H', W') [m] of the depth camera -> (H, W) [m] in the colour camera, 0 = none.
+
+        Each depth pixel covers its square's image in the colour camera (no holes where that has the finer pixels);
+        of several that land on a pixel, the nearest counts.
+        """
+        target = self.color_intrinsics
+        depth = depth if self.undistortion is None else self.undistortion.depth(depth)
+        x, y, z = transform_points(self.T_color_depth, back_project(self.depth_intrinsics, depth)[depth > 0]).T
+        front = z > 0
+        z = z[front]
+        u = target.fx * x[front] / z + target.cx
+        v = target.fy * y[front] / z + target.cy
+        half_u = 0.5 * max(1.0, target.fx / self.depth_intrinsics.fx)
+        half_v = 0.5 * max(1.0, target.fy / self.depth_intrinsics.fy)
+        first_u, first_v = np.ceil(u - half_u), np.ceil(v - half_v)
+        nearest, depths = np.full(target.height * target.width, np.inf, dtype=np.float32), z.astype(np.float32)
+        for dv in range(int(np.floor(2 * half_v)) + 1):
+            row = first_v + dv
+            is_row = (row < v + half_v) & (row >= 0) & (row < target.height)
+            for du in range(int(np.floor(2 * half_u)) + 1):
+                column = first_u + du
+                lands = is_row & (column < u + half_u) & (column >= 0) & (column < target.width)
+                pixels = (row[lands] * target.width + column[lands]).astype(np.int64)
+                np.minimum.at(nearest, pixels, depths[lands])
+        nearest[np.isinf(nearest)] = 0.0
+        return nearest.reshape(target.height, target.width)
+
+
+class Undistortion:
+    """Removes a lens distortion.
+
+    intrinsics: those of the result, which are the lens's own unless `lens` says others; R (3, 3) turns the lens's
+    axes into those of the result. valid: (H, W), False where the lens did not see the pixel, as in the corners of a
+    pincushion; None where it saw all. There colour is black, and depth and labels are 0.
+    """
+
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        model: str,
+        coefficients: Float64,
+        *,
+        lens: Intrinsics | None = None,
+        R: Float64 | None = None,
+    ) -> None:
+        R = np.eye(3) if R is None else R
+        counts = (4,) if model == "equidistant" else NUM_COEFFICIENTS
+        if len(coefficients) not in counts and not (len(coefficients) > 4 and not np.any(coefficients[4:])):
+            expected = ", ".join(map(str, counts))
+            raise InputError(
+                f"distortion model {model}: expected {expected} coefficients, got {len(coefficients)}",
+                remedy="calibrate again, or fill up with zeros",
+            )
+        self.intrinsics = intrinsics
+        self._map_u, self._map_v = _maps(lens or intrinsics, model, coefficients, R, intrinsics)
+        is_seen = (self._map_u >= 0) & (self._map_u <= intrinsics.width - 1)
+        is_seen &= (self._map_v >= 0) & (self._map_v <= intrinsics.height - 1)
+        is_seen &= _radii(intrinsics, R) < _largest_radius(model, coefficients)
+        if is_seen.mean() < REGISTERED_SHARE:
+            raise InputError(
+                f"distortion {model} {np.round(coefficients, 6).tolist()}: the camera saw {is_seen.mean():.0%} of the"
+                f" pinhole's image, expected at least {REGISTERED_SHARE:.0%}",
+                remedy="correct the calibration, or undistort the images first",
+            )
+        self.valid = None if is_seen.all() else is_seen
+        self._map_u[~is_seen] = -10.0  # folded back into the image, or outside of it
+
+    def color(self, image: UInt8) -> UInt8:
+        """Colour (H, W, 3), interpolated."""
+        return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_LINEAR), dtype=np.uint8)
+
+    def labels(self, image: UInt8) -> UInt8:
+        """Labels (H, W), nearest pixel."""
+        return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.uint8)
+
+    def depth(self, image: Float32) -> Float32:
+        """Depth (H, W) [m], nearest pixel."""
+        return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.float32)
+
+
+def _maps(
+    lens: Intrinsics, model: str, coefficients: Float64, R: Float64, result: Intrinsics
+) -> tuple[Float32, Float32]:
+    """Column and row in the distorted image of each pixel of the result."""
+    K, P = (np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]], dtype=np.float64) for k in (lens, result))
+    size = (result.width, result.height)
+    if model == "equidistant":
+        maps = cv2.fisheye.initUndistortRectifyMap(K, coefficients[:4], R, P, size, cv2.CV_32FC1)
+    else:
+        maps = cv2.initUndistortRectifyMap(K, coefficients, R, P, size, cv2.CV_32FC1)
+    return np.asarray(maps[0]), np.asarray(maps[1])
+
+
+def _radii(result: Intrinsics, R: Float64) -> Float64:
+    """Distance of each pixel (H, W) of the result from the lens's axis, at a depth of one."""
+    x, y, z = np.moveaxis(back_project(result, np.ones((result.height, result.width))) @ R, 2, 0)
+    return np.asarray(np.where(z > 0, np.hypot(x, y) / np.maximum(z, 1e-9), np.inf))
+
+
+def _largest_radius(model: str, coefficients: Float64) -> float:
+    """Up to which distance from the axis a lens's polynomial still grows: beyond, it would show things twice."""
+    r, bent = _bent(model, coefficients)
+    folds = np.flatnonzero(np.diff(bent) <= 0)
+    return float(r[folds[0]]) if folds.size else np.inf
+
+
+def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
+    """Distances from the axis at a depth of one, and where the lens shows them, both in focal lengths."""
+    r = np.linspace(0.0, FARTHEST_RAY, 20001)
+    k = np.zeros(8)
+    k[: min(len(coefficients), 8)] = coefficients[:8]
+    if model == "equidistant":
+        a = np.arctan(r)
+        return r, a * (1 + k[0] * a**2 + k[1] * a**4 + k[2] * a**6 + k[3] * a**8)
+    bent = r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6) / (1 + k[5] * r**2 + k[6] * r**4 + k[7] * r**6)
+    return r, np.asarray(bent)
+
+
+def undistortion_of(lens: Intrinsics, model: str, coefficients: Float64) -> Undistortion | None:
+    """Build what removes a lens's distortion, None for a pinhole. Raises InputError for an impossible lens.
+
+    The result has the lens's focal lengths. Of an equidistant lens they are shortened, so that the result shows what
+    lies on the image's axes, but nothing beyond `WIDEST_RAY`: that would leave the middle few pixels.
+    """
+    if not is_distorted(model, coefficients):
+        return None
+    model = lens_model(model)
+    if model not in DISTORTION_MODELS:
+        raise InputError(
+            f"distortion model {model!r} is unknown",
+            remedy="rectify the images first, or give --intrinsics NAME=FX,FY,CX,CY if they are;"
+            f" known models: {', '.join(DISTORTION_MODELS)}",
+        )
+    if model != "equidistant" or len(coefficients) < 4:
+        return Undistortion(lens, model, coefficients)
+    r, bent = _bent(model, coefficients)
+    edges = np.array([lens.cx / lens.fx, lens.cy / lens.fy])
+    edges = np.append(edges, [(lens.width - 1) / lens.fx - edges[0], (lens.height - 1) / lens.fy - edges[1]])
+    grows = slice(1 + int(np.argmax(bent)))
+    seen = np.minimum(np.maximum(np.interp(edges, bent[grows], r[grows]), 1e-9), WIDEST_RAY)
+    share = min(1.0, float((edges / seen).min()))
+    return Undistortion(replace(lens, fx=share * lens.fx, fy=share * lens.fy), model, coefficients, lens=lens)

@@ -1,0 +1,471 @@
+"""The cameras of a log made ready: intrinsics, world frame, lens and depth registration, or why they cannot be."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.recording.container.raw_log import RawLog
+from splatctrl_cli.recording.log.cameras import (
+    find_cameras,
+    find_info,
+    frame_of,
+    image_topics,
+    is_registered,
+    join_pose_topics,
+    listed,
+    no_camera,
+    pose_topics,
+)
+from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
+from splatctrl_cli.recording.log.registration import (
+    DISTORTION_MODELS,
+    DepthToColor,
+    TfTree,
+    Undistortion,
+    is_distorted,
+    lens_model,
+    undistortion_of,
+)
+from splatctrl_cli.recording.log.survey import Calibration, Survey
+from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions, refuse_unknown_cameras
+from splatctrl_cli.records import Bool, Float64, Intrinsics
+
+_RECTIFIED = frozenset({"rect", "rectified", "undistorted"})  # words in the names of topics
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """One RGB-D camera of a log; valid (H, W) is False where its lens did not see the pixel, fixed_pose is
+    T_world_camera where a person gave it, human_topic its masks, depth_scale [m per count] what a person or the log
+    says of it.
+    """
+
+    name: str
+    color_topic: str
+    depth_topic: str
+    frame_id: str
+    world_frame: str
+    intrinsics: Intrinsics
+    undistortion: Undistortion | None = None
+    valid: Bool | None = None
+    depth_to_color: DepthToColor | None = None
+    fixed_pose: Float64 | None = None
+    depth_scale: float | None = None
+    human_topic: str = ""
+
+    def pose_at(self, tf: TfTree, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
+        """T_world_camera at a time; None where tf does not know it."""
+        if self.fixed_pose is not None:
+            return self.fixed_pose
+        return tf.lookup(self.world_frame, self.frame_id, stamp_ns, tolerance_ns)
+
+
+def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[Camera, ...]:
+    """Every camera to be read, complete. Raises InputError naming the camera, the topic and what it lacks."""
+    found = camera_topics(log, survey, options)
+    if not found:
+        raise no_camera(log, survey)
+    known = {camera.name: camera for camera in found}
+    names = tuple(known) if options.cameras is None else options.cameras
+    asked = (*names, *options.camera_poses, *options.camera_pose_topics, *options.intrinsics)
+    refuse_unknown_cameras(log.path, asked, known)
+    join_pose_topics(log, survey, options, [known[name] for name in names])
+    check_mask_topics(log.path, survey, options.human_topics, tuple(known))
+    try:
+        cameras = tuple(_Builder(log, survey, options, known[name]).build() for name in names)
+    except InputError as error:
+        usable = [name for name in known if not _Builder(log, survey, options, known[name]).problems()]
+        if not usable:
+            raise
+        raise InputError(error.message, remedy=f"{error.remedy}; or give --cameras {','.join(usable)}") from None
+    worlds = {camera.world_frame for camera in cameras if camera.fixed_pose is None}
+    if len(worlds) > 1:
+        raise InputError(
+            f"{log.path}: the cameras are in separate tf trees, with roots {', '.join(sorted(worlds))}",
+            remedy="record the transform that joins them, or choose with --cameras",
+        )
+    return cameras
+
+
+def camera_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
+    """The cameras that the options name, else those found; a mask is no camera's colour."""
+    return _given_topics(log, survey, options) or find_cameras(survey, without=options.human_topics.values())
+
+
+def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
+    """What a reconstruction from this log would lack, in words; empty where nothing."""
+    found = camera_topics(log, survey, options)
+    if not found:
+        lacks = [str(no_camera(log, survey)).removeprefix(f"{log.path}: ")]
+        if not survey.of_type(CAMERA_INFO):
+            lacks.append("no CameraInfo topic; record the colour camera's camera_info")
+        return lacks if survey.tf.frames else [*lacks, "no tf (/tf, /tf_static); record it, or give --camera-pose"]
+    lacks = []
+    try:
+        join_pose_topics(log, survey, options, found, only_first=True)
+    except InputError as error:
+        lacks.append(str(error).removeprefix(f"{log.path}: "))
+    for topics in found:
+        if options.cameras is not None and topics.name not in options.cameras:
+            continue
+        lacks.extend(_Builder(log, survey, options, topics).problems())
+        gap = nearest_gap_ns(*[survey.topics[name].stamps_ns for name in (topics.color, topics.depth)]) * 1e-9
+        if gap > options.pairing_tolerance_s:
+            lacks.append(
+                f"camera {topics.name}: colour and depth are never closer than {gap * 1e3:.4g} ms; give "
+                f"--pairing-tolerance {gap * 1.01 + 1e-4:.3g} (seconds), if that is right"
+            )
+    return lacks
+
+
+def nearest_gap_ns(color_ns: Sequence[int], depth_ns: Sequence[int]) -> int:
+    """The smallest difference between a colour and a depth stamp [ns]."""
+    color, depth = np.sort(np.array(color_ns)), np.sort(np.array(depth_ns))
+    after = np.clip(np.searchsorted(depth, color), 0, len(depth) - 1)
+    before = np.clip(after - 1, 0, None)
+    return int(np.minimum(np.abs(depth[after] - color), np.abs(depth[before] - color)).min())
+
+
+def intrinsics_of(calibration: Calibration) -> Intrinsics:
+    """The pinhole part of a CameraInfo (its pixel convention is ours)."""
+    K = calibration.K
+    return Intrinsics(
+        fx=float(K[0, 0]),
+        fy=float(K[1, 1]),
+        cx=float(K[0, 2]),
+        cy=float(K[1, 2]),
+        width=calibration.width,
+        height=calibration.height,
+    )
+
+
+def _rectified(calibration: Calibration) -> Calibration:
+    """The camera of the rectified image: P where it is set, and no distortion; valid where the lens is known."""
+    K = calibration.projection if calibration.projection[0, 0] > 0 else calibration.K
+    pinhole = replace(calibration, K=K, distortion_model="plumb_bob", distortion=np.zeros(0))
+    model = lens_model(calibration.distortion_model)
+    if not is_distorted(model, calibration.distortion) or model not in DISTORTION_MODELS:
+        return pinhole
+    lens, R = intrinsics_of(calibration), calibration.rotation if np.any(calibration.rotation) else None
+    with suppress(InputError):  # of a lens that cannot be, nothing says what it saw
+        undone = Undistortion(intrinsics_of(pinhole), model, calibration.distortion, lens=lens, R=R)
+        return replace(pinhole, valid=undone.valid)
+    return pinhole
+
+
+class ImageLens(StrEnum):
+    """What images are like by their CameraInfo and the name of their topic."""
+
+    PINHOLE = "pinhole"
+    DISTORTED = "distorted"
+    RECTIFIED = "rectified"
+    CONTRADICTED = "contradicted"
+
+
+def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> ImageLens:
+    """Decide whether images are rectified, where their topic's name says so and their CameraInfo has a distortion.
+
+    A CameraInfo may describe the rectified images beside the raw ones (image_proc): by a P that is not K, or a topic
+    of raw images in the same folder. RealSense's ``image_rect_raw`` is as the lens sees it. Depth is computed in
+    rectified images. Otherwise the two contradict each other.
+    """
+    says_rectified = not _RECTIFIED.isdisjoint(re.split("[/_]", image_topic.lower()))
+    if not is_distorted(calibration.distortion_model, calibration.distortion):
+        return ImageLens.RECTIFIED if says_rectified else ImageLens.PINHOLE
+    if not says_rectified or image_topic.endswith("rect_raw"):
+        return ImageLens.DISTORTED
+    folder, P = image_topic.rpartition("/")[0], calibration.projection
+    has_raw = any(t.topic.name.startswith(f"{folder}/image_raw") for t in survey.of_type(IMAGE, COMPRESSED_IMAGE))
+    is_depth = any(t.topic.name == image_topic for t in image_topics(survey, "depth"))
+    is_own = P[0, 0] > 0 and not np.allclose(P, calibration.K, rtol=1e-3)
+    return ImageLens.RECTIFIED if has_raw or is_depth or is_own else ImageLens.CONTRADICTED
+
+
+class _Builder:
+    """Makes one camera ready."""
+
+    def __init__(self, log: RawLog, survey: Survey, options: SourceOptions, topics: CameraTopics) -> None:
+        self._path = log.path
+        self._where = f"{log.path}: camera {topics.name}"
+        self._survey = survey
+        self._options = options
+        self._topics = topics
+
+    def build(self) -> Camera:
+        """The camera. Raises InputError for the first thing it lacks."""
+        topics = self._topics
+        self._check_depth()
+        self._check_clock()
+        calibration = self._calibration(topics.info, topics.color)
+        undistortion = self._undistortion(calibration, topics.info)
+        intrinsics = intrinsics_of(calibration) if undistortion is None else undistortion.intrinsics
+        fixed = self._options.camera_poses.get(topics.name)
+        return Camera(
+            name=topics.name,
+            color_topic=topics.color,
+            depth_topic=topics.depth,
+            frame_id=self._frame_id,
+            world_frame=self._check_world(),
+            intrinsics=intrinsics,
+            undistortion=undistortion,
+            valid=calibration.valid if undistortion is None else undistortion.valid,
+            depth_to_color=None if self._is_registered else self._registration(intrinsics),
+            fixed_pose=None if fixed is None else transform_from(fixed[:3], fixed[3:]),
+            depth_scale=self._depth_scale,
+            human_topic=self._options.human_topics.get(topics.name, ""),
+        )
+
+    def problems(self) -> list[str]:
+        """Everything that the camera lacks, in words; empty where `build` succeeds."""
+        found = []
+        intrinsics = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
+        steps: list[Callable[[], object]] = [
+            self._check_depth,
+            self._check_clock,
+            lambda: self._calibration(self._topics.info, self._topics.color),
+            self._check_world,
+            lambda: None if self._is_registered else self._registration(intrinsics),
+            self.build,
+        ]
+        for step in steps:
+            try:
+                step()
+            except InputError as error:
+                found.append(str(error).removeprefix(f"{self._path}: "))
+        return list(dict.fromkeys(found))
+
+    @property
+    def _frame_id(self) -> str:
+        return frame_of(self._survey, self._topics.color, self._topics.depth)
+
+    @property
+    def _is_registered(self) -> bool:
+        topics = self._topics
+        return is_registered(self._survey, topics.color, topics.depth, topics.info, topics.depth_info)
+
+    @property
+    def _depth_scale(self) -> float | None:
+        if self._options.depth_scale is not None:
+            return self._options.depth_scale
+        try:
+            return self._survey.realsense.depth_unit(self._topics.depth)
+        except InputError as error:
+            raise InputError(f"{self._where}: {error.message}", remedy=error.remedy) from None
+
+    def _calibration(self, info: str, image_topic: str) -> Calibration:
+        calibration = self._survey.topics[info].calibration if info else None
+        given = self._options.intrinsics.get(self._topics.name)
+        if given is not None and image_topic == self._topics.color:
+            return self._given(given, image_topic)
+        if calibration is None:
+            there = [t.topic.name for t in self._survey.of_type(CAMERA_INFO)]
+            raise InputError(
+                f"{self._where}: topic {image_topic} has no usable CameraInfo",
+                remedy=f"record its camera_info, name it with --camera; CameraInfo topics there: {listed(there)};"
+                f" or give --intrinsics {self._topics.name}=FX,FY,CX,CY",
+            )
+        image = self._survey.topics[image_topic].image
+        size, expected = (image.width, image.height), (calibration.width, calibration.height)
+        if expected == (0, 0) and not calibration.cut:
+            expected = size
+        by_hand = f", or give --intrinsics {self._topics.name}=FX,FY,CX,CY of the recorded images"
+        remedy = f"name the right CameraInfo with --camera{by_hand if calibration.cut else ''}"
+        if not calibration.is_possible:
+            what = f"{info} says {calibration.cut}, which it is not inside of, for images of {size[0]}x{size[1]}"
+            raise InputError(f"{self._where}: topic {image_topic}: {what}", remedy=remedy)
+        if size != expected:
+            cut = f" ({calibration.cut})" if calibration.cut else ""
+            raise InputError(
+                f"{self._where}: topic {image_topic}: expected {expected[0]}x{expected[1]} images as {info}"
+                f" says{cut}, got {size[0]}x{size[1]}",
+                remedy=remedy,
+            )
+        sized = replace(calibration, width=size[0], height=size[1])
+        lens = image_lens(self._survey, image_topic, sized)
+        if lens is ImageLens.CONTRADICTED:
+            raise self._contradicted(sized, info, image_topic)
+        return _rectified(sized) if lens is ImageLens.RECTIFIED else sized
+
+    def _contradicted(self, calibration: Calibration, info: str, image_topic: str) -> InputError:
+        k = intrinsics_of(calibration)
+        pinhole = f"--intrinsics {self._topics.name}={k.fx:.9g},{k.fy:.9g},{k.cx:.9g},{k.cy:.9g}"
+        bent = ",".join(f"{value:.9g}" for value in calibration.distortion)
+        return InputError(
+            f"{self._where}: topic {image_topic} says rectified, but {info} has a distortion and no P of its own",
+            remedy=f"give {pinhole} if the images are rectified, {pinhole},{bent} if they are as the lens sees them",
+        )
+
+    def _given(self, intrinsics: tuple[float, ...], image_topic: str) -> Calibration:
+        """What --intrinsics says, for images of the size that they are."""
+        image = self._survey.topics[image_topic].image
+        fx, fy, cx, cy, *distortion = intrinsics
+        return Calibration(
+            width=image.width,
+            height=image.height,
+            K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+            projection=np.zeros((3, 3)),
+            rotation=np.zeros((3, 3)),
+            distortion_model="plumb_bob",
+            distortion=np.array(distortion),
+            frame_id=image.frame_id,
+        )
+
+    def _check_depth(self) -> None:
+        """Raise InputError where the depth topic holds something else, or several could be it."""
+        topics = self._topics
+        image = self._survey.topics[topics.depth].image
+        if image.kind != "depth":
+            raise InputError(
+                f"{self._where}: topic {topics.depth}: expected depth images, got {image.encoding}",
+                remedy="name a topic of depth images with --camera",
+            )
+        if topics.rivals:
+            raise InputError(
+                f"{self._where}: {', '.join(topics.rivals)} could each be its depth, and no name says which",
+                remedy=f"give --camera {topics.name}={topics.color},DEPTH with the one that is depth",
+            )
+
+    def _check_clock(self) -> None:
+        """Raise InputError where a clock went back: one stamp stands for two times then, of images and of tf."""
+        for name in (self._topics.color, self._topics.depth):
+            clock = self._survey.topics[name].clock
+            if clock.went_back:
+                raise InputError(
+                    f"{self._where}: topic {name}: the clock of its headers goes back by {clock.back_ns / 1e9:.3f} s"
+                    f" at {clock.back_log_ns / 1e9:.3f} s of the log (a bag in a loop, a simulation that was reset),"
+                    f" {clock.num_back} images in all",
+                    remedy="give --stamps log to take the times of logging, or cut the log there",
+                )
+
+    def _check_world(self) -> str:
+        """The world frame, after checking that tf joins the camera to it."""
+        tf, frame_id = self._survey.tf, self._frame_id
+        if self._topics.name in self._options.camera_poses:
+            return self._options.world_frame or "world"
+        world = self._options.world_frame or tf.root_of(frame_id)
+        if world not in tf.frames and tf.frames and self._options.world_frame:
+            raise InputError(
+                f"{self._where}: tf has no frame {world!r}", remedy=f"--world-frame: use one of {listed(tf.frames)}"
+            )
+        if frame_id not in tf.frames or not tf.connects(world, frame_id):
+            target = f" in {world!r}" if world != frame_id else ""
+            raise InputError(
+                f"{self._where}: no tf for frame {frame_id!r} of topic {self._topics.color}{target};"
+                f" frames tf knows: {listed(tf.frames)}",
+                remedy=f"record /tf and /tf_static, or give --camera-pose {self._topics.name}=x,y,z,qx,qy,qz,qw"
+                f"{self._instead()}",
+            )
+        return world
+
+    def _instead(self) -> str:
+        """What else could place the camera, in words; empty where nothing."""
+        topics = pose_topics(self._survey)
+        return f", or NAME=TOPIC[@FRAME] of a pose topic ({listed(topics)})" if topics else ""
+
+    def _undistortion(self, calibration: Calibration, info: str) -> Undistortion | None:
+        try:
+            return undistortion_of(intrinsics_of(calibration), calibration.distortion_model, calibration.distortion)
+        except InputError as error:
+            raise InputError(f"{self._where}: {info}: {error.message}", remedy=error.remedy) from None
+
+    def _registration(self, color: Intrinsics) -> DepthToColor:
+        """How raw depth reaches the colour camera. Raises InputError where K or the transform is not known."""
+        topics, tf, color_frame = self._topics, self._survey.tf, self._frame_id
+        depth_image = self._survey.topics[topics.depth].image
+        size = f"{depth_image.encoding} {depth_image.width}x{depth_image.height}"
+        what = f"{self._where}: depth {size} of {topics.depth} is not registered to colour of {topics.color}"
+        remedy = "record depth aligned to colour"
+        if not topics.depth_info:
+            raise InputError(f"{what}, and {topics.depth} has no CameraInfo", remedy=f"record it, or {remedy}")
+        calibration = self._calibration(topics.depth_info, topics.depth)
+        frame = depth_image.frame_id
+        T_color_depth = self._survey.realsense.T_between(topics.color, topics.depth)
+        if is_registered(self._survey, topics.color, topics.depth, topics.info, ""):  # but for the lens
+            T_color_depth = np.eye(4)
+            self._survey.tf.note(
+                f"camera {topics.name}: {topics.info} and {topics.depth_info} differ in distortion: colour and depth"
+                " are undistorted each by its own"
+            )
+        color_info = self._survey.topics[topics.info].calibration if topics.info else None
+        if T_color_depth is None and frame == color_frame and color_info is not None:
+            is_one_sensor = (calibration.cut or color_info.cut) and np.allclose(
+                calibration.sensor_K, color_info.sensor_K, rtol=0.01
+            )
+            T_color_depth = np.eye(4) if is_one_sensor else None
+        if T_color_depth is None and frame == color_frame:
+            raise InputError(
+                f"{what}: their CameraInfo differ but both say frame {frame!r}",
+                remedy=f"{remedy}, or correct the frames",
+            )
+        if T_color_depth is None:
+            span = tf.span_ns(frame) or tf.span_ns(color_frame) or (0, 0)
+            T_color_depth = tf.lookup(color_frame, frame, span[0])
+        if T_color_depth is None:
+            raise InputError(
+                f"{what}, and tf does not join their frames {frame!r} and {color_frame!r};"
+                f" frames tf knows: {listed(tf.frames)}",
+                remedy=f"record /tf_static, or {remedy}",
+            )
+        undistortion = self._undistortion(calibration, topics.depth_info)
+        return DepthToColor(
+            depth_intrinsics=intrinsics_of(calibration) if undistortion is None else undistortion.intrinsics,
+            color_intrinsics=color,
+            T_color_depth=T_color_depth,
+            undistortion=undistortion,
+        )
+
+
+def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
+    """The topics that --camera names, their CameraInfo looked up where it names none."""
+    cameras = []
+    for given in options.camera_topics:
+        for topic, kind in ((given.color, "colour"), (given.depth, "depth")):
+            images = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is not None]
+            if topic not in images:
+                raise InputError(
+                    f"{log.path}: --camera {given.name}: no {kind} images on topic {topic}",
+                    remedy=f"image topics there: {listed(images)}",
+                )
+        if given.info and given.info not in [t.topic.name for t in survey.of_type(CAMERA_INFO)]:
+            raise InputError(
+                f"{log.path}: --camera {given.name}: no CameraInfo on topic {given.info}",
+                remedy="leave INFO out to have it found",
+            )
+        color, depth = survey.topics[given.color], survey.topics[given.depth]
+        cameras.append(
+            CameraTopics(
+                name=given.name,
+                color=given.color,
+                depth=given.depth,
+                info=given.info or find_info(survey, color),
+                depth_info=given.depth_info or find_info(survey, depth),
+            )
+        )
+    return tuple(cameras)
+
+
+def check_mask_topics(path: Path, survey: Survey, topics: Mapping[str, str], cameras: tuple[str, ...]) -> None:
+    """Raise InputError where a mask topic, by camera name, is for no camera or holds no grey images."""
+    grey = [
+        topic.topic.name
+        for topic in survey.of_type(IMAGE, COMPRESSED_IMAGE)
+        if topic.first_image is not None and topic.first_image.is_gray
+    ]
+    for camera, topic in topics.items():
+        if camera not in cameras:
+            raise InputError(
+                f"{path}: --human-topic {camera}={topic}: no camera {camera!r}",
+                remedy=f"use one of: {', '.join(cameras)}",
+            )
+        if topic not in grey:
+            raise InputError(
+                f"{path}: --human-topic {camera}={topic}: no mono8 or 8UC1 images on that topic",
+                remedy=f"grey topics there: {', '.join(grey) or 'none'}",
+            )

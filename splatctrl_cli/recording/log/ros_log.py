@@ -1,0 +1,295 @@
+"""A ROS log as records: cameras found, colour and depth paired, poses from tf, joints in one order.
+
+Two passes: the first takes all but the images (transforms may follow the images that need them) and plans every
+frame; the second takes only planned images and holds no more of them than the log's disorder demands. For `ingest`,
+files that a capture can hold as they are stay undecoded.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage
+from splatctrl_cli.recording.log.decoder import MessageDecoder, UndecodableMessageError
+from splatctrl_cli.recording.log.frame_plan import FramePlan, Planned, PlannedImages
+from splatctrl_cli.recording.log.messages import ImageMessage, color_of, depth_of, num_invalid, read_image
+from splatctrl_cli.recording.log.rig import Camera, build_cameras, nearest_gap_ns
+from splatctrl_cli.recording.log.state_topics import joint_records
+from splatctrl_cli.recording.log.stored_frame import (
+    StoredFrame,
+    check_depth,
+    decoded,
+    human_mask,
+    is_kept,
+    is_png,
+    topics_of,
+    with_joints,
+)
+from splatctrl_cli.recording.log.survey import Survey, dropped, first_of_each, pair_by_stamp, paired, survey
+from splatctrl_cli.recording.source_options import SourceOptions, still_note
+from splatctrl_cli.records import SECOND_NS, Float32, Float64, Index, JointState, LossReport, Record, UInt8, by_stamp
+
+
+@dataclass(kw_only=True)
+class _Pass:
+    """What one pass over the images met; one that ends early has not met all."""
+
+    damage: Damage = field(default_factory=Damage)
+    num_invalid: int = 0
+
+
+class RosLogSource:
+    """Records of an MCAP, ROS 1 bag or ROS 2 bag."""
+
+    has_clock = True
+
+    def __init__(self, log: RawLog, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
+        options.refuse(("root", "holdout"), "a log", log.path)
+        self.name = log.path.name
+        self._log = log
+        self._options = options
+        found = survey(log, by_log_time=options.stamps == "log")
+        _check_not_empty(log, found)
+        self._rig = _rig(log, found, options)
+        self._tf = found.tf
+        self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.all_notes, *found.tf.notes])
+        self.cameras = tuple(camera.name for camera in self._rig)
+        self._loss.notes.extend(still_note(camera.name) for camera in self._rig if camera.fixed_pose is not None)
+        self.world_frame = self._rig[0].world_frame
+        loss, first_note = LossReport(), len(self._loss.notes)
+        self.joint_names, self.states = joint_records(found, options, loss, joints)
+        self.joint_topics = topics_of(found, loss, first_note, options)
+        self._loss = with_joints(self._loss, loss, first_note)
+        self._plan = self._planned(found)
+        self._passes = [_Pass()]
+
+    @property
+    def loss(self) -> LossReport:
+        """What did not become records; images that do not decode are those of the pass of `records` that met most."""
+        loss, most = self._loss, max(self._passes, key=lambda one: (one.damage.count, one.num_invalid))
+        return replace(
+            loss,
+            damaged=loss.damaged + most.damage.count,
+            invalid_depth=most.num_invalid,
+            notes=[*loss.notes, *most.damage.all_notes],
+        )
+
+    def records(self) -> Iterator[Record]:
+        return decoded(by_stamp(self.states, self._stored_frames(lazily=False)))
+
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        """Joint states and stored frames by stamp; image files that need no change are only decoded on demand."""
+        return by_stamp(self.states, self._stored_frames(lazily=True))
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of every planned frame."""
+        return ((planned.stamp_ns, planned.camera.name, planned.T_world_camera) for planned in self._plan)
+
+    def pose_at(self, camera: str, stamp_ns: int) -> Float64 | None:
+        """T_world_camera (4, 4) of a camera at any time [ns]; None where tf does not know it."""
+        tolerance_ns = round(self._options.pose_tolerance_s * SECOND_NS)
+        return next(c for c in self._rig if c.name == camera).pose_at(self._tf, stamp_ns, tolerance_ns)
+
+    def digests(self) -> dict[str, str]:
+        return dict(self._digests)
+
+    @cached_property
+    def _digests(self) -> dict[str, str]:
+        names = [file.name for file in self._log.files]
+        is_unique = len(set(names)) == len(names)
+        return {
+            file.name if is_unique else f"{file.parent.name}/{file.name}": sha256(file) for file in self._log.files
+        }
+
+    def _planned(self, found: Survey) -> FramePlan:
+        plan = FramePlan(self._rig)
+        for camera in self._rig:
+            (color, color_ns), (depth, depth_ns) = (
+                self._images(found, topic) for topic in (camera.color_topic, camera.depth_topic)
+            )
+            tolerance_ns = round(self._options.pairing_tolerance_s * SECOND_NS)
+            pairs = paired(color_ns, depth_ns, tolerance_ns)
+            if not len(pairs):
+                gap = nearest_gap_ns(color_ns.tolist(), depth_ns.tolist()) / SECOND_NS
+                raise InputError(
+                    f"{self._log.path}: camera {camera.name}: no colour and depth image within"
+                    f" {tolerance_ns / 1e6:g} ms of each other, the closest are {gap * 1e3:.4g} ms apart",
+                    remedy=f"give --pairing-tolerance {gap * 1.01 + 1e-4:.3g} (seconds), if that is right",
+                )
+            self._loss.unpaired_color += len(color) - len(pairs)
+            self._loss.unpaired_depth += len(depth) - len(pairs)
+            self._add(plan, found, camera, color_ns[pairs[:, 0]], color[pairs[:, 0]], depth[pairs[:, 1]])
+        return plan
+
+    def _images(self, found: Survey, topic: str) -> tuple[Index, Index]:
+        """Number and stamp of each image but those that came again; these and missing ones are counted."""
+        stamps = np.array(found.topics[topic].stamps_ns, dtype=np.int64)
+        if len(stamps) > 1 and not stamps.any():
+            raise InputError(
+                f"{self._log.path}: topic {topic}: expected stamps, got 0 in all {len(stamps)} headers",
+                remedy="give --stamps log to take the times of logging",
+            )
+        kept = first_of_each(stamps)
+        drops = dropped(stamps)
+        self._loss.duplicate_images += len(stamps) - len(kept)
+        self._loss.dropped_images += drops.num_images
+        if drops.num_images:
+            self._loss.notes.append(
+                f"{topic}: about {drops.num_images} images were dropped in {drops.num_gaps} gaps of a period of"
+                f" {drops.period_ns / 1e6:.4g} ms"
+            )
+        return kept, stamps[kept]
+
+    def _add(
+        self, plan: FramePlan, found: Survey, camera: Camera, stamp_ns: Index, color: Index, depth: Index
+    ) -> None:
+        """Plan the pairs of a camera, those without a pose counted. Raises InputError where none has one."""
+        tolerance_ns = round(self._options.pose_tolerance_s * SECOND_NS)
+        pairing_ns = round(self._options.pairing_tolerance_s * SECOND_NS)
+        masks = _mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
+        poses = (camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in map(int, stamp_ns))
+        num = plan.add(camera, stamp_ns, color, depth, masks, poses)
+        if not num:
+            raise InputError(
+                f"{self._log.path}: camera {camera.name}: tf has no pose of frame {camera.frame_id!r} in"
+                f" {camera.world_frame!r} at the time of any image ({_times(found, camera)})",
+                remedy="check the clocks of the recording, or give --camera-pose",
+            )
+        self._loss.without_pose += len(color) - num
+
+    def _stored_frames(self, *, lazily: bool) -> Iterator[StoredFrame]:
+        lost, decoder, checked = _Pass(), MessageDecoder(), set[str]()
+        self._passes.append(lost)
+        for planned, messages in PlannedImages(self._log, self._plan).of_frames(lost.damage):
+            camera = planned.camera
+            is_whole = not lazily or camera.name not in checked  # the first depth is looked at
+            try:
+                color, depth, *masks = _images(decoder, camera, messages, is_whole=is_whole)
+            except UndecodableMessageError as error:
+                lost.damage.add(f"camera {camera.name} at {planned.stamp_ns} ns: {error}")
+                continue
+            human = self._human(camera, masks[0]) if masks else None
+            if depth.compressed is None:
+                lost.num_invalid += num_invalid(depth.pixels)
+            stored = _stored_frame(planned, color, depth, human, messages)
+            if camera.name not in checked:
+                scale = depth.unit(camera.depth_scale)
+                if check_depth(stored.depth, f"{self._log.path}: topic {camera.depth_topic}", scale):
+                    checked.add(camera.name)
+            yield stored
+
+    def _human(self, camera: Camera, mask: ImageMessage) -> UInt8:
+        human = human_mask(mask.pixels, camera.intrinsics, f"{self._log.path}: topic {camera.human_topic}")
+        return human if camera.undistortion is None else camera.undistortion.labels(human)
+
+
+def _images(
+    decoder: MessageDecoder, camera: Camera, messages: Sequence[RawMessage], *, is_whole: bool
+) -> list[ImageMessage]:
+    """Colour, depth and mask; is_whole: all decoded, not only what a capture cannot keep. Raises
+    UndecodableMessageError.
+    """
+    kept = (False,) * 3 if is_whole else (*_keeps_files(camera), False)
+    images = [
+        read_image(decoder.decode(message), message.topic.type_name, lazily=lazily)
+        for message, lazily in zip(messages, kept, strict=False)
+    ]
+    depth = camera.depth_to_color
+    expected = (camera.intrinsics, camera.intrinsics if depth is None else depth.depth_intrinsics)
+    for image, k in zip(images, expected, strict=False):
+        if (image.width, image.height) != (k.width, k.height):
+            raise UndecodableMessageError(
+                f"expected an image of {k.width}x{k.height}, got {image.width}x{image.height}"
+            )
+    return images
+
+
+def _keeps_files(camera: Camera) -> tuple[bool, bool]:
+    """Whether image files of colour and depth go into a capture as they are."""
+    is_plain = camera.undistortion is None
+    return is_plain, is_plain and camera.depth_to_color is None
+
+
+def _stored_frame(
+    planned: Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, messages: Sequence[RawMessage]
+) -> StoredFrame:
+    camera = planned.camera
+    is_counts = depth.is_counts and camera.depth_to_color is None
+    keeps_color, keeps_depth = _keeps_files(camera)
+    return StoredFrame(
+        stamp_ns=planned.stamp_ns,
+        camera=camera.name,
+        intrinsics=camera.intrinsics,
+        T_world_camera=planned.T_world_camera,
+        read_color=partial(_color, camera, color),
+        read_depth=partial(_depth, camera, depth),
+        human=human,
+        valid=camera.valid,
+        color_file=color.compressed if keeps_color and is_kept(color.compressed) else None,
+        depth_file=depth.compressed if keeps_depth and depth.is_counts and is_png(depth.compressed) else None,
+        depth_unit=depth.unit(camera.depth_scale) if is_counts else None,
+        origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
+        places=tuple(replace(message, data=b"") for message in messages),
+    )
+
+
+def _color(camera: Camera, image: ImageMessage) -> UInt8:
+    pixels = color_of(image)
+    return pixels if camera.undistortion is None else camera.undistortion.color(pixels)
+
+
+def _depth(camera: Camera, image: ImageMessage) -> Float32:
+    metres = depth_of(image, camera.depth_scale)
+    if camera.depth_to_color is not None:
+        return camera.depth_to_color.warp(metres)
+    return metres if camera.undistortion is None else camera.undistortion.depth(metres)
+
+
+def _rig(log: RawLog, found: Survey, options: SourceOptions) -> tuple[Camera, ...]:
+    """The cameras. Raises InputError for what they lack, which in a damaged log may be what was lost."""
+    try:
+        return build_cameras(log, found, options)
+    except InputError as error:
+        if not found.damage.count:
+            raise
+        raise InputError(
+            f"{error.message}; but the log is damaged: {found.damage.notes[0]}",
+            remedy=f"copy the file again; if this is all there is: {error.remedy}",
+        ) from None
+
+
+def _check_not_empty(log: RawLog, found: Survey) -> None:
+    if found.num_messages:
+        return
+    if found.damage.count:
+        raise InputError(
+            f"{log.path}: nothing usable before the damage ({found.damage.notes[0]})", remedy="copy the file again"
+        )
+    raise InputError(f"{log.path}: the log holds no messages", remedy="record it again, or give another file")
+
+
+def _times(found: Survey, camera: Camera) -> str:
+    stamps = found.topics[camera.color_topic].stamps_ns
+    images = f"images {min(stamps) / 1e9:.3f} to {max(stamps) / 1e9:.3f} s"
+    span = found.tf.span_ns(camera.frame_id)
+    return images if span is None else f"{images}, tf {span[0] / 1e9:.3f} to {span[1] / 1e9:.3f} s"
+
+
+def _mask_by_color(
+    survey: Survey, color_topic: str, mask_topic: str, tolerance_ns: int, camera: str, loss: LossReport
+) -> dict[int, int]:
+    """Mask number by colour number, the closest stamps paired; images without a mask are noted in `loss`."""
+    if not mask_topic:
+        return {}
+    color_ns, mask_ns = survey.topics[color_topic].stamps_ns, survey.topics[mask_topic].stamps_ns
+    pairs = dict(pair_by_stamp(color_ns, mask_ns, tolerance_ns))
+    if len(pairs) < len(color_ns):
+        loss.notes.append(
+            f"camera {camera}: {len(color_ns) - len(pairs)} of {len(color_ns)} images have no mask on {mask_topic}"
+            f" within {tolerance_ns / 1e6:g} ms"
+        )
+    return pairs

@@ -1,0 +1,271 @@
+"""Joint states out of decoded messages of the types that robots publish them in, and as columns by which joints a
+message names.
+"""
+
+from array import array
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.files.spilled_rows import Rows
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.recording.log.decoder import JOINT_STATE, UndecodableMessageError, stamp_ns
+from splatctrl_cli.recording.log.state_columns import ColumnWriter
+from splatctrl_cli.records import Float64, Stamps
+
+FRANKA_STATES = ("franka_msgs/msg/FrankaRobotState", "franka_msgs/msg/FrankaState")
+CONTROLLER_STATE = "control_msgs/msg/JointTrajectoryControllerState"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+STATE_TYPES = (JOINT_STATE, *FRANKA_STATES, CONTROLLER_STATE, TRAJECTORY)
+STANDARD_TYPES = (JOINT_STATE, TRAJECTORY)  # known without a definition in the log
+NAMELESS = tuple(f"joint{number}" for number in range(1, 8))  # what a Franka's q[0..6] are called
+_MAX_SKEW = 1e-2  # largest entry of R^T R - I of a pose that a robot logs
+
+
+def _none() -> Float64:
+    return np.zeros(0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawJoints:
+    """One joint state as recorded, in the order of its names.
+
+    position (J,); velocity, commanded_velocity (J,) or empty; log_time_ns: when it was logged; T_base_ee (4, 4): the
+    end effector that the robot's own controller reports; note: what of the message is not used, and why.
+    """
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    position: Float64
+    velocity: Float64
+    log_time_ns: int = 0
+    commanded_velocity: Float64 = field(default_factory=_none)
+    T_base_ee: Float64 | None = None
+    note: str = ""
+
+
+def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoints]:
+    """The joint states of a message of `STATE_TYPES`, log time [ns]. Raises UndecodableMessageError."""
+    if type_name == JOINT_STATE:
+        return [_joint_state(message, log_time_ns)]
+    if type_name in FRANKA_STATES:
+        return [_franka(message, log_time_ns)]
+    if type_name == CONTROLLER_STATE:
+        return [_controller(message, log_time_ns)]
+    return _trajectory(message, log_time_ns)
+
+
+def rigid_or_none(T: Float64) -> Float64 | None:
+    """A pose (4, 4) where it is one: finite, a rotation, not the zeros of a field that nobody filled."""
+    R = T[:3, :3]
+    is_rigid = np.isfinite(T).all() and np.abs(R.T @ R - np.eye(3)).max() < _MAX_SKEW and np.linalg.det(R) > 0
+    return T if is_rigid else None
+
+
+def pose_of_columns(values: Float64) -> Float64 | None:
+    """T (4, 4) of 16 numbers, columns one after the other, as libfranka stores poses (franka/robot_state.h)."""
+    return rigid_or_none(values.reshape(4, 4).T)
+
+
+def pose_of_quat(position: Float64, quat_xyzw: Float64) -> Float64 | None:
+    """T (4, 4) of a position [m] and a quaternion, None where its length is not one."""
+    if not (np.isfinite(position).all() and abs(float(np.linalg.norm(quat_xyzw)) - 1.0) < _MAX_SKEW):
+        return None
+    return transform_from(position, quat_xyzw)
+
+
+def _joint_state(message: Any, log_time_ns: int) -> RawJoints:
+    names = tuple(str(name) for name in message.name)
+    position, velocity = _array(message.position), _array(message.velocity)
+    return _checked("a JointState", message, names, position, velocity, _none(), log_time_ns, None)
+
+
+def _franka(message: Any, log_time_ns: int) -> RawJoints:
+    """FrankaRobotState of franka_ros2 (states with names, PoseStamped), or the older one of bare arrays."""
+    fields = {name.lower(): getattr(message, name) for name in message.__dataclass_fields__}
+    if "measured_joint_state" in fields:
+        measured, desired, pose = fields["measured_joint_state"], fields["desired_joint_state"], fields["o_t_ee"].pose
+        p, r = pose.position, pose.orientation
+        position, velocity = _array(measured.position), _array(measured.velocity)
+        names = tuple(str(name) for name in measured.name)
+        commanded = _array(desired.velocity)
+        T = pose_of_quat(np.array([p.x, p.y, p.z]), np.array([r.x, r.y, r.z, r.w]))
+    else:
+        position, velocity, commanded = (_array(fields[name]) for name in ("q", "dq", "dq_d"))
+        names, T = (), pose_of_columns(_array(fields["o_t_ee"]))
+    if not names and len(position) == len(NAMELESS):
+        names = NAMELESS
+    return _checked("a Franka state", message, names, position, velocity, commanded, log_time_ns, T)
+
+
+def _controller(message: Any, log_time_ns: int) -> RawJoints:
+    """`feedback` and `reference`, where they are filled, else `actual` and `desired` of before (control_msgs)."""
+    names = tuple(str(name) for name in message.joint_names)
+    actual = _filled(message, ("feedback", "actual"), len(names))
+    wanted = _filled(message, ("reference", "desired"), len(names))
+    if actual is None:
+        raise UndecodableMessageError(f"a controller state of {len(names)} joints without positions")
+    commanded = _none() if wanted is None else _array(wanted.velocities)
+    position, velocity = _array(actual.positions), _array(actual.velocities)
+    return _checked("a controller state", message, names, position, velocity, commanded, log_time_ns, None)
+
+
+def _filled(message: Any, fields: tuple[str, ...], num_joints: int) -> Any:
+    there = [getattr(message, name) for name in fields if name in message.__dataclass_fields__]
+    return next((point for point in there if len(point.positions) == num_joints), None)
+
+
+def _checked(
+    what: str,
+    message: Any,
+    names: tuple[str, ...],
+    position: Float64,
+    velocity: Float64,
+    commanded: Float64,
+    log_time_ns: int,
+    T_base_ee: Float64 | None,
+) -> RawJoints:
+    if len(position) != len(names):
+        raise UndecodableMessageError(f"{what} with {len(names)} names and {len(position)} positions")
+    is_odd = len(velocity) not in (0, len(names))
+    return RawJoints(
+        stamp_ns=stamp_ns(message.header),
+        names=names,
+        position=position,
+        velocity=velocity if len(velocity) == len(names) else _none(),
+        log_time_ns=log_time_ns,
+        commanded_velocity=commanded if len(commanded) == len(names) else _none(),
+        T_base_ee=T_base_ee,
+        note=f"{len(names)} names with {len(velocity)} velocities, which are not used" if is_odd else "",
+    )
+
+
+def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
+    """Every point of a planned motion; a header without a stamp means that it begins when it is sent."""
+    names = tuple(str(name) for name in message.joint_names)
+    start_ns = stamp_ns(message.header) or log_time_ns
+    states = []
+    for point in message.points:
+        since, position, velocity = point.time_from_start, _array(point.positions), _array(point.velocities)
+        if len(position) != len(names):
+            raise UndecodableMessageError(f"a trajectory of {len(names)} joints with {len(position)} positions")
+        after_ns = int(since.sec) * 1_000_000_000 + int(since.nanosec)
+        states.append(
+            RawJoints(
+                stamp_ns=start_ns + after_ns,
+                names=names,
+                position=position,
+                velocity=velocity if len(velocity) == len(names) else _none(),
+                log_time_ns=log_time_ns + after_ns,
+                commanded_velocity=velocity if len(velocity) == len(names) else _none(),
+            )
+        )
+    return states
+
+
+def _array(values: Any) -> Float64:
+    return np.asarray(values, dtype=np.float64)
+
+
+COLUMNS = ("position", "velocity", "commanded_velocity", "T_base_ee")
+
+
+class JointStream:
+    """States that name the same joints; `names` in the order of the first, which is that of the columns."""
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self.names = names
+        self._stamps, self._log_times = array("q"), array("q")
+        self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
+        self._columns = ColumnWriter({name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS})
+
+    @classmethod
+    def of(
+        cls, names: tuple[str, ...], stamp_ns: Stamps, log_time_ns: Stamps, columns: Mapping[str, Iterable[Float64]]
+    ) -> "JointStream":
+        """The stream that had these columns, given as blocks of rows. Raises ValueError for other lengths."""
+        stream = cls(names)
+        stream._stamps.extend(stamp_ns.tolist())
+        stream._log_times.extend(log_time_ns.tolist())
+        for name, blocks in columns.items():
+            stream._columns.add_column(name, blocks)
+        if columns and len(stream._columns) != len(stream):
+            raise ValueError(f"columns of other lengths than {len(stream)}")
+        return stream
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def stamp_ns(self) -> Stamps:
+        """Of the messages (T,)."""
+        return np.array(self._stamps, dtype=np.int64)
+
+    @property
+    def log_time_ns(self) -> Stamps:
+        """When they were logged (T,)."""
+        return np.array(self._log_times, dtype=np.int64)
+
+    def columns(self) -> dict[str, Rows]:
+        """position, velocity, commanded_velocity (T, J), T_base_ee (T, 4, 4): NaN where a state has none, not there
+        where none has one.
+        """
+        return self._columns.tables()
+
+    def add(self, state: RawJoints) -> None:
+        """The next state. Raises OverflowError for a time beyond 64 bits."""
+        times = array("q", (state.stamp_ns, state.log_time_ns))  # both, before either is kept
+        self._stamps.append(times[0])
+        self._log_times.append(times[1])
+        self._columns.add({name: self._row(state, name) for name in COLUMNS})
+
+    def _row(self, state: RawJoints, name: str) -> Float64 | None:
+        value: Float64 | None = getattr(state, name)
+        if value is None or name == "T_base_ee" or not len(value):
+            return value if value is not None and len(value) else None
+        if state.names not in self._orders:
+            self._orders[state.names] = [state.names.index(joint) for joint in self.names]
+        return value[self._orders[state.names]]
+
+
+class JointLog:
+    """The states of a topic in file order; first_names: of the first, None before it; notes: of states, counted."""
+
+    def __init__(self) -> None:
+        self.first_names: tuple[str, ...] | None = None
+        self.notes: Counter[str] = Counter()
+        self._num = 0
+        self._streams: dict[frozenset[str], JointStream] = {}
+
+    @classmethod
+    def of(cls, num: int, streams: Sequence[JointStream]) -> "JointLog":
+        """The log of `num` states that had these streams."""
+        log = cls()
+        log._num = num
+        log._streams = {frozenset(stream.names): stream for stream in streams}
+        log.first_names = streams[0].names if streams else None
+        return log
+
+    def __len__(self) -> int:
+        return self._num
+
+    @property
+    def streams(self) -> list[JointStream]:
+        """By which joints they name; states that name none are in none."""
+        return list(self._streams.values())
+
+    def extend(self, states: Iterable[RawJoints]) -> None:
+        """The next states. Raises OverflowError for a time beyond 64 bits."""
+        for state in states:
+            self.notes.update(filter(None, [state.note]))
+            if state.names:
+                key = frozenset(state.names)
+                stream = self._streams[key] if key in self._streams else JointStream(state.names)
+                stream.add(state)
+                self._streams[key] = stream
+            if self.first_names is None:
+                self.first_names = state.names
+            self._num += 1

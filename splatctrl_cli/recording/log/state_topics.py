@@ -1,0 +1,408 @@
+"""The joint states of a log's topics: which topic, joints spread over several topics, names without a prefix; and
+which of two clocks the log goes by: what stamped the messages, or what logged them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from splatctrl_cli.config.fixed import (
+    CLOCK_DRIFT,
+    CLOCK_MIXED,
+    CLOCK_NEIGHBOURS,
+    CLOCK_OTHER,
+    CLOCK_STEP,
+    STATES_BRIDGED,
+    STATES_COMPARED,
+    STATES_RIVAL,
+    STATES_STILL,
+    TURNS_ACCELERATION,
+    TURNS_FEWEST,
+    TURNS_LEAST,
+    TURNS_SHARE,
+)
+from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError
+from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, absent, ranges
+from splatctrl_cli.recording.log.decoder import JOINT_STATE
+from splatctrl_cli.recording.log.state_columns import NO_STATES, StateColumns
+from splatctrl_cli.recording.log.state_messages import STANDARD_TYPES, STATE_TYPES, TRAJECTORY, JointStream
+from splatctrl_cli.recording.log.state_track import RawTrack, cleaned, unwrapped
+from splatctrl_cli.recording.log.survey import Survey, TopicSurvey
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import Bool, Float64, Index, LossReport, Stamps
+
+_COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")  # in topics of what is wished
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stream:
+    """States of one topic that name the same joints, under the names to take them by."""
+
+    where: str
+    names: tuple[str, ...]
+    states: JointStream
+
+    @property
+    def has_poses(self) -> bool:
+        return "T_base_ee" in self.states.columns()
+
+
+def joint_records(
+    survey: Survey, options: SourceOptions, loss: LossReport, wanted: Sequence[str] | None = None
+) -> tuple[tuple[str, ...], StateColumns]:
+    """Joint names and states by stamp; no names and no states where the log holds none.
+
+    With `wanted` (a robot's joints), they are brought together from the topics that have them. Else the states are of
+    one topic, and those that lack a joint of the fullest (a gripper that publishes alone) are left out with a note.
+    """
+    topics = state_topics(survey, options, loss)
+    if not topics:
+        return (), NO_STATES
+    try:
+        refuse_contradiction(topics, wanted)
+    except SplatCtrlError as wrong:
+        if wanted is not None:
+            raise
+        loss.notes.append(wrong.message)
+    loss.notes += [f"{t.topic.name}: {note} ({num} states)" for t in topics for note, num in t.joints.notes.items()]
+    raw = track_of_topic(main_topic(topics, loss), loss) if wanted is None else track_of_joints(topics, wanted, loss)
+    states = cleaned(raw, loss)
+    return (raw.names, states) if len(states) else ((), NO_STATES)
+
+
+def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> list[TopicSurvey]:
+    """The topics with joint states, planned motions only where nothing measured is there.
+
+    Raises InputError where --joint-topic is none of them.
+    """
+    found = [t for t in survey.of_type(*STATE_TYPES) if t.joints.streams]
+    for topic in survey.of_type(*STATE_TYPES):
+        if not topic.topic.definition and topic.topic.type_name not in STANDARD_TYPES:
+            kind = topic.topic.type_name
+            loss.notes.append(f"{topic.topic.name}: the log has no definition of {kind}: its states are not read")
+    if options.joint_topic is not None:
+        chosen = [t for t in found if t.topic.name == options.joint_topic]
+        if not chosen:
+            raise InputError(
+                f"joint topic {options.joint_topic}: not a topic of the log with joint states",
+                remedy=f"use one of: {', '.join(t.topic.name for t in found) or 'none there'}",
+            )
+        return chosen
+    return [t for t in found if t.topic.type_name != TRAJECTORY] or found
+
+
+def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
+    """/joint_states, else the JointState topic with most messages, else the fullest of another type; one that names
+    commands last.
+    """
+
+    def rank(topic: TopicSurvey) -> tuple[bool, bool, bool, int, str]:
+        name = topic.topic.name
+        is_of_type = topic.topic.type_name == JOINT_STATE
+        return (name == "/joint_states", not _is_command(name), is_of_type, topic.count, name)
+
+    chosen = max(topics, key=rank)
+    others = sorted(t.topic.name for t in topics if t is not chosen)
+    if others:
+        loss.notes.append(f"joint states are taken from {chosen.topic.name}, not from {', '.join(others)}")
+    return chosen
+
+
+def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
+    """The states of a topic that name the most joints; others (a gripper that publishes alone) are noted."""
+    chosen = max(_streams([topic]), key=lambda s: (len(s.names), len(s.states), sorted(s.names)))
+    others = len(topic.joints) - len(chosen.states)
+    if others:
+        loss.notes.append(f"{chosen.where}: {others} of {len(topic.joints)} states name other joints: left out")
+    return _raw(chosen, chosen.names, loss)
+
+
+def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: LossReport) -> RawTrack:
+    """The states of the joints `wanted` as far as the topics have them, from as few topics as hold them.
+
+    The topic with the most of them gives the stamps, of equals one with end-effector poses, then /joint_states; other
+    joints are interpolated between the states of their topics. States outside of these, or in a gap of more than
+    `STATES_BRIDGED` over which a joint moved, are left out with a note.
+    """
+    streams = _renamed(_streams(topics), wanted, loss)
+    base = _base(streams, wanted)
+    track = _raw(base, base.names, loss)
+    missing = [name for name in wanted if name not in base.names]
+    used = [base.where]
+    while missing:
+        best = max(streams, key=lambda s: (len(set(s.names) & set(missing)), len(s.states), s.where))
+        added = tuple(name for name in missing if name in best.names)
+        if not added:
+            break
+        track = _filled(track, _raw(best, added, loss), loss)
+        missing = [name for name in missing if name not in added]
+        used.append(best.where)
+    others = sorted({t.topic.name for t in topics} - set(used))
+    if others:
+        taken = ", ".join(dict.fromkeys(used))
+        loss.notes.append(f"joint states are taken from {taken}, not from {', '.join(others)}")
+    return track if missing else track.of_names(wanted)
+
+
+def _streams(topics: Sequence[TopicSurvey]) -> list[_Stream]:
+    return [
+        _Stream(where=topic.topic.name, names=stream.names, states=stream)
+        for topic in topics
+        for stream in topic.joints.streams
+    ]
+
+
+def _base(streams: Sequence[_Stream], wanted: Sequence[str]) -> _Stream:
+    """The stream with most of the joints `wanted`, of equals one with end-effector poses, then /joint_states."""
+
+    def rank(stream: _Stream) -> tuple[int, bool, bool, bool, int, str]:
+        covered, where = len(set(stream.names) & set(wanted)), stream.where
+        return (
+            covered,
+            stream.has_poses,
+            where == "/joint_states",
+            not _is_command(where),
+            len(stream.states),
+            where,
+        )
+
+    return max(streams, key=rank)
+
+
+def _is_command(topic: str) -> bool:
+    return any(word in topic.lower() for word in _COMMANDS)
+
+
+def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | None) -> None:
+    """Raise where the states of joints `wanted` (None: of all) are those of two robots.
+
+    InputError for another topic, not one of commands, that has the same joints elsewhere by over `STATES_RIVAL`;
+    NotEvaluableError for two publishers that take turns on one topic.
+    """
+    streams = _streams(topics)
+    if wanted is None:
+        base = max(streams, key=lambda s: (s.where == main_topic(topics, LossReport()).topic.name, len(s.names)))
+    else:
+        streams = _renamed(streams, wanted, LossReport())
+        base = _base(streams, wanted)
+    names = base.names if wanted is None else tuple(name for name in base.names if name in wanted)
+    for other in streams:
+        shared = [name for name in names if name in other.names]
+        if other.where == base.where or not shared or _is_command(other.where):
+            continue
+        apart = _apart(base, other, shared)
+        if apart > STATES_RIVAL:
+            both = f"{base.where} and {other.where}"
+            raise InputError(
+                f"joint states: {both} both have {', '.join(shared[:3])} and differ by {apart:.3g} (median)",
+                remedy=f"give --joint-topic {base.where} or --joint-topic {other.where}",
+            )
+    num = _num_turns(base, names)
+    if num >= max(TURNS_FEWEST, TURNS_SHARE * len(base.states)):
+        raise NotEvaluableError(
+            f"{base.where}: two publishers take turns: {num} of {len(base.states)} states jump away and back at once",
+            remedy="let one node publish the topic (ros2 topic info -v names them), and record again",
+        )
+
+
+def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
+    """Median distance [rad or m] of two streams' shared joints at the same times; 0 where they do not overlap."""
+    stamps, its = base.states.stamp_ns, other.states.stamp_ns
+    at, at_other = np.argsort(stamps, kind="stable"), np.argsort(its, kind="stable")
+    its = its[at_other]
+    some = np.unique(np.linspace(0, len(its) - 1, min(len(its), STATES_COMPARED // 10)).astype(np.int64))
+    near = np.clip(np.searchsorted(stamps[at], its[some]), 0, len(at) - 1)
+    is_near = np.abs(stamps[at][near] - its[some]) <= STATES_BRIDGED * 1e9
+    if not is_near.any():
+        return 0.0
+    one = base.states.columns()["position"][at[near[is_near]]][:, [base.names.index(name) for name in shared]]
+    two = other.states.columns()["position"][at_other[some[is_near]]][:, [other.names.index(name) for name in shared]]
+    turned = np.abs(one - two)
+    return float(np.median(np.minimum(turned, np.abs(turned - 2 * np.pi)).max(axis=1)))
+
+
+def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
+    """Count states that lie far from both neighbours, which are close together: no joint turns back so fast."""
+    position = stream.states.columns().get("position")
+    columns = [stream.names.index(name) for name in names]
+    if position is None or not columns:
+        return 0
+    num, order = 0, np.argsort(stream.states.stamp_ns, kind="stable")
+    seconds = stream.states.stamp_ns[order] * 1e-9
+    for first, last in ranges(max(len(order) - 2, 0)):
+        q, gaps = position[order[first : last + 2]][:, columns], np.diff(seconds[first : last + 2])
+        steps = np.abs(np.diff(q, axis=0))
+        jump = np.minimum(steps[1:], steps[:-1])
+        fastest = np.maximum(TURNS_ACCELERATION * gaps[1:] * gaps[:-1], TURNS_LEAST)[:, None]
+        is_turn = (np.abs(q[2:] - q[:-2]) < 0.25 * jump) & (jump > fastest)
+        num += int((is_turn & (np.abs(jump - 2 * np.pi) > 0.1 * np.pi)).any(axis=1).sum())
+    return num
+
+
+def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
+    """Rename a stream's unknown joints to the robot's missing ones, where only a prefix differs."""
+    found = dict.fromkeys(name for stream in streams for name in stream.names)
+    unknown, missing = [n for n in found if n not in wanted], [name for name in wanted if name not in found]
+    names = with_prefix(unknown, missing)
+    if not names:
+        return streams
+    name, meant = next(iter(names.items()))
+    loss.notes.append(f"joint names differ by a prefix: {name} is {meant}, and so on")
+    return [replace(s, names=tuple(names.get(name, name) for name in s.names)) for s in streams]
+
+
+def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
+    """Map a log's joint names to the robot's by a prefix that either has; empty unless one prefix fits best."""
+    by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
+    for name in dict.fromkeys(found):
+        for meant in wanted:
+            longer, shorter = (name, meant) if len(name) > len(meant) else (meant, name)
+            prefix = longer.removesuffix(shorter)
+            if len(prefix) < len(longer) and prefix.endswith(("_", "/", ".", ":", "-")):
+                by_prefix.setdefault((prefix, longer == name), {})[name] = meant
+    fitting = sorted(by_prefix.values(), key=len)[-2:]
+    is_sure = bool(fitting) and len(fitting[-1]) > 1 and (len(fitting) == 1 or len(fitting[0]) < len(fitting[1]))
+    return fitting[-1] if is_sure else {}
+
+
+def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
+    """The states of a stream with `names` as columns."""
+    states, columns = stream.states, stream.states.columns()
+    raw = RawTrack(
+        where=stream.where,
+        names=stream.names,
+        stamp_ns=checked_stamps(states.stamp_ns, states.log_time_ns, stream.where, loss),
+        **{"velocity": absent(len(states), len(stream.names)), **columns},
+    )
+    return raw.of_names(names)
+
+
+def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
+    """`track` with the joints of `other`, interpolated at its stamps; states where that cannot be are left out."""
+    order = np.argsort(other.stamp_ns, kind="stable")
+    at = other.stamp_ns[order]
+    stamps = track.stamp_ns
+    after = np.clip(np.searchsorted(at, stamps), 1, max(len(at) - 1, 1))
+    if len(at) == 1:
+        at, order = np.repeat(at, 2), np.repeat(order, 2)
+    before = after - 1
+    position = unwrapped(other.select(order), loss).position
+    gap = (at[after] - at[before]) * 1e-9
+    is_still = _is_still(position, before, after)
+    keep = (stamps >= at[0]) & (stamps <= at[-1]) & ((gap <= STATES_BRIDGED) | is_still)
+    share = np.clip((stamps - at[before]) / np.maximum(at[after] - at[before], 1), 0.0, 1.0)[:, None]
+
+    names = ", ".join(other.names)
+    if not keep.any():
+        raise InputError(
+            f"{track.where} and {other.where}: mixed clocks: at no state of {track.where} is {names} known",
+            remedy="give another --joint-topic, or record both by one clock",
+        )
+    loss.notes.append(f"{track.where}: {names} of {other.where} are interpolated at its {len(stamps)} states")
+    if not keep.all():
+        lost = f"{int((~keep).sum())} of {len(stamps)} states left out"
+        loss.notes.append(f"{track.where}: {lost}: {names} of {other.where} are unknown then")
+
+    def joined(one: Table, two: Table, order: Index) -> Table:
+        file = RowFile((len(track.names) + len(other.names),))
+        for first, last in ranges(len(stamps)):
+            part = slice(first, last)
+            between = (1 - share[part]) * two[order[before[part]]] + share[part] * two[order[after[part]]]
+            file.append(np.hstack([one[part], between]))
+        return Rows(file)
+
+    one, two = track.commanded_velocity, other.commanded_velocity
+    filled = replace(
+        track,
+        names=(*track.names, *other.names),
+        position=joined(track.position, position, np.arange(len(at))),
+        velocity=joined(track.velocity, other.velocity, order),
+        commanded_velocity=None if one is None or two is None else joined(one, two, order),
+    )
+    return filled.select(np.flatnonzero(keep))
+
+
+def _is_still(table: Table, before: Index, after: Index) -> Bool:
+    """Pairs of states (T,) of which no joint differs."""
+    is_still = np.zeros(len(before), dtype=np.bool_)
+    for first, last in ranges(len(before)):
+        change = np.abs(table[after[first:last]] - table[before[first:last]])
+        is_still[first:last] = change.max(axis=1) < STATES_STILL
+    return is_still
+
+
+def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossReport) -> Stamps:
+    """The stamps (T,) [ns] to use, in file order: those of the headers, or the log's where no header has one.
+
+    Notes another clock, a drift and steps in `loss`. Raises InputError for states of two clocks.
+    """
+    is_unset = stamp_ns == 0
+    if is_unset.all():
+        loss.notes.append(f"{where}: no state has a stamp; the times of logging are used")
+        return log_ns
+    if is_unset.any() and stamp_ns[~is_unset].min() > CLOCK_MIXED * 1e9:  # a simulation may begin at 0
+        raise InputError(
+            f"{where}: mixed clocks: {int(is_unset.sum())} of {len(stamp_ns)} states have no stamp",
+            remedy="leave them out of the log, or give another --joint-topic",
+        )
+    late = np.asarray((log_ns - stamp_ns) * 1e-9, dtype=np.float64)
+    _check_steps(late, where, loss)
+    median = float(np.median(late))
+    if abs(median) > CLOCK_OTHER:
+        loss.notes.append(
+            f"{where}: stamps are {abs(median):.3f} s {'before' if median > 0 else 'after'} the time of logging: "
+            "two clocks; are the cameras stamped by the same one?"
+        )
+    drift, span = _drift(late, np.asarray((stamp_ns - stamp_ns[0]) * 1e-9, dtype=np.float64))
+    if abs(drift) > CLOCK_DRIFT:
+        loss.notes.append(
+            f"{where}: stamps and times of logging drift apart by {1e3 * abs(drift):.1f} ms over {span:.1f} s "
+            f"({1e6 * abs(drift) / span:.0f} ppm)"
+        )
+    return stamp_ns
+
+
+def _check_steps(late: Float64, where: str, loss: LossReport) -> None:
+    n = CLOCK_NEIGHBOURS
+    if len(late) < 2 * n:
+        if np.ptp(late) > CLOCK_MIXED:
+            raise _mixed(where, float(np.ptp(late)), int(np.argmax(np.abs(np.diff(late)))) + 1)
+        return
+    windows = np.empty(len(late) - n + 1)
+    for first, last in ranges(len(windows)):
+        near = late[first : last + n - 1]
+        windows[first:last] = np.median(np.lib.stride_tricks.sliding_window_view(near, n), axis=1)
+    change = np.abs(windows[n:] - windows[:-n])  # the n states before i + n against those from it on
+    step = float(change.max(initial=0.0))
+    if step <= CLOCK_STEP:
+        return
+    at = int(np.argmax(change))
+    state = at + 1 + int(np.argmax(np.abs(np.diff(late[at : at + 2 * n]))))
+    if step > CLOCK_MIXED:
+        raise _mixed(where, step, state)
+    loss.notes.append(f"{where}: stamps step by {step:.3f} s against the time of logging at state {state}")
+
+
+def _mixed(where: str, step: float, state: int) -> InputError:
+    return InputError(
+        f"{where}: mixed clocks: stamps jump by {step:.1f} s against the time of logging at state {state}",
+        remedy="cut the log there, or give another --joint-topic",
+    )
+
+
+def _drift(late: Float64, seconds: Float64) -> tuple[float, float]:
+    """How much later [s] the last quarter is logged than the first, and the seconds between them.
+
+    Of each quarter the tenth percentile counts: a message may be logged late, but not early. 0 where the change is
+    not spread over the log (a step, a stall).
+    """
+    quarter = len(late) // 4
+    span = float(np.median(seconds[-quarter:]) - np.median(seconds[:quarter])) if quarter >= 10 else 0.0
+    if span <= 0:
+        return 0.0, 1.0
+    first, last = late[:quarter], late[-quarter:]
+    drift = float(np.percentile(last, 10) - np.percentile(first, 10))
+    halves = float(np.percentile(late[quarter:-quarter], 10) - np.percentile(first, 10))
+    is_even = 0.1 < halves / drift < 0.9 if drift else False
+    return (drift if is_even else 0.0), span

@@ -1,0 +1,318 @@
+"""Joint states of one source, cleaned: in time order, one per stamp, with velocities (from positions whose stamps
+jitter, where there are none); what was wrong is counted.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import fixed
+from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, ranges
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.records import Bool, Float64, LossReport, Stamps
+
+
+def gaps_of(stamp_ns: Stamps) -> NDArray[np.intp]:
+    """Indices i of the gaps between states i and i + 1; stamps (T,) rise."""
+    steps = np.diff(stamp_ns)
+    if not len(steps):
+        return np.zeros(0, dtype=np.intp)
+    longest = max(fixed.STATES_GAP_PERIODS * float(np.median(steps)), fixed.STATES_GAP_SECONDS * 1e9)
+    return np.flatnonzero(steps > longest)
+
+
+def smoothed_seconds(stamp_ns: Stamps) -> Float64:
+    """Times (T,) [s] since the first stamp of a robot that sends at a fixed rate, without the jitter of sending.
+
+    The line through the stamps of the neighbouring states over their numbers, lost ones counted. Stamps that follow
+    no fixed rate (residuals above a quarter of a period), or that would no longer rise, come back as they are.
+    """
+    seconds = np.asarray((stamp_ns - stamp_ns[0]) * 1e-9, dtype=np.float64)
+    if len(seconds) < 3:
+        return seconds
+    lag = min(fixed.STATES_PERIOD_SAMPLES, len(seconds) - 1)
+    period = float(np.median(seconds[lag:] - seconds[:-lag])) / lag
+    number = _numbers(seconds, period)
+    smooth = np.empty_like(seconds)
+    sums = _Sums()
+    for begin, end in ranges(len(seconds)):
+        index = np.arange(begin, end)
+        first = np.maximum(index - fixed.STATES_CLOCK_SAMPLES, 0)
+        last = np.minimum(index + fixed.STATES_CLOCK_SAMPLES, len(seconds) - 1) + 1
+        k, residual = number[: last[-1]], seconds[sums.num : last[-1]] - period * number[sums.num : last[-1]]
+        sums.add(k[sums.num :], residual)  # small numbers: the sums below keep their digits
+        mean_k, mean_r, mean_kk, mean_kr = sums.means(first, last)
+        slope = (mean_kr - mean_k * mean_r) / np.maximum(mean_kk - mean_k**2, 1e-12)
+        smooth[begin:end] = period * number[begin:end] + mean_r + slope * (number[begin:end] - mean_k)
+        sums.forget(end - fixed.STATES_CLOCK_SAMPLES)
+    is_regular = float(np.sqrt(np.mean((smooth - seconds) ** 2))) < 0.25 * period
+    return smooth if is_regular and bool(np.all(np.diff(smooth) > 0)) else seconds
+
+
+class _Sums:
+    """Running sums of k, r, k^2 and k r over all states so far, of which the newest are kept."""
+
+    def __init__(self) -> None:
+        self._sums = np.zeros((4, 1))  # up to but not with state `_start` and those after it
+        self._start = 0
+
+    @property
+    def num(self) -> int:
+        """States that were added."""
+        return self._start + self._sums.shape[1] - 1
+
+    def add(self, k: Float64, r: Float64) -> None:
+        """The next states' (T,)."""
+        rows = [np.cumsum(np.concatenate([s[-1:], v])) for s, v in zip(self._sums, (k, r, k**2, k * r), strict=True)]
+        self._sums = np.hstack([self._sums, np.array(rows)[:, 1:]])
+
+    def means(self, first: NDArray[np.intp], last: NDArray[np.intp]) -> Float64:
+        """(4, T) of the states from each first up to its last."""
+        return np.asarray((self._sums[:, last - self._start] - self._sums[:, first - self._start]) / (last - first))
+
+    def forget(self, before: int) -> None:
+        """The sums that no later state asks for."""
+        if before > self._start:
+            self._sums, self._start = self._sums[:, before - self._start :].copy(), before
+
+
+def _numbers(seconds: Float64, period: float) -> Float64:
+    """The number (T,) of each state since the first, lost ones counted.
+
+    A clock that ticks with the period follows the stamps slowly, so that jitter of almost half a period
+    is not taken for a loss.
+    """
+    numbers = np.zeros(len(seconds))
+    clock, number = 0.0, 0
+    for first, last in ranges(len(seconds)):
+        block: list[int] = []
+        for second in seconds[first:last].tolist():
+            ticks = max(round((second - clock) / period), 1) if first or block else 0
+            number += ticks
+            clock += ticks * period
+            clock += fixed.STATES_CLOCK_GAIN * (second - clock)
+            block.append(number)
+        numbers[first:last] = block
+    return numbers
+
+
+def differentiated(stamp_ns: Stamps, position: Float64) -> Float64:
+    """Velocities (T, J) [1/s] of positions (T, J) at rising stamps (T,) [ns].
+
+    The slope, at each state, of the parabola through it and its two neighbours on either side (a Savitzky-Golay
+    derivative for uneven steps), on the smoothed clock; nothing is fitted across a gap. A state alone has velocity 0.
+    """
+    return np.concatenate([np.zeros((0, *position.shape[1:])), *(v for _, v in slopes_by_block(stamp_ns, position))])
+
+
+def slopes_by_block(stamp_ns: Stamps, position: Table) -> Iterator[tuple[int, Float64]]:
+    """`differentiated` a block at a time: the first state of each and the velocities (K, J) there."""
+    for start, end in pairwise([0, *(gaps_of(stamp_ns) + 1).tolist(), len(stamp_ns)]):
+        if end - start == 1:
+            yield start, np.zeros((1, *position.shape[1:]))
+            continue
+        seconds = smoothed_seconds(stamp_ns[start:end])
+        size = min(2 * fixed.STATES_POSITION_SAMPLES + 1, end - start)
+        for first, last in ranges(end - start):
+            low, high = max(min(first - size // 2, end - start - size), 0), min(last + size // 2, end - start)
+            high = max(high, min(low + size, end - start))
+            slopes = _slopes(seconds[low:high], position[start + low : start + high])
+            yield start + first, slopes[first - low : last - low]
+
+
+def _slopes(seconds: Float64, position: Float64) -> Float64:
+    size = min(2 * fixed.STATES_POSITION_SAMPLES + 1, len(seconds))
+    starts = np.clip(np.arange(len(seconds)) - size // 2, 0, len(seconds) - size)
+    since = sliding_window_view(seconds, size)[starts] - seconds[:, None]  # (T, size)
+    scale = np.ptp(since, axis=1, keepdims=True)
+    design = (since / scale)[..., None] ** np.arange(min(size, 3))  # (T, size, coefficients of the parabola)
+    weights = np.linalg.pinv(design)[:, 1, :] / scale  # of the slope at the state itself
+    windows = sliding_window_view(position, size, axis=0)[starts]  # (T, J, size)
+    return np.asarray(np.einsum("ts,tjs->tj", weights, windows))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawTrack(StateColumns):
+    """Joint states as recorded, in file order; velocity is NaN where absent.
+
+    where: what to call it in a message (a topic, a file).
+    """
+
+    where: str
+    names: tuple[str, ...]
+
+    def of_names(self, names: Sequence[str]) -> "RawTrack":
+        """The columns of these joints, in that order."""
+        order = np.array([self.names.index(name) for name in names], dtype=np.int64)
+        return replace(self.of_joints(order), names=tuple(names))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Velocities:
+    """What is known of T velocities: is_missing, is_zero (J,) for joints that have none, or that move at zero;
+    num_missing: states without one of a joint, num_taken: states in which one has to be taken from the positions.
+    """
+
+    is_missing: Bool
+    is_all_missing: bool
+    is_zero: Bool
+    num_missing: int
+    num_taken: int
+
+
+def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
+    """The states by stamp, each stamp once, each with velocities; every change is noted in `loss`.
+
+    States with a position that is not finite are damage and left out; of states with one stamp the first is kept;
+    velocities that are absent, NaN, or zero throughout for a joint that moves, are differences of the positions.
+    """
+    ordered = unwrapped(_in_order(_finite(raw, loss), loss), loss)
+    gaps = gaps_of(ordered.stamp_ns)
+    if len(gaps):
+        longest = float(np.max(np.diff(ordered.stamp_ns)[gaps])) * 1e-9
+        loss.state_gaps += len(gaps)
+        loss.notes.append(f"{raw.where}: {len(gaps)} gaps between states, the longest {longest:.3f} s")
+    num = len(ordered.stamp_ns)
+    velocity = _with_velocity(ordered, loss) if num else ordered.velocity
+    num_without = num - _num_posed(ordered)
+    if 0 < num_without < num:
+        loss.notes.append(f"{raw.where}: {num_without} of {num} states have no valid end-effector pose")
+    return replace(ordered, velocity=velocity)
+
+
+def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
+    """Remove steps of a whole turn between states, as from pi to -pi. The states are in time order."""
+    position, file = raw.position, RowFile(raw.position.shape[1:])
+    turns: Float64 = np.zeros(position.shape[1])
+    is_close = np.diff(raw.stamp_ns) * 1e-9 <= fixed.STATES_BRIDGED
+    num = np.zeros(len(turns), dtype=np.int64)
+    last: Float64 | None = None
+    for first, end in ranges(len(position)):
+        block = position[first:end]
+        steps = np.diff(block if last is None else np.vstack([last, block]), axis=0)
+        is_wrap = (np.abs(steps) > fixed.STATES_WRAP) & (np.abs(steps) < 4 * np.pi - fixed.STATES_WRAP)
+        is_wrap &= is_close[end - 1 - len(steps) : end - 1, None]
+        num += is_wrap.sum(axis=0)
+        added = -2 * np.pi * np.cumsum(np.where(is_wrap, np.sign(steps), 0.0), axis=0) + turns
+        added = added if last is not None else np.vstack([turns, added])
+        file.append(block + added)
+        turns, last = added[-1], block[-1]
+    if not num.any():
+        return raw
+    names = ", ".join(name for name, count in zip(raw.names, num, strict=True) if count)
+    loss.notes.append(f"{raw.where}: {names}: {int(num.sum())} steps of a whole turn between states are taken out")
+    return replace(raw, position=Rows(file))
+
+
+def _num_posed(raw: RawTrack) -> int:
+    """States with an end-effector pose."""
+    num = 0
+    for first, last in ranges(len(raw.stamp_ns)):
+        there = np.zeros(last - first, dtype=np.bool_)
+        for poses in (raw.T_base_ee, raw.T_world_ee):
+            if poses is not None:
+                there |= np.isfinite(poses[first:last]).all(axis=(1, 2))
+        num += int(there.sum())
+    return num
+
+
+def _finite(raw: RawTrack, loss: LossReport) -> RawTrack:
+    is_finite = np.zeros(len(raw.stamp_ns), dtype=np.bool_)
+    for first, last in ranges(len(is_finite)):
+        is_finite[first:last] = np.isfinite(raw.position[first:last]).all(axis=1)
+    num_broken = int((~is_finite).sum())
+    if not num_broken:
+        return raw
+    loss.damaged += num_broken
+    loss.notes.append(f"{raw.where}: {num_broken} states with NaN or infinity: left out")
+    return raw.select(np.flatnonzero(is_finite))
+
+
+def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
+    num_back = int((np.diff(raw.stamp_ns) < 0).sum())
+    if num_back:
+        loss.unsorted_states += num_back
+        loss.notes.append(f"{raw.where}: stamps go back at {num_back} of {len(raw.stamp_ns)} states: sorted")
+        raw = raw.select(np.argsort(raw.stamp_ns, kind="stable"))
+    is_again = np.concatenate([[False], np.diff(raw.stamp_ns) == 0])[: len(raw.stamp_ns)]
+    num_again = int(is_again.sum())
+    if not num_again:
+        return raw
+    again, num_other = np.flatnonzero(is_again), 0
+    for first, last in ranges(num_again):
+        part = again[first:last]
+        differs = np.abs(raw.position[part] - raw.position[part - 1]).max(axis=1) > fixed.STATES_CONFLICT
+        num_other += int(differs.sum())
+    loss.duplicate_states += num_again
+    loss.conflicting_states += num_other
+    more = f", {num_other} of them with other positions" if num_other else ""
+    loss.notes.append(f"{raw.where}: {num_again} states repeat a stamp{more}: the first of each is kept")
+    return raw.select(np.flatnonzero(~is_again))
+
+
+def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
+    """velocity (T, J) with what is missing taken from the positions."""
+    found = _looked_at(raw)
+    if not found.num_taken:
+        thinned = raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // fixed.STATES_COMPARED))
+        _compare_units(thinned, loss)
+        return raw.velocity
+    loss.differentiated_velocities += found.num_taken
+    loss.notes.append(f"{raw.where}: {_reason(raw, found)}; they are differences of the positions")
+    whole = RowFile(raw.velocity.shape[1:])
+    for first, slopes in slopes_by_block(raw.stamp_ns, raw.position):
+        logged = raw.velocity[first : first + len(slopes)]
+        whole.append(np.where(~np.isfinite(logged) | found.is_zero, slopes, logged))
+    return Rows(whole)
+
+
+def _looked_at(raw: RawTrack) -> _Velocities:
+    num, num_joints = raw.position.shape[:2]
+    low, high = np.full(num_joints, np.inf), np.full(num_joints, -np.inf)
+    is_still, is_missing, is_there = (np.full(num_joints, first) for first in (True, False, False))
+    num_missing = 0
+    for first, last in ranges(num):
+        position, velocity = raw.position[first:last], raw.velocity[first:last]
+        missing = ~np.isfinite(velocity)
+        low, high = np.minimum(low, position.min(axis=0)), np.maximum(high, position.max(axis=0))
+        is_still &= (np.where(missing, 0.0, velocity) == 0).all(axis=0)
+        is_missing |= missing.any(axis=0)
+        is_there |= ~missing.all(axis=0)
+        num_missing += int(missing.any(axis=1).sum())
+    is_zero = np.asarray(is_still & is_there & (high - low > fixed.STATES_STILL))
+    return _Velocities(
+        is_missing=is_missing,
+        is_all_missing=not is_there.any(),
+        is_zero=is_zero,
+        num_missing=num_missing,
+        num_taken=num if is_zero.any() else num_missing,
+    )
+
+
+def _reason(raw: RawTrack, found: _Velocities) -> str:
+    if found.is_all_missing:
+        return "no velocities recorded"
+    if found.is_zero.any():
+        joints = ", ".join(name for name, zero in zip(raw.names, found.is_zero, strict=True) if zero)
+        return f"velocities of {joints} are zero throughout although they move"
+    joints = ", ".join(name for name, missing in zip(raw.names, found.is_missing, strict=True) if missing)
+    return f"velocities of {joints} are missing or NaN in {found.num_missing} states"
+
+
+def _compare_units(raw: RawTrack, loss: LossReport) -> None:
+    """Of states that are few enough to be read at once."""
+    position, velocity = raw.position[: len(raw.stamp_ns)], raw.velocity[: len(raw.stamp_ns)]
+    slopes: Float64 = differentiated(raw.stamp_ns, position)
+    is_fast = np.abs(slopes) > fixed.STATES_SPEED
+    if is_fast.sum() < 10:
+        return
+    ratio = float(np.median(np.abs(velocity[is_fast])) / np.median(np.abs(slopes[is_fast])))
+    if not 1 / fixed.STATES_SPEED_RATIO < ratio < fixed.STATES_SPEED_RATIO:
+        loss.notes.append(
+            f"{raw.where}: logged velocities are {ratio:.3g} times the change of the positions: other units, "
+            "or stamps of another rate"
+        )

@@ -1,0 +1,301 @@
+"""What `ingest` keeps as its source stored it: frames, lossless without decoding them, and joint states by topic.
+
+Joint states of a log's topics are kept as recorded, so that any joints can be asked for: joint_topics/K/stamp_ns.npy,
+log_time_ns.npy (T,) int64; position.npy, and where there are any velocity.npy, commanded_velocity.npy (T, J),
+T_base_ee.npy (T, 4, 4) float64; what K is stands in capture.json.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from math import prod
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_DEPTH
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import npy_head, npy_of
+from splatctrl_cli.files.image_file import JPEG, PNG
+from splatctrl_cli.files.spilled_rows import Rows, blocks_of, ranges
+from splatctrl_cli.recording.container.raw_log import RawMessage, Topic
+from splatctrl_cli.recording.log.decoder import UndecodableMessageError
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.recording.log.state_messages import STATE_TYPES, JointLog, JointStream
+from splatctrl_cli.recording.log.state_topics import joint_records
+from splatctrl_cli.recording.log.survey import Survey, TopicSurvey
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import (
+    Bool,
+    Float32,
+    Float64,
+    Intrinsics,
+    JointState,
+    LossReport,
+    Record,
+    RecordSource,
+    RgbdFrame,
+    UInt8,
+)
+
+FOLDER = "joint_topics"
+AGAIN = "run `splatctrl ingest` again"
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointTopics:
+    """The topics with joint states, what became of them (`loss`, its notes from number `first_note` of the whole
+    report on), and the topic that somebody chose.
+    """
+
+    topics: Sequence[TopicSurvey]
+    loss: LossReport
+    first_note: int
+    chosen: str | None = None
+
+
+def topics_of(found: Survey, loss: LossReport, first_note: int, options: SourceOptions) -> JointTopics:
+    """Those of a log."""
+    topics = found.of_type(*STATE_TYPES)
+    return JointTopics(topics=topics, loss=loss, first_note=first_note, chosen=options.joint_topic)
+
+
+def with_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
+    """A report with that of the joint states, its notes from number `at` on."""
+    return loss.plus(joints, [*loss.notes[:at], *joints.notes, *loss.notes[at:]])
+
+
+def without_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
+    """The reverse of `with_joints`."""
+    return loss.plus(joints, [*loss.notes[:at], *loss.notes[at + len(joints.notes) :]], sign=-1)
+
+
+def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) -> dict[str, Any]:
+    """Write the streams of all topics into a capture; `wrote` gets each file. Returns what capture.json says."""
+    described, number = [], 0
+    for topic in kept.topics:
+        streams = []
+        for stream in topic.joints.streams:
+            place = f"{FOLDER}/{number}"
+            (folder / place).mkdir(parents=True)
+            number += 1
+            times = {"stamp_ns": stream.stamp_ns, "log_time_ns": stream.log_time_ns}
+            for name, values in times.items():
+                np.save(folder / place / f"{name}.npy", values, allow_pickle=False)
+            columns = stream.columns()
+            for name, rows in columns.items():
+                _write_rows(folder / place / f"{name}.npy", rows)
+            for name in (*times, *columns):
+                wrote(f"{place}/{name}.npy")
+            streams.append({"folder": place, "joints": list(stream.names), "columns": list(columns)})
+        described.append(
+            {
+                "topic": topic.topic.name,
+                "type": topic.topic.type_name,
+                "messages": topic.count,
+                "has_definition": bool(topic.topic.definition),
+                "states": len(topic.joints),
+                "streams": streams,
+            }
+        )
+    loss = {"counts": asdict(kept.loss), "first_note": kept.first_note}
+    return {"topics": described, "chosen": kept.chosen, "loss": loss}
+
+
+def read_topics(folder: Path, described: Mapping[str, Any], checked: Callable[[str], Path]) -> JointTopics:
+    """What `write_topics` wrote. `checked` gives the path of a file whose checksum is right.
+
+    Raises InputError where a file is not as it was written.
+    """
+    try:
+        topics = [_topic(entry, checked) for entry in described["topics"]]
+        loss = LossReport(**described["loss"]["counts"])
+        first_note, chosen = int(described["loss"]["first_note"]), described["chosen"]
+    except (KeyError, TypeError, ValueError, OSError, EOFError) as error:
+        raise InputError(f"{folder / FOLDER}: cannot be read: {error}", remedy=AGAIN) from None
+    return JointTopics(topics=topics, loss=loss, first_note=first_note, chosen=chosen)
+
+
+def joints_again(
+    kept: JointTopics, options: SourceOptions, wanted: Sequence[str]
+) -> tuple[tuple[str, ...], StateColumns, LossReport]:
+    """Names and states of a robot's joints as the log itself would give them, and what became of the others."""
+    loss = LossReport()
+    found = Survey(topics={topic.topic.name: topic for topic in kept.topics})
+    chosen = options if options.joint_topic is not None else replace(options, joint_topic=kept.chosen)
+    names, states = joint_records(found, chosen, loss, wanted)
+    return names, states, loss
+
+
+def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSurvey:
+    streams = []
+    for stream in entry["streams"]:
+        place = stream["folder"]
+        stamps, log_times = (
+            np.asarray(npy_of(checked(f"{place}/{name}.npy").read_bytes()), dtype=np.int64)
+            for name in ("stamp_ns", "log_time_ns")
+        )
+        columns = {name: _blocks(checked(f"{place}/{name}.npy")) for name in stream["columns"]}
+        streams.append(JointStream.of(tuple(stream["joints"]), stamps, log_times, columns))
+    definition = "kept" if entry["has_definition"] else ""
+    topic = Topic(name=entry["topic"], type_name=entry["type"], encoding="cdr", definition=definition)
+    return TopicSurvey(topic=topic, count=int(entry["messages"]), joints=JointLog.of(int(entry["states"]), streams))
+
+
+def _write_rows(path: Path, rows: Rows) -> None:
+    """A .npy file, a block at a time."""
+    with path.open("wb") as stream:
+        np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": rows.shape})
+        for block in blocks_of(rows):
+            stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())
+
+
+def _blocks(path: Path) -> Iterator[Float64]:
+    """Of a .npy file as `_write_rows` writes it. Raises ValueError for another."""
+    with path.open("rb") as stream:
+        shape, is_by_columns, dtype = npy_head(stream)
+        if dtype != np.dtype("<f8") or is_by_columns or not shape:
+            raise ValueError(f"{path.name}: expected rows of float64, got {dtype} {shape}")
+        if 8 * prod(shape) != path.stat().st_size - stream.tell():
+            raise ValueError(f"{path.name}: does not hold the {shape[0]} rows that it announces")
+        for first, last in ranges(shape[0]):
+            size = (last - first) * prod(shape[1:])
+            values = np.frombuffer(stream.read(8 * size), dtype)  # no map: a file that shrinks would kill the program
+            if values.size != size:
+                raise ValueError(f"{path.name}: ends after {first + values.size} of {shape[0]} rows")
+            yield values.reshape(last - first, *shape[1:])
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredFrame:
+    """A frame whose images are decoded when they are asked for, and how its source stored them: `ingest` keeps files.
+
+    read_color, read_depth: give the frame's color and depth, or raise UndecodableMessageError;
+    color_file: the bytes of a JPEG or PNG that decode to exactly the frame's color, None where there are none;
+    depth_file: those of a 16-bit PNG of which the depth is exactly ``counts * float32(depth_unit)``, or None;
+    depth_unit: [m] of which every depth is a uint16 multiple (``counts * float32(unit)``), None if there is none.
+    origin: where it came from, in words; places: the colour and the depth message without their bytes, empty where
+    there are none.
+    """
+
+    stamp_ns: int
+    camera: str
+    intrinsics: Intrinsics
+    T_world_camera: Float64
+    read_color: Callable[[], UInt8]
+    read_depth: Callable[[], Float32]
+    color_file: bytes | None
+    depth_unit: float | None
+    origin: str
+    human: UInt8 | None = None
+    valid: Bool | None = None
+    places: tuple[RawMessage, ...] = ()
+    depth_file: bytes | None = None
+
+    @cached_property
+    def color(self) -> UInt8:
+        """Of the frame. Raises InputError where the image does not decode."""
+        with self._refused():
+            return self.read_color()
+
+    @cached_property
+    def depth(self) -> Float32:
+        """Of the frame. Raises InputError where the image does not decode."""
+        with self._refused():
+            return self.read_depth()
+
+    @property
+    def frame(self) -> RgbdFrame:
+        """The frame, with both images decoded. Raises InputError where one does not."""
+        return RgbdFrame(
+            stamp_ns=self.stamp_ns,
+            camera=self.camera,
+            color=self.color,
+            depth=self.depth,
+            intrinsics=self.intrinsics,
+            T_world_camera=self.T_world_camera,
+            human=self.human,
+            valid=self.valid,
+        )
+
+    @contextmanager
+    def _refused(self) -> Iterator[None]:
+        try:
+            yield
+        except UndecodableMessageError as error:
+            raise InputError(f"{self.origin}: {error}", remedy="copy the recording again") from None
+
+
+class FrameSource(RecordSource, Protocol):
+    """A record source that also says how its frames were stored."""
+
+    @property
+    def world_frame(self) -> str:
+        """The frame of poses, as the source names it."""
+        ...
+
+    @property
+    def states(self) -> StateColumns:
+        """The joint states, by stamp, without a pass over the frames."""
+        ...
+
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        """As `records`, with the frames as they are stored."""
+        ...
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp, without its images."""
+        ...
+
+
+def is_kept(data: bytes | None) -> bool:
+    """Whether an image file's bytes are of a kind that captures hold: JPEG or PNG."""
+    return data is not None and data.startswith((JPEG, PNG))
+
+
+def is_png(data: bytes | None) -> bool:
+    """Whether these are the bytes of a PNG file."""
+    return data is not None and data.startswith(PNG)
+
+
+def decoded(items: Iterable[StoredFrame | JointState]) -> Iterator[Record]:
+    """The same records, their frames decoded."""
+    return (item.frame if isinstance(item, StoredFrame) else item for item in items)
+
+
+def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:
+    """(H, W) uint8, 1 where an image file or message is not 0. Raises InputError unless 8-bit grey, (H, W)."""
+    if pixels.dtype != np.uint8 or pixels.shape != (camera.height, camera.width):
+        size = "x".join(map(str, reversed(pixels.shape[:2])))
+        channels = pixels.shape[2] if pixels.ndim == 3 else 1
+        raise InputError(
+            f"{where}: expected an 8-bit grey mask of {camera.width}x{camera.height}, as the colour images,"
+            f" got {size} of {channels} channel(s), {pixels.dtype}",
+            remedy="write 0 where there is no person, anything else where there is one",
+        )
+    return np.asarray(pixels != 0, np.uint8)
+
+
+def check_depth(depth: Float32, where: str, scale: float) -> bool:
+    """Whether a depth image [m] holds any depth; raises InputError when its median is implausible.
+
+    `scale` [m per count] is what turned counts into metres.
+    """
+    valid = depth[depth > 0]
+    if valid.size == 0:
+        return False
+    median = float(np.median(valid))
+    low, high = PLAUSIBLE_DEPTH
+    if not low <= median <= high:
+        counts = median / scale
+        nearest, farthest = UNIT_DEPTH
+        fits = [s for s in (1e-3, 1e-4, 1.0, 1e-2, 1e-5, 1e-6) if nearest <= counts * s <= farthest]
+        remedy = f"give --depth-scale {fits[0]:g}" if fits else "give the right --depth-scale [m per count]"
+        raise InputError(
+            f"{where}: median depth {median:.4g} m is implausible (expected {low:g} to {high:g} m)",
+            remedy=f"is the depth scale {scale:g} m per count wrong? {remedy}",
+        )
+    return True

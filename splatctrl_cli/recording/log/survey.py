@@ -1,0 +1,423 @@
+"""A first pass over a log: topics, stamps, frames, calibrations, joints; of images the first of each topic. And the
+robot's model that a log itself brings: a latched topic ``robot_description``, or that parameter of a node.
+
+Images are paired by their stamps; those that came twice or not at all, and clocks that went back, are counted.
+"""
+
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config.fixed import IMAGES_BACK_NS, IMAGES_FEWEST, IMAGES_FEWEST_BACK, IMAGES_GAP, IMAGES_STEADY
+from splatctrl_cli.recording.container.mcap_log import LogIndex, McapLog
+from splatctrl_cli.recording.container.mcap_records import ChunkIndex
+from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.recording.log.decoder import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    OPTION,
+    TRANSFORM,
+    TRANSFORMS,
+    MessageDecoder,
+    RealSense,
+    UndecodableMessageError,
+    UnreadFormError,
+    header_stamp_ns,
+    is_ros,
+    stamp_ns,
+)
+from splatctrl_cli.recording.log.messages import ImageMessage, read_image
+from splatctrl_cli.recording.log.registration import TfTree
+from splatctrl_cli.recording.log.state_messages import STANDARD_TYPES, STATE_TYPES, JointLog, RawJoints, read_states
+from splatctrl_cli.recording.log.video import VideoLog
+from splatctrl_cli.records import Bool, Float64
+
+Stamps = Sequence[int] | NDArray[np.int64]
+_BLOCK = 1 << 14  # pairs that are Python's numbers at once
+
+
+def pair_by_stamp(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> list[tuple[int, int]]:
+    """`paired` as a list of (colour, depth)."""
+    return [(i, j) for i, j in paired(color_ns, depth_ns, tolerance_ns).tolist()]
+
+
+def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.int64]:
+    """Index pairs (K, 2) of colour and depth at most `tolerance_ns` apart, each index once, the closest pairs first.
+
+    Returned by colour stamp. Of equally close pairs the earlier one wins.
+    """
+    color, depth = np.asarray(color_ns, dtype=np.int64), np.asarray(depth_ns, dtype=np.int64)
+    order = np.argsort(depth, kind="stable")
+    first = np.searchsorted(depth[order], color - tolerance_ns, side="left")
+    count = np.searchsorted(depth[order], color + tolerance_ns, side="right") - first
+    i = np.repeat(np.arange(len(color)), count)  # every pair that is close enough
+    j = order[np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)]
+    closest = np.lexsort((j, i, depth[j], color[i], np.abs(color[i] - depth[j])))
+    partner = np.full(len(color), -1, dtype=np.int64)
+    is_free = np.ones(len(depth), dtype=np.bool_)
+    for start in range(0, len(closest), _BLOCK):
+        block = closest[start : start + _BLOCK]
+        for a, b in zip(i[block].tolist(), j[block].tolist(), strict=True):
+            if is_free[b] and partner[a] < 0:
+                is_free[b], partner[a] = False, b
+    found = np.flatnonzero(partner >= 0)
+    found = found[np.argsort(color[found], kind="stable")]
+    return np.stack([found, partner[found]], axis=1)
+
+
+@dataclass(kw_only=True)
+class StampClock:
+    """Whether the clock of a topic's headers went back while the recording went on: a bag in a loop, a reset.
+
+    num_back: stamps more than a second behind one that was logged before them; back_ns: the first one's distance,
+    seen at log time back_log_ns.
+    """
+
+    num_back: int = 0
+    back_ns: int = 0
+    back_log_ns: int = 0
+    _latest_ns: int | None = None
+    _latest_log_ns: int = 0
+
+    def see(self, stamp_ns: int, log_time_ns: int) -> None:
+        """The next message in the order of the file."""
+        if self._latest_ns is None or stamp_ns > self._latest_ns:
+            self._latest_ns, self._latest_log_ns = stamp_ns, log_time_ns
+        elif self._latest_ns - stamp_ns > IMAGES_BACK_NS and log_time_ns > self._latest_log_ns:
+            if not self.num_back:
+                self.back_ns, self.back_log_ns = self._latest_ns - stamp_ns, log_time_ns
+            self.num_back += 1
+
+    @property
+    def went_back(self) -> bool:
+        """Whether it did: a stamp or two may be wrong by themselves."""
+        return self.num_back >= IMAGES_FEWEST_BACK
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drops:
+    """Gaps of a topic of steady rate: how many, the images missing in them, and the period [ns]."""
+
+    num_gaps: int
+    num_images: int
+    period_ns: float
+
+
+def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
+    """Numbers (K,) of the images whose stamp none before them has."""
+    return np.sort(np.unique(stamps_ns, return_index=True)[1]).astype(np.int64)
+
+
+def dropped(stamps_ns: Stamps) -> Drops:
+    """What is missing between different stamps; nothing where there are few, or most intervals differ.
+
+    The period is the median interval, and steady within a quarter of it must be three intervals of four.
+    """
+    intervals = np.diff(np.unique(stamps_ns)).astype(np.float64)
+    if len(intervals) < IMAGES_FEWEST:
+        return Drops(num_gaps=0, num_images=0, period_ns=0.0)
+    period = float(np.median(intervals))
+    is_steady = np.abs(intervals - period) <= IMAGES_STEADY * period
+    gaps = intervals[intervals > IMAGES_GAP * period]
+    if is_steady.mean() < 0.75:
+        gaps = gaps[:0]
+    return Drops(num_gaps=len(gaps), num_images=int((np.rint(gaps / period) - 1).sum()), period_ns=period)
+
+
+LARGE = 1 << 30  # bytes from which on an MCAP is described by its index
+_MOST_BYTES = 64 << 20  # of chunks that are unpacked
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """What a CameraInfo says: size [px], K (3, 3) of the raw image with its distortion, projection (3, 3) of the
+    rectified image (the left part of P; zero where unset), rotation (3, 3) from the raw camera's axes to those of the
+    rectified (zero where unset), frame. valid (H, W): of a rectified image, False where the lens did not see a pixel.
+
+    Of images that are binned or cut out, these are theirs and sensor_K (3, 3) is that of the whole sensor; cut says
+    how in words ("" where they are whole), is_possible whether the region lies inside the sensor.
+    """
+
+    width: int
+    height: int
+    K: Float64
+    projection: Float64
+    rotation: Float64
+    distortion_model: str
+    distortion: Float64
+    frame_id: str
+    valid: Bool | None = None
+    sensor_K: Float64 = field(default_factory=lambda: np.zeros((3, 3)))
+    cut: str = ""
+    is_possible: bool = True
+
+
+@dataclass(kw_only=True)
+class TopicSurvey:
+    """What a log holds of one topic; stamps_ns and clock (image topics only) are of the headers in file order."""
+
+    topic: Topic
+    count: int = 0
+    first_log_ns: int = 0
+    last_log_ns: int = 0
+    stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    clock: StampClock = field(default_factory=StampClock)
+    first_image: ImageMessage | None = None
+    calibration: Calibration | None = None
+    joints: JointLog = field(default_factory=JointLog)
+
+    @property
+    def image(self) -> ImageMessage:
+        """The first image, of a topic that is known to have one."""
+        assert self.first_image is not None
+        return self.first_image
+
+
+@dataclass(kw_only=True)
+class Survey:
+    """Everything of a log but its images; by_log_time: stamps are the times of logging, not those of headers."""
+
+    by_log_time: bool = False
+    topics: dict[str, TopicSurvey] = field(default_factory=dict)
+    tf: TfTree = field(default_factory=TfTree)
+    realsense: RealSense = field(default_factory=RealSense)
+    damage: Damage = field(default_factory=Damage)
+
+    @property
+    def num_messages(self) -> int:
+        """Messages of all topics."""
+        return sum(topic.count for topic in self.topics.values())
+
+    def of_type(self, *types: str) -> list[TopicSurvey]:
+        """Topics of these types that hold messages, by name."""
+        found = [t for t in self.topics.values() if t.topic.type_name in types and t.count and is_ros(t.topic)]
+        return sorted(found, key=lambda t: t.topic.name)
+
+
+def survey(log: RawLog, *, by_log_time: bool = False) -> Survey:
+    """Read `log` once; a message that does not decode is counted as damage.
+
+    by_log_time: take the times of logging for the stamps of images, transforms and joint states.
+    """
+    result = Survey(by_log_time=by_log_time)
+    decoder = MessageDecoder()
+    for topic in log.topics():
+        result.topics.setdefault(topic.name, TopicSurvey(topic=topic))
+    for message in log.messages(result.damage):
+        add_message(result, decoder, message)
+    return result
+
+
+def add_message(result: Survey, decoder: MessageDecoder, message: RawMessage) -> None:
+    """Count one message, and take from it what a survey keeps."""
+    entry = result.topics.setdefault(message.topic.name, TopicSurvey(topic=message.topic))
+    if entry.count == 0:
+        entry.topic = message.topic
+        entry.first_log_ns = entry.last_log_ns = message.log_time_ns
+    entry.count += 1
+    entry.first_log_ns = min(entry.first_log_ns, message.log_time_ns)
+    entry.last_log_ns = max(entry.last_log_ns, message.log_time_ns)
+    if is_ros(message.topic):
+        try:
+            _take(result, entry, decoder, message)
+        except UnreadFormError as error:
+            name = message.topic.name
+            result.damage.remark(str(error) if str(error).startswith(name) else f"{name}: {error}")
+        except (UndecodableMessageError, ValueError) as error:
+            result.damage.add(str(error))
+        except OverflowError:
+            result.damage.add(f"{message.topic.name}: a time beyond 2^63 ns")
+        except AttributeError as error:  # a definition of a known name with other fields
+            result.damage.remark(f"{message.topic.name}: a {message.topic.type_name} of another definition: {error}")
+
+
+def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: RawMessage) -> None:
+    kind = message.topic.type_name
+    if kind in {IMAGE, COMPRESSED_IMAGE}:
+        entry.stamps_ns.append(-1)  # every image has its place, also one that does not decode
+        entry.stamps_ns[-1] = message.log_time_ns if result.by_log_time else header_stamp_ns(message)
+        entry.clock.see(entry.stamps_ns[-1], message.log_time_ns)
+        result.realsense.add_image(message)
+        if entry.first_image is None:
+            entry.first_image = read_image(decoder.decode(message), kind)
+            if entry.first_image.remark:
+                result.damage.remark(f"{message.topic.name}: {entry.first_image.remark}")
+    elif kind == CAMERA_INFO and entry.calibration is None:
+        entry.calibration = _calibration(decoder.decode(message))
+        if entry.calibration is not None and entry.calibration.cut and entry.calibration.is_possible:
+            result.damage.remark(f"{message.topic.name}: says {entry.calibration.cut}: K is moved and scaled to that")
+    elif kind in STATE_TYPES and (message.topic.definition or kind in STANDARD_TYPES):
+        entry.joints.extend(_states(result, decoder.decode(message), message))
+    elif kind in {TRANSFORM, OPTION} and message.topic.name.startswith("/device_"):
+        result.realsense.add(message.topic.name, decoder.decode(message))
+    elif kind in TRANSFORMS:
+        is_static = message.topic.name.endswith("tf_static")
+        holds = message.topic.schema != ""  # Foxglove has no static transforms: one that comes once holds always
+        log_time_ns = message.log_time_ns if result.by_log_time else None
+        _add_transforms(result.tf, decoder.decode(message), log_time_ns, static=is_static, holds=holds)
+
+
+def _calibration(message: Any) -> Calibration | None:
+    fields = {name.lower(): value for name, value in vars(message).items()}
+    K = np.asarray(fields["k"], dtype=np.float64).reshape(3, 3)
+    if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        return None  # an uncalibrated driver publishes zeros
+    calibration = Calibration(
+        width=int(message.width),
+        height=int(message.height),
+        K=K,
+        projection=np.asarray(fields["p"], dtype=np.float64).reshape(3, 4)[:, :3],
+        rotation=np.asarray(fields["r"], dtype=np.float64).reshape(3, 3),
+        distortion_model=str(message.distortion_model),
+        distortion=np.asarray(fields["d"], dtype=np.float64),
+        frame_id=message.header.frame_id.strip("/"),
+        sensor_K=K,
+    )
+    return _cut(calibration, message)
+
+
+def _cut(whole: Calibration, message: Any) -> Calibration:
+    """The camera of images that are binned or cut out of those of the whole sensor, as image_geometry takes it: moved
+    by the region's corner, then divided by the binning.
+    """
+    across, down = (max(1, int(getattr(message, name, 0))) for name in ("binning_x", "binning_y"))
+    roi, size = getattr(message, "roi", None), (whole.width, whole.height)
+    x, y, width, height = (int(getattr(roi, name, 0)) for name in ("x_offset", "y_offset", "width", "height"))
+    is_whole = not any((x, y, width, height)) or (x, y, width, height) == (0, 0, *size)
+    if is_whole and across == down == 1:
+        return whole
+    width, height = size if is_whole else (width, height)
+    region = "" if is_whole else f"region of {width}x{height} at ({x}, {y}) of {size[0]}x{size[1]}"
+    binning = f"binning {across}x{down} of {size[0]}x{size[1]}" if across * down > 1 else ""
+    A = np.array([[1 / across, 0, -x / across], [0, 1 / down, -y / down], [0, 0, 1]])
+    return replace(
+        whole,
+        width=width // across,
+        height=height // down,
+        K=A @ whole.K,
+        projection=A @ whole.projection,
+        cut=", ".join(filter(None, (region, binning))),
+        is_possible=width > 0 and height > 0 and x + width <= size[0] and y + height <= size[1],
+    )
+
+
+def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints]:
+    """Joint states; by log time all of a message move with its stamp."""
+    states = read_states(decoded, message.topic.type_name, message.log_time_ns)
+    if not result.by_log_time:
+        return states
+    late_ns = message.log_time_ns - stamp_ns(decoded.header)
+    return [replace(state, stamp_ns=state.stamp_ns + late_ns) for state in states]
+
+
+def _add_transforms(tree: TfTree, message: Any, log_time_ns: int | None, *, static: bool, holds: bool) -> None:
+    for item in message.transforms:
+        t, r = item.transform.translation, item.transform.rotation
+        tree.add(
+            item.header.frame_id,
+            item.child_frame_id,
+            stamp_ns(item.header) if log_time_ns is None else log_time_ns,
+            np.array([t.x, t.y, t.z], dtype=np.float64),
+            np.array([r.x, r.y, r.z, r.w], dtype=np.float64),
+            static=static,
+            holds=holds,
+        )
+
+
+def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
+    """A survey of the whole log; of a large MCAP one by its index, and notes that say so."""
+    size = sum(file.stat().st_size for file in log.files)
+    inner, video = (log.inner, log) if isinstance(log, VideoLog) else (log, None)
+    if size < LARGE or not isinstance(inner, McapLog):
+        return survey(log), ()
+    index = inner.index()
+    found = _sampled(inner, index, video)
+    how = f"{size} bytes: described by index and first messages; neither checksums nor the rest were read"
+    return found, (*index.notes, how)
+
+
+def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:
+    found, decoder = Survey(), MessageDecoder()
+    chunks = _first_chunks(index)
+    messages = log.messages_of(chunks, found.damage) if chunks else islice(log.messages(Damage()), 2000)
+    messages = messages if video is None else video.decoded(messages, Damage())  # others lie between these chunks
+    for message in messages:
+        add_message(found, decoder, message)
+    for topic in log.topics():
+        found.topics.setdefault(topic.name, TopicSurvey(topic=topic))
+    for entry in found.topics.values():
+        entry.count = 0
+    for channel, count in index.counts.items():
+        counted = log.topic_of(channel)
+        if counted is not None:
+            entry = found.topics[counted.name]
+            entry.count += count
+            entry.first_log_ns = entry.first_log_ns or index.first_ns
+            entry.last_log_ns = index.last_ns
+    return found
+
+
+def _first_chunks(index: LogIndex) -> list[ChunkIndex]:
+    """The first chunk of each channel, and the first ones of the file, within bounds."""
+    wanted = {chunk.chunk_start_offset: chunk for chunk in index.chunks[:4]}
+    for channel in sorted(index.counts):
+        first = next((c for c in index.chunks if channel in c.message_index_offsets), None)
+        if first is not None:
+            wanted[first.chunk_start_offset] = first
+    chosen: list[ChunkIndex] = []
+    size = 0
+    for _, chunk in sorted(wanted.items())[:24]:
+        size += max(chunk.uncompressed_size, chunk.compressed_size)
+        if size <= _MOST_BYTES or not chosen:
+            chosen.append(chunk)
+    return chosen
+
+
+NAME, EVENTS = "robot_description", "/parameter_events"
+STRING, EVENT = "std_msgs/msg/String", "rcl_interfaces/msg/ParameterEvent"
+_TEXT = 4  # a parameter's type that is text (rcl_interfaces/ParameterType)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotDescription:
+    """The text of a URDF, and the topic or node whose parameter it is."""
+
+    where: str
+    text: str
+
+
+def robot_descriptions(log: RawLog) -> list[RobotDescription]:
+    """Those of a log, each text once; of a topic the first message. The topics that have them are read, no others."""
+    topics = log.topics()
+    own = {t.name for t in topics if t.type_name == STRING and t.name.rpartition("/")[2] == NAME}
+    wanted = own or {t.name for t in topics if t.type_name == EVENT}
+    if not topics:  # no index
+        wanted = {f"/{NAME}", EVENTS}
+    found: dict[str, str] = {}
+    decoder = MessageDecoder()
+    for message in log.messages(Damage(), wanted) if wanted else ():
+        try:
+            said = decoder.decode(message)
+        except UndecodableMessageError:
+            continue  # the survey counts it
+        if message.topic.type_name == STRING:
+            found.setdefault(message.topic.name, str(said.data))
+        elif message.topic.type_name == EVENT:
+            found.update(_parameters(said))
+        if own and own <= found.keys():
+            break
+    where = {text: name for name, text in reversed(found.items()) if text.strip()}
+    return [RobotDescription(where=name, text=text) for text, name in reversed(where.items())]
+
+
+def _parameters(event: Any) -> Iterator[tuple[str, str]]:
+    """Node and text of the parameters of that name that an event sets."""
+    for parameter in (*event.new_parameters, *event.changed_parameters):
+        if parameter.name == NAME and parameter.value.type == _TEXT:
+            yield str(event.node), str(parameter.value.string_value)

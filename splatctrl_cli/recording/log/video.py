@@ -1,0 +1,295 @@
+"""Compressed video in a log, decoded as its messages pass by: each image takes the place of its message; or in a file
+beside a log, with the stamps of its images in a file of its own, which is read as a log of one colour topic.
+
+Read are H.264 and H.265 of foxglove.CompressedVideo (Annex B, an image a message; docs.foxglove.dev, CompressedVideo)
+and of ffmpeg_image_transport's FFMPEGPacket. An image needs those before it, back to a key frame: what has no key
+frame before it, or follows an image that is missing, is left out up to the next key frame, and counted. FFmpeg itself
+would show such images, with wrong blocks in them; by what it says of a packet a missing one is told.
+"""
+
+import re
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.libraries import is_installed, of_extra
+from splatctrl_cli.recording.container.foreign import AZURE_KINECT, refuse_foreign
+from splatctrl_cli.recording.container.log_formats import open_raw_log
+from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.recording.log.decoder import IMAGE, VIDEO, MessageDecoder, UndecodableMessageError, pack_image
+from splatctrl_cli.records import SECOND_NS, Stamps
+
+LIBRARY, EXTRA = "av", "video"
+CODECS = {"264": "h264", "265": "hevc", "hevc": "hevc"}  # by what a format's name holds
+FORMATS = {  # the field that names the format, by the type of message
+    "foxglove_msgs/msg/CompressedVideo": "format",
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": "encoding",
+}
+_GAP = "Frame num gap"  # FFmpeg says this of H.264 for its developers only
+KEY_FRAME = "key frame"  # in every note on what was lost
+OFTENER = "record a key frame every second, or cut the log at one"
+_EARLY, _LATE = f"before its first {KEY_FRAME}", f"that follow missing or damaged ones, up to the next {KEY_FRAME},"
+
+
+def is_video(topic: Topic) -> bool:
+    """Whether a topic's messages are packets of video."""
+    return topic.type_name in FORMATS
+
+
+@dataclass(kw_only=True)
+class _Stream:
+    """One topic's decoder: how many packets it had, those that wait for their image (message without data, header) by
+    number, the last key frame, packets since then at which something was missing, images lost before and after it.
+    """
+
+    context: Any
+    num: int = 0
+    waiting: dict[int, tuple[RawMessage, Any]] = field(default_factory=dict)
+    key: int | None = None
+    broken: list[int] = field(default_factory=list)
+    num_early: int = 0
+    num_late: int = 0
+
+
+class VideoLog:
+    """A log with the images of its video."""
+
+    def __init__(self, log: RawLog) -> None:
+        self.inner = log
+        self.path, self.files, self.container = log.path, log.files, log.container
+
+    def topics(self) -> tuple[Topic, ...]:
+        """Of the log, those of video as they are decoded."""
+        return tuple(map(_decoded_topic, self.inner.topics()))
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Yield the log's messages, images of video as they come out of the decoder."""
+        return self.decoded(self.inner.messages(damage, names), damage)
+
+    def decoded(self, messages: Iterable[RawMessage], damage: Damage) -> Iterator[RawMessage]:
+        """Some messages of the log, in its order."""
+        streams: dict[str, _Stream | None] = {}
+        decoder = MessageDecoder()
+        for message in messages:
+            if not is_video(message.topic):
+                yield message
+                continue
+            try:
+                packet = decoder.decode(message)
+            except UndecodableMessageError as error:
+                damage.add(str(error))
+                continue
+            name = message.topic.name
+            if name not in streams:
+                streams[name] = _stream(getattr(packet, FORMATS[message.topic.type_name]))
+            stream = streams[name]
+            if stream is None:  # no codec that is read
+                yield message
+                continue
+            yield from _pushed(stream, message, packet)
+        for name, stream in streams.items():
+            if stream is not None:
+                yield from _images(stream, None)
+                _count(name, stream, damage)
+
+
+def with_video(log: RawLog) -> RawLog:
+    """The log, with the images of its video where it has any and the library is installed."""
+    topics = log.topics()  # none where there is no index
+    has_video = any(map(is_video, topics)) or not topics
+    return VideoLog(log) if has_video and is_installed(LIBRARY) else log
+
+
+def _stream(name: str) -> _Stream | None:
+    codec = next((codec for word, codec in CODECS.items() if word in name.lower()), None)
+    if codec is None:
+        return None
+    context = of_extra(LIBRARY, EXTRA, "video topics").CodecContext.create(codec, "r")
+    context.thread_count = 1
+    return _Stream(context=context)
+
+
+def _decoded_topic(topic: Topic) -> Topic:
+    return replace(topic, type_name=IMAGE, encoding=VIDEO, schema=topic.schema or topic.type_name, definition="")
+
+
+def _pushed(stream: _Stream, message: RawMessage, packet: Any) -> Iterator[RawMessage]:
+    """The images that a packet lets out: its own, or earlier ones of a stream that reorders."""
+    number, header = stream.num, packet.header
+    stream.num += 1
+    stream.waiting[number] = replace(message, data=b""), header
+    yield from _images(stream, bytes(packet.data), number)
+
+
+def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[RawMessage]:
+    """Whole images as messages, by the number of the packet that they came in; without data, the rest of them."""
+    frames, is_broken = _decode(stream.context, data, number)
+    if is_broken:
+        stream.broken.append(number)
+    for frame in frames:
+        if frame.is_corrupt:
+            stream.broken.append(frame.pts)
+        if frame.key_frame:
+            _lose(stream, [other for other in stream.waiting if other < frame.pts])
+            stream.key = frame.pts
+            stream.broken = [other for other in stream.broken if other >= frame.pts]
+        if frame.pts not in stream.waiting:
+            continue
+        if stream.key is None or any(stream.key <= other <= frame.pts for other in stream.broken):
+            _lose(stream, [frame.pts])
+            continue
+        message, header = stream.waiting.pop(frame.pts)
+        pixels = frame.to_ndarray(format="rgb24")
+        yield replace(message, topic=_decoded_topic(message.topic), data=pack_image(header, pixels))
+
+
+def _decode(context: Any, data: bytes | None, number: int) -> tuple[list[Any], bool]:
+    """What comes out of the decoder, and whether it said that something was missing or damaged."""
+    av = of_extra(LIBRARY, EXTRA, "video topics")
+    packet = None if data is None else av.Packet(data)
+    if packet is not None:
+        packet.pts = number
+    level = av.logging.get_level()
+    av.logging.set_level(av.logging.DEBUG)
+    av.logging.set_skip_repeated(False)
+    try:
+        with av.logging.Capture(local=True) as said:
+            frames, is_broken = list(context.decode(packet)), False
+    except av.FFmpegError:
+        frames, is_broken = [], True
+    finally:
+        av.logging.set_level(level)
+    return frames, is_broken or any(how <= av.logging.ERROR or _GAP in words for how, _, words in said)
+
+
+def _lose(stream: _Stream, numbers: list[int]) -> None:
+    for number in numbers:
+        del stream.waiting[number]
+    if stream.key is None:
+        stream.num_early += len(numbers)
+    else:
+        stream.num_late += len(numbers)
+
+
+def _count(topic: str, stream: _Stream, damage: Damage) -> None:
+    """Tell `damage` what became no image."""
+    _lose(stream, list(stream.waiting))
+    for num, where in ((stream.num_early, _EARLY), (stream.num_late, _LATE)):
+        if num:
+            damage.add(f"{topic}: {num} images of video {where} left out: {OFTENER}", num)
+
+
+SUFFIXES = (".mp4", ".mkv", ".mov", ".avi")
+_BESIDE = ("{}.csv", "{}.txt", "{}_timestamps.csv", "{}_timestamps.txt")
+_UNITS_NS = ((11, SECOND_NS), (14, 1_000_000), (17, 1_000), (99, 1))  # by at most so many digits before the point
+_TIME = re.compile("time|stamp", re.IGNORECASE)
+
+
+def open_log(path: Path) -> RawLog:
+    """A log, or a video file with its stamps beside it. Raises InputError."""
+    refuse_foreign(path)
+    return VideoFileLog(path) if path.suffix.lower() in SUFFIXES else with_video(open_raw_log(path))
+
+
+class VideoFileLog:
+    """The images of ``X.mp4`` as topic ``/X``, stamped and logged at the times that ``X.csv`` or its kin has.
+
+    The file beside it has a line for each image: a stamp, or of a table the column whose name says time or stamp. Of
+    its digits before the point 10 are seconds since 1970, 13 milliseconds, 16 microseconds and 19 nanoseconds; fewer
+    than ten are seconds. The images name no frame.
+    """
+
+    container = "video"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        beside = next((file for form in _BESIDE if (file := path.with_name(form.format(path.stem))).is_file()), None)
+        if beside is None:
+            raise InputError(
+                f"{path}: no stamps beside it",
+                remedy=f"write {path.stem}.csv, a line for each image: its time in seconds"
+                + (f"; if an Azure Kinect recorded it, {AZURE_KINECT}" if path.suffix.lower() == ".mkv" else ""),
+            )
+        self._av = of_extra(LIBRARY, EXTRA, "video files")
+        self.files = (path, beside)
+        self._stamps = _read_stamps(beside)
+        self._topic = Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)
+
+    def topics(self) -> tuple[Topic, ...]:
+        """The one."""
+        return (self._topic,)
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Yield the images. Raises InputError where there are more, or fewer, than stamps."""
+        if names is not None and self._topic.name not in names:
+            return
+        num, found = 0, Damage()
+        for frame in self._frames(found):
+            if frame is not None and num < len(self._stamps):
+                yield self._message(frame, int(self._stamps[num]))
+            num += 1
+        for note in found.notes:
+            damage.add(note)
+        if num != len(self._stamps) and not found.count:
+            raise InputError(
+                f"{self.path}: {num} images, but {len(self._stamps)} stamps in {self.files[1].name}",
+                remedy="write a stamp for each image of the file",
+            )
+
+    def _frames(self, damage: Damage) -> Iterator[Any]:
+        """Images in the order in which they are shown, None for one that is damaged."""
+        try:
+            with self._av.open(str(self.path)) as container:
+                if not container.streams.video:
+                    raise InputError(f"{self.path}: a file without video", remedy="give the colour camera's video")
+                for frame in container.decode(video=0):
+                    if frame.is_corrupt:
+                        damage.add(f"{self.path.name}: an image at {frame.time} s is damaged")
+                    yield None if frame.is_corrupt else frame
+        except (self._av.FFmpegError, OSError) as error:
+            damage.add(f"{self.path.name}: cannot be decoded further: {error}")
+
+    def _message(self, frame: Any, stamp_ns: int) -> RawMessage:
+        stamp = SimpleNamespace(sec=stamp_ns // SECOND_NS, nanosec=stamp_ns % SECOND_NS)
+        data = pack_image(SimpleNamespace(stamp=stamp, frame_id=""), frame.to_ndarray(format="rgb24"))
+        return RawMessage(topic=self._topic, log_time_ns=stamp_ns, data=data, file=self.path.name)
+
+
+def _read_stamps(path: Path) -> Stamps:
+    """The stamps [ns] of the images in their order. Raises InputError."""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    rows, column = [re.split(r"[,;\s]+", line) for line in lines], 0
+    if rows and _number(rows[0][0]) is None:
+        column = next((i for i, name in enumerate(rows[0]) if _TIME.search(name)), -1)
+        lines, rows = lines[1:], rows[1:]
+    elif rows and len(rows[0]) > 1:
+        column = -1
+    if column < 0 or not rows:
+        raise InputError(
+            f"{path}: expected a stamp a line, or columns whose first line names one time or stamp",
+            remedy="write the images' times alone, in seconds",
+        )
+    values = []
+    for row, line in zip(rows, lines, strict=True):
+        value = _number(row[column]) if column < len(row) else None
+        if value is None:
+            raise InputError(f"{path}: expected a time, got {line[:80]!r}", remedy="correct the line")
+        values.append(value)
+    digits = len(str(abs(int(values[0]))))
+    unit_ns = next(unit for most, unit in _UNITS_NS if digits <= most)
+    return np.array([round(value * unit_ns) for value in values], dtype=np.int64)
+
+
+def _number(text: str) -> Decimal | None:
+    try:
+        value = Decimal(text)
+    except InvalidOperation:
+        return None
+    return value if value.is_finite() and abs(value) < 1 << 61 else None

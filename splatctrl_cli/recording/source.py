@@ -1,0 +1,336 @@
+"""Opens any recorded input as records in time order, and describes what any file or folder is and holds."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.calibration.calibration_file import describe_calibration, is_calibration
+from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.summary import Grid, Summary, files_below, names_in
+from splatctrl_cli.grid_files.grid_format import FORMAT, covers, header_facts
+from splatctrl_cli.recording.calibrated import calibrated
+from splatctrl_cli.recording.capture.capture import CaptureSource, robot_description_of
+from splatctrl_cli.recording.capture.capture_header import is_capture, read_capture_header
+from splatctrl_cli.recording.capture.capture_writer import check_not_partial
+from splatctrl_cli.recording.container.foreign import refuse_foreign
+from splatctrl_cli.recording.container.log_formats import (
+    CONTAINERS,
+    SUFFIXES,
+    SessionLog,
+    is_bag_folder,
+    open_raw_log,
+)
+from splatctrl_cli.recording.container.raw_log import RawLog
+from splatctrl_cli.recording.describe_file import describe_file
+from splatctrl_cli.recording.folder.image_folder import ImageFolderSource, RigFolderSource, open_image_folder
+from splatctrl_cli.recording.folder.layouts import (
+    BARE_REMEDY,
+    bare_images,
+    has_views,
+    layout_of,
+    open_layout,
+    readable_in,
+)
+from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
+from splatctrl_cli.recording.log.rig import camera_topics, missing
+from splatctrl_cli.recording.log.ros_log import RosLogSource
+from splatctrl_cli.recording.log.state_messages import STATE_TYPES
+from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.recording.log.survey import NAME as ROBOT
+from splatctrl_cli.recording.log.survey import RobotDescription, TopicSurvey, robot_descriptions, survey_to_describe
+from splatctrl_cli.recording.log.video import SUFFIXES as VIDEOS
+from splatctrl_cli.recording.log.video import open_log
+from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions
+from splatctrl_cli.scene_files.scene_folder import run_value
+from splatctrl_cli.scene_files.voxel_file import known_space, read_occupancy
+
+__all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_source"]
+
+
+def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth: bool = True) -> FrameSource:
+    """The records of an MCAP, ROS 1 or ROS 2 bag, capture folder, dataset folder or file, or image folder's
+    TOML description.
+
+    Raises InputError where there is nothing, or nothing that can be used, as images without depth where it is needed.
+    """
+    options = options or SourceOptions()
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    return calibrated(_opened(path, options, needs_depth=needs_depth), options)
+
+
+def _opened(path: Path, options: SourceOptions, *, needs_depth: bool) -> FrameSource:
+    """As recorded."""
+    if path.suffix == ".toml" or (not is_capture(path) and has_views(path)):
+        source = open_image_folder(path, options) if path.suffix == ".toml" else open_layout(path, options)
+        if needs_depth and (refusal := lacks_depth(source)) is not None:
+            raise refusal
+        return source
+    if is_capture(path):
+        return CaptureSource(path, options)
+    return RosLogSource(open_log(path), options)
+
+
+def lacks_depth(source: FrameSource) -> InputError | None:
+    """What to say where a recording is without depth, as only images in a folder may be."""
+    return source.no_depth() if isinstance(source, ImageFolderSource) and not source.has_depth else None
+
+
+def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
+    """The records of one input, or of several logs that were recorded at the same time.
+
+    Raises InputError as `open_source`, and where one of several is not a log.
+    """
+    log = open_logs(paths)
+    options = options or SourceOptions()
+    return open_source(paths[0], options) if log is None else calibrated(RosLogSource(log, options), options)
+
+
+def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescription]]:
+    """What logs and captures of one session say of the robot, each text once, with the path that says it; other
+    recordings, and what cannot be opened, say nothing.
+    """
+    found: dict[str, tuple[Path, RobotDescription]] = {}
+    for path in paths:
+        said = []
+        if is_capture(path):
+            said = robot_description_of(path)
+        elif path.exists() and not has_views(path):
+            with suppress(InputError):  # who reads it says why
+                said = robot_descriptions(open_raw_log(path))
+        for description in said:
+            found.setdefault(description.text, (path, description))
+    return list(found.values())
+
+
+def open_logs(paths: Sequence[Path]) -> RawLog | None:
+    """A log, or several of one session as one; None for a single path that is not a log.
+
+    Raises InputError where there is nothing, and where one of several is not a log.
+    """
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder", remedy="check the path")
+        if path.suffix == ".toml" or is_capture(path) or has_views(path):
+            if len(paths) == 1:
+                return None
+            raise InputError(f"{path}: expected a log beside others, got none", remedy="give it alone")
+    logs = tuple(open_log(path) for path in paths)
+    return logs[0] if len(logs) == 1 else SessionLog(logs)
+
+
+def describe(path: Path, options: SourceOptions | None = None) -> Summary:
+    """Describe `path`. Raises InputError where there is nothing, or nothing known."""
+    options = options or SourceOptions()
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    if path.is_dir():
+        return _describe_folder(path, options)
+    with path.open("rb") as stream:
+        start = stream.read(16)
+    if start.startswith(tuple(kind.magic for kind in CONTAINERS)) or path.suffix in (*SUFFIXES, *VIDEOS):
+        return describe_log(open_log(path), options)
+    if path.suffix == ".toml" and is_calibration(path):
+        return describe_calibration(path)
+    if path.suffix == ".toml":
+        return _describe_images(path, open_image_folder(path, options), "image folder")
+    if (layout := layout_of(path)) is not None:
+        return _describe_images(path, open_layout(path, options), layout.name)
+    try:
+        return describe_file(path)
+    except InputError:
+        refuse_foreign(path)
+        raise
+
+
+def describe_log(log: RawLog, options: SourceOptions) -> Summary:
+    """Topics, times, frames, cameras, and what a reconstruction would lack."""
+    found, sampling = survey_to_describe(log)
+    with_messages = [t for t in found.topics.values() if t.count]
+    facts: dict[str, object] = {
+        "bytes": sum(file.stat().st_size for file in log.files),
+        "messages": found.num_messages,
+    }
+    if with_messages:
+        first, last = min(t.first_log_ns for t in with_messages), max(t.last_log_ns for t in with_messages)
+        facts |= {"start_s": first * 1e-9, "end_s": last * 1e-9, "duration_s": (last - first) * 1e-9}
+    if found.tf.frames:
+        facts |= {"tf_frames": list(found.tf.frames), "tf_roots": list(found.tf.roots)}
+    joints = next((t.joints.first_names for t in found.topics.values() if t.joints.first_names is not None), ())
+    if joints:
+        facts["joints"] = list(joints)
+    robots = [name for name, t in sorted(found.topics.items()) if t.count and name.endswith(f"/{ROBOT}")]
+    if robots:
+        facts[ROBOT] = robots
+    rows = [_topic_row(found.topics[name]) for name in sorted(found.topics)]
+    unused = [name for name, topic in found.topics.items() if _first(topic) == "-" and not _is_read(topic)]
+    grids = [Grid(name="topics", header=_TOPIC_COLUMNS, rows=rows, unused=unused)]
+    cameras = camera_topics(log, found, options)
+    if cameras:
+        rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
+        grids.append(Grid(name="cameras", header=("camera", "color", "depth", "camera_info"), rows=rows))
+    lacks = missing(log, found, options) if found.num_messages else ["the log holds no messages"]
+    notes = [*sampling, *found.damage.all_notes, *found.tf.notes]
+    return Summary(
+        path=str(log.path),
+        kind=log.container,
+        facts=facts,
+        grids=tuple(grids),
+        missing=tuple(lacks),
+        notes=tuple(notes),
+        damaged=found.damage.count,
+    )
+
+
+_TOPIC_COLUMNS = ("topic", "type", "encoding", "count", "hz", "first message")
+
+
+def _topic_row(entry: TopicSurvey) -> list[object]:
+    span = (entry.last_log_ns - entry.first_log_ns) * 1e-9
+    return [
+        entry.topic.name,
+        entry.topic.schema or entry.topic.type_name or "-",
+        entry.topic.encoding or "-",
+        entry.count,
+        f"{(entry.count - 1) / span:.2f}" if entry.count > 1 and span > 0 else "-",
+        _first(entry),
+    ]
+
+
+def _is_read(entry: TopicSurvey) -> bool:
+    """Whether a command can read a topic, with the right options."""
+    name, kind = entry.topic.name, entry.topic.type_name or ""
+    types = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS)
+    return kind in types or kind.startswith("geometry_msgs/") or name.endswith(f"/{ROBOT}")
+
+
+def _first(entry: TopicSurvey) -> str:
+    image, calibration = entry.first_image, entry.calibration
+    if image is not None:
+        wrapped = " compressed" if image.compressed is not None else ""
+        return f"{image.width}x{image.height} {image.encoding}{wrapped} in frame {image.frame_id!r}"
+    if calibration is not None:
+        K = calibration.K
+        return f"{calibration.width}x{calibration.height} fx {K[0, 0]:.1f} cx {K[0, 2]:.1f} cy {K[1, 2]:.1f}"
+    if entry.joints.first_names is not None:
+        return f"{len(entry.joints.first_names)} joints"
+    return "-"
+
+
+_KNOWN_FILES = ("run.json", "splats.ply", "occupancy.npz", "field.json")
+
+
+def _describe_folder(path: Path, options: SourceOptions) -> Summary:
+    if is_capture(path):
+        return _describe_capture(path)
+    check_not_partial(path)
+    if is_bag_folder(path):
+        return describe_log(open_log(path), options)
+    if (layout := layout_of(path)) is not None:
+        return _describe_images(path, open_layout(path, options), layout.name)
+    names = {name for name in _KNOWN_FILES if (path / name).is_file()}
+    is_dtu = all((path / name).is_dir() for name in ("Cameras", "Rectified"))
+    if not ("run.json" in names or "splats.ply" in names or is_dtu):
+        refuse_foreign(path)
+        inside = readable_in(path)
+        if not inside and (found := bare_images(path)):
+            raise InputError(f"{path}: {found}", remedy=BARE_REMEDY)
+        raise InputError(
+            f"{path}: a folder of no known kind",
+            remedy=f"give one that is in it: {inside}"
+            if inside
+            else "expected a capture, ROS 2 bag, dataset folder (splatctrl help formats), MVSNet scan or output;"
+            " for other images give their .toml",
+        )
+    field = _field_facts(path / "field.json") if "field.json" in names else {}
+    kind = "MVSNet scan" if is_dtu else "scene folder" if "splats.ply" in names else "run folder"
+    kind = "field folder" if field else kind
+    entries = [path / name for name in names_in(path)[:1000]]
+    rows = [[file.name + "/" if file.is_dir() else file.name, *files_below(file)] for file in entries]
+    count, size = files_below(path)
+    facts: dict[str, object] = {"files": count, "bytes": size}
+    if "splats.ply" in names:
+        facts["splats"] = describe_file(path / "splats.ply").facts
+    if "occupancy.npz" in names:
+        facts["space"] = _known_space(path, has_run="run.json" in names)
+    facts |= field
+    if "run.json" in names and not field:
+        run = describe_file(path / "run.json").facts
+        facts["run"] = {key: value for key, value in run.items() if key != "config"}  # `info run.json` shows it
+    grid = Grid(name="files", header=("name", "files", "bytes"), rows=rows)
+    return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,))
+
+
+def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
+    """What is known at the end of a scene, by the thresholds it was made with."""
+    run: Mapping[str, Any] = describe_file(path / "run.json").facts if has_run else {}
+
+    def used(name: str, default: float) -> float:
+        return run_value(run, ("config", "occupancy", name), _probability, default, where=str(path / "run.json"))
+
+    thresholds = OccupancyConfig()
+    low, high = used("free_below", thresholds.free_below), used("occupied_above", thresholds.occupied_above)
+    return known_space(
+        read_occupancy(path / "occupancy.npz"), replace(thresholds, free_below=low, occupied_above=high)
+    )
+
+
+def _probability(value: Any) -> float:
+    number = float(value)
+    if not 0.0 < number < 1.0:
+        raise ValueError(f"{number}, expected a probability between 0 and 1")
+    return number
+
+
+def _field_facts(path: Path) -> dict[str, object]:
+    """What a distance grid covers and how it was made; empty where the file is none of ours."""
+    header: Mapping[str, Any] = describe_file(path).facts
+    if header.get("format") != FORMAT or not {"shape", "first_cell", "voxel"} <= header.keys():
+        return {}
+    return {**covers(header["first_cell"], header["voxel"], header["shape"]), **header_facts(header)}
+
+
+def _describe_capture(path: Path) -> Summary:
+    header = read_capture_header(path)
+    rows = [
+        [name, camera["num_frames"], f"{camera['width']}x{camera['height']}", camera["fx"], camera["depth_scale"]]
+        for name, camera in header["cameras"].items()
+    ]
+    loss: dict[str, Any] = header["loss"]
+    facts: dict[str, object] = {
+        "recorded_from": header["name"],
+        "world_frame": header["world_frame"],
+        "has_clock": header["has_clock"],
+        "joints": header["joint_names"],
+        "loss": {key: value for key, value in loss.items() if key != "notes"},
+        "sources": len(header["sources"]),
+    }
+    grid = Grid(name="cameras", header=("camera", "frames", "size", "fx", "depth_scale"), rows=rows)
+    return Summary(path=str(path), kind="capture", facts=facts, grids=(grid,), notes=tuple(loss.get("notes", ())))
+
+
+def _describe_images(path: Path, source: ImageFolderSource | RigFolderSource, kind: str) -> Summary:
+    first = next((item for item in source.stored() if isinstance(item, StoredFrame)), None)
+    counts = source.count_views()
+    facts: dict[str, object] = {"has_clock": source.has_clock}
+    if first is not None:
+        valid = first.frame.depth > 0
+        intrinsics = first.frame.intrinsics
+        facts |= {
+            "size": f"{intrinsics.width}x{intrinsics.height}",
+            "fx_fy_cx_cy": [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy],
+            "first_valid_depth_share": round(float(valid.mean()), 4),
+        }
+    loss = source.loss
+    facts["loss"] = {
+        "unpaired_color": loss.unpaired_color,
+        "unpaired_depth": loss.unpaired_depth,
+        "without_pose": loss.without_pose,
+    }
+    grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])
+    refusal = lacks_depth(source)
+    lacks = () if refusal is None else (str(refusal)[str(refusal).index("depth is missing") :],)
+    return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,), missing=lacks, notes=tuple(loss.notes))

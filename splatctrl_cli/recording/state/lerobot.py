@@ -1,0 +1,59 @@
+"""LeRobot's datasets as a preset of a table of joint states: which file has an episode, and what its columns are.
+
+Of LeRobot's datasets v2 and v3 (huggingface/lerobot, lerobot_dataset.py, utils.py): ``meta/info.json`` with the
+features, in v2 a file of each episode, ``data/chunk-000/episode_000000.parquet``, in v3 files of many,
+``data/chunk-000/file-000.parquet``, whose column ``episode_index`` says which; ``observation.state`` are the
+positions, ``timestamp`` seconds from the episode's begin.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import ParquetFile
+from splatctrl_cli.recording.folder.layout import read_json
+
+INFO, POSITION, EPISODE = Path("meta/info.json"), "observation.state", "episode_index"
+
+
+def is_lerobot(path: Path) -> bool:
+    return (path / INFO).is_file() and (path / "data").is_dir()
+
+
+def preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
+    """The keys of [states] for an episode of a dataset, by default its only one. Raises InputError."""
+    info = read_json(folder / INFO)
+    try:
+        feature, num = info["features"][POSITION], int(info["total_episodes"])
+        size, names = int(feature["shape"][0]), _names(feature.get("names"))
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputError(
+            f"{folder / INFO}: expected total_episodes and the feature {POSITION}, got no usable {error}",
+            remedy="describe the columns in a .toml (splatctrl help replay, Logs)",
+        ) from None
+    if episode is None and num != 1:
+        raise InputError(f"{folder}: {num} episodes", remedy="choose one in a .toml: [states] preset, file, episode")
+    found = {"time": "timestamp", "position": [POSITION], "episode": episode or 0}
+    return (
+        found
+        | ({"joints": names} if len(names) == size else {})
+        | {"file": str(_file(folder, episode or 0).absolute())}
+    )
+
+
+def _names(said: Any) -> list[str]:
+    """Joints of a feature: a list, or lists by kind (``{"motors": [...]}``); ``shoulder_pan.pos`` is shoulder_pan."""
+    lists = list(said.values()) if isinstance(said, dict) else [said or []]
+    return [str(name).removesuffix(".pos") for names in lists for name in names]
+
+
+def _file(folder: Path, episode: int) -> Path:
+    """The file with an episode. Raises InputError where none has it."""
+    files = sorted((folder / "data").glob("*/*.parquet"))
+    of_one = [file for file in files if file.stem == f"episode_{episode:06d}"]
+    shared = (file for file in files if file.stem.startswith("file") and len(ParquetFile(file, (EPISODE, episode))))
+    found = next(iter(of_one), None) or next(shared, None)
+    if found is None:
+        raise InputError(f"{folder}: no episode {episode}", remedy="copy the whole dataset, or give another episode")
+    return found

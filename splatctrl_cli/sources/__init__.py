@@ -1,1 +1,0 @@
-"""Opens any recorded input, and says what a file is."""

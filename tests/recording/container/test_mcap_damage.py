@@ -1,0 +1,279 @@
+"""Damaged and hostile MCAP files: what is whole is read, what is lost is counted, memory stays bounded."""
+
+import os
+import struct
+import subprocess
+import sys
+import zlib
+from collections import Counter
+from io import BytesIO
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk, DataEnd, Footer, Header
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+
+from benchmarks.mcap_recovery import DAMAGES, LOGS, NUM_MESSAGES, counted, damaged, log
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.unpacking import MAX_BLOCK
+from splatctrl_cli.recording.container.mcap_file import McapFile
+from splatctrl_cli.recording.container.mcap_log import McapLog
+from splatctrl_cli.recording.container.mcap_records import CHUNK, MAGIC
+from splatctrl_cli.recording.container.raw_log import MAX_NOTES, Damage
+from splatctrl_cli.recording.source import SourceOptions, open_source
+from tests.recording.container.mcap_recover import recover
+from tests.recording.log.make_log import LogRecipe, make_log
+
+GIB = 1 << 30
+
+
+def small_log(compression: CompressionType = CompressionType.ZSTD, num: int = 40, size: int = 3000) -> bytes:
+    """A log of one topic: message i is logged at i + 1 ns and holds `size` bytes that do not compress away."""
+    stream = BytesIO()
+    writer = McapWriter(stream, chunk_size=10 * size, compression=compression, enable_data_crcs=True)
+    writer.start(profile="", library="tests")
+    schema = writer.register_schema(name="x", encoding="", data=b"")
+    channel = writer.register_channel(topic="/x", message_encoding="x", schema_id=schema)
+    for index in range(num):
+        writer.add_message(channel, log_time=index + 1, publish_time=index + 1, data=payload(index, size))
+    writer.add_attachment(create_time=1, log_time=1, name="a", media_type="b", data=b"attached")
+    writer.finish()
+    return stream.getvalue()
+
+
+def payload(index: int, size: int) -> bytes:
+    state, out = index + 1, bytearray()
+    while len(out) < size:
+        state = (state * 6364136223846793005 + 1442695040888963407) % (1 << 64)
+        out += struct.pack("<Q", state)
+    return bytes(out[:size])
+
+
+def read(path: Path, data: bytes) -> tuple[list[int], Damage]:
+    """Log times of the messages that `data` gives, each with its right content, and the damage."""
+    path.write_bytes(data)
+    damage = Damage()
+    messages = list(McapLog(path).messages(damage))
+    for message in messages:
+        assert message.data == payload(message.log_time_ns - 1, len(message.data))
+    return [message.log_time_ns for message in messages], damage
+
+
+def chunk_places(path: Path, data: bytes | bytearray) -> list[int]:
+    """Where the chunks of a file that holds `data` begin."""
+    path.write_bytes(data)
+    return [part.offset for part in McapFile(path).parts(Damage()) if part.opcode == CHUNK]
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_cut_gives_the_whole_messages_of_the_chunk_it_cuts(tmp_path: Path, compression: CompressionType) -> None:
+    data = small_log(compression, num=400, size=20_000)  # chunks of 200 kB: more than one block of zstd and lz4
+    path = tmp_path / "x.mcap"
+    place = chunk_places(path, data)[3]
+    found, damage = read(path, data[: place + 180_000])
+    assert found == list(range(1, len(found) + 1))
+    assert len(found) > 30 + 3, "the three chunks before the cut hold ten each; more are in the cut one"
+    assert damage.notes == [f"x.mcap: cut or damaged after byte {place}"]
+
+
+@pytest.mark.parametrize("has_summary", [True, False])
+def test_a_chunk_whose_length_is_wrong_costs_itself_alone(tmp_path: Path, has_summary: bool) -> None:
+    data = bytearray(small_log())
+    place, _, last = chunk_places(tmp_path / "x.mcap", data)[1:4]
+    data[place + 1 : place + 9] = struct.pack("<Q", 100 << 30)
+    found, damage = read(tmp_path / "x.mcap", bytes(data if has_summary else data[: last + 20]))
+    assert found == [*range(1, 11), *range(21, 41 if has_summary else 31)]
+    assert "are damaged and were left out" in damage.notes[0]
+    assert has_summary or damage.count == 2
+
+
+def test_a_hole_of_zeros_costs_what_it_covers(tmp_path: Path) -> None:
+    data = bytearray(small_log())
+    path = tmp_path / "x.mcap"
+    _, second, third, _ = chunk_places(path, data)
+    data[second - 40 : third - 30] = bytes(third - second + 10)
+    found, damage = read(path, bytes(data))
+    assert found == [*range(1, 11), *range(21, 41)]
+    assert damage.count >= 1
+
+
+@pytest.mark.parametrize("where", ["chunk", "attachment", "summary"])
+def test_each_checksum_is_checked(tmp_path: Path, where: str) -> None:
+    data = bytearray(small_log(CompressionType.NONE))
+    path = tmp_path / "x.mcap"
+    path.write_bytes(data)
+    if where == "chunk":
+        at = data.index(payload(12, 8))
+    elif where == "attachment":
+        at = data.index(b"attached")
+    else:
+        at = data.rindex(b"/x")
+    data[at] ^= 1
+    path.write_bytes(data)
+    damage = Damage()
+    num = len(list(McapLog(path).messages(damage)))
+    assert num == (30 if where == "chunk" else 40)
+    expected = {"chunk": "checksum differs", "attachment": "checksum of the attachment", "summary": "of the summary"}
+    assert any(expected[where] in note for note in damage.notes)
+
+
+def test_unknown_records_are_passed_over(tmp_path: Path) -> None:
+    data = small_log()
+    path = tmp_path / "x.mcap"
+    place = chunk_places(path, data)[0]
+    alien = b"".join(struct.pack("<BQ", opcode, 5) + b"alien" for opcode in (0x10, 0x7F, 0x80, 0xFF))
+    found, damage = read(path, data[:place] + alien + data[place:])
+    assert found == list(range(1, 41))
+    assert [note[-7:] for note in damage.notes[:1]] == ["differs"], "the checksum of the data section knows"
+
+
+def test_notes_of_damage_are_bounded_and_their_count_is_not() -> None:
+    damage = Damage()
+    for index in range(1000):
+        damage.add(f"note {index}")
+    assert damage.count == 1000
+    assert damage.notes[-2:] == [f"note {MAX_NOTES - 1}", f"and {1000 - MAX_NOTES} more"]
+
+
+def hostile(name: str) -> bytes:
+    """A small file that asks for much memory or time."""
+    builder = RecordBuilder()
+    Header(profile="", library="").write(builder)
+    start = MAGIC + builder.end()
+    unknown = struct.pack("<BQ", 0x10 if name == "flood" else 0, (1 << 16) - 9) + bytes((1 << 16) - 9)
+    zeros = zstandard.ZstdCompressor().compress(unknown * (1 << 10))
+    if name == "record":
+        return start + struct.pack("<BQ", 0x05, 100 << 30) + bytes(100)
+    if name == "attachment":
+        return start + struct.pack("<BQ", 0x09, 100 << 30) + bytes(100)
+    if name == "text":
+        return start + struct.pack("<BQHI", 0x03, 50, 1, 0xFFFFFFF0) + bytes(44)
+    size = {"bomb": 4 * GIB, "liar": 1 << 20, "window": 1 << 20, "many": 1 << 26, "flood": 1 << 26}[name]
+    if name == "window":  # a frame that asks for a window of 3.75 TiB
+        records = b"\x28\xb5\x2f\xfd\x00\xff" + b"\x01\x00\x00" + bytes(16)
+    elif name == "bomb":
+        compressor = zstandard.ZstdCompressor().compressobj()
+        records = b"".join(compressor.compress(bytes(1 << 24)) for _ in range(256)) + compressor.flush()
+    else:
+        records = zeros
+    builder = RecordBuilder()
+    for _ in range(20 if name in {"many", "flood"} else 1):
+        Chunk(
+            compression="zstd",
+            data=records,
+            message_end_time=1,
+            message_start_time=0,
+            uncompressed_crc=0,
+            uncompressed_size=size,
+        ).write(builder)
+    DataEnd(0).write(builder)
+    Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
+    return start + builder.end() + MAGIC
+
+
+READ = """
+import resource, sys
+from pathlib import Path
+from splatctrl_cli.recording.container.mcap_log import McapLog
+from splatctrl_cli.recording.container.raw_log import Damage
+resource.setrlimit(resource.RLIMIT_AS, (2**30, 2**30))
+damage = Damage()
+assert list(McapLog(Path(sys.argv[1])).messages(damage)) == []
+status = Path("/proc/self/status").read_text().splitlines()
+peak = next(line for line in status if line.startswith("VmHWM"))  # ru_maxrss begins with a parent's
+print(int(peak.split()[1]) // 1024, damage.notes[0])
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("record", "cut or damaged after byte"),
+        ("attachment", "cut or damaged after byte"),
+        ("text", "was left out"),
+        ("bomb", f"announces {4 * GIB} bytes unpacked, at most {MAX_BLOCK} are read"),
+        ("liar", "holds more"),
+        ("window", "cannot be decompressed"),
+        ("many", "holds bytes that are not a record"),
+        ("flood", "unpacks to over 1000 times"),
+    ],
+)
+def test_a_small_file_that_asks_for_much_gets_little(tmp_path: Path, name: str, told: str) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(hostile(name))
+    assert path.stat().st_size < 1 << 18
+    done = subprocess.run(
+        [sys.executable, "-c", READ, str(path)], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    megabytes, note = done.stdout.split(" ", 1)
+    assert told in note
+    assert int(megabytes) < 700
+
+
+def test_checksums_are_compared_once_and_again_where_the_file_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(small_log(CompressionType.NONE))
+    log, num_sums, crc32 = McapLog(path), 0, zlib.crc32
+
+    def counting(data: bytes, value: int = 0) -> int:
+        nonlocal num_sums
+        num_sums += len(data) > 1000  # not those of the short heads and of the summary
+        return crc32(data, value)
+
+    monkeypatch.setattr(zlib, "crc32", counting)
+    sums = []
+    for _ in range(3):
+        num_sums = 0
+        assert len(list(log.messages(Damage()))) == 40
+        sums.append(num_sums)
+    assert sums[0] > 4 and sums[1:] == [0, 0]
+    data = bytearray(path.read_bytes())
+    data[data.index(payload(30, 100)) + 50] ^= 1
+    path.write_bytes(data)
+    os.utime(path, ns=(1, 1))
+    for _ in range(2):
+        damage = Damage()
+        assert len(list(log.messages(damage))) < 40
+        assert "checksum differs" in damage.notes[0]
+
+
+def test_a_pass_that_was_not_finished_says_nothing_of_the_checksums(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    data = bytearray(small_log(CompressionType.NONE))
+    data[data.index(payload(30, 100)) + 50] ^= 1
+    path.write_bytes(data)
+    log = McapLog(path)
+    assert next(log.messages(Damage())).log_time_ns == 1
+    assert len(list(log.messages(Damage()))) < 40
+
+
+def test_a_log_whose_damage_took_what_is_missing_says_so(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(chunk_size=1))  # a chunk a message, tf first
+    data = bytearray(log.read_bytes())
+    for chunk in McapFile(log).chunk_indexes()[:1]:
+        data[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= 0xFF
+    log.write_bytes(bytes(data))
+    expected = r"no tf .*; but the log is damaged: .*chunk.*; copy the file again; if this is all there is: "
+    with pytest.raises(InputError, match=expected):
+        open_source(log, SourceOptions(world_frame="world"))
+
+
+STEP = 211
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_no_message_is_lost_that_the_tool_recovers_and_each_loss_is_told(tmp_path: Path, name: str) -> None:
+    data = log(*LOGS[name])
+    truth = Counter(recover(data).kept)
+    assert truth.total() == NUM_MESSAGES == recover(data, always_decode=True).claimed
+    for kind in DAMAGES:
+        for number, file in enumerate(damaged(data, kind, STEP)):
+            found = counted(file, truth, tmp_path / "x.mcap")
+            assert not found.lacking, f"{kind} {number}: {found}"
+            assert found.read == NUM_MESSAGES or found.is_told, f"{kind} {number}: {found}"

@@ -1,0 +1,381 @@
+"""Datasets as they are published: forms of a layout, and what each says of its cameras."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import back_project, invert_transform, look_at, project, transform_points
+from splatctrl_cli.recording.folder import layout_nerfstudio
+from splatctrl_cli.recording.folder.layout_scenes import COLOR_LENS, DEPTH_LENS, T_COLOR_DEPTH
+from splatctrl_cli.recording.folder.layout_tum import marker_to_camera
+from splatctrl_cli.recording.folder.poses import stamp_of_text
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
+from tests.recording.folder.make_layout import (
+    HEIGHT,
+    POSES,
+    WIDTH,
+    K,
+    check,
+    counts_of,
+    frames_of,
+    make_arkit,
+    make_bop,
+    make_frames,
+    make_icl,
+    make_nerfstudio,
+    make_redwood,
+    make_replica,
+    make_scannet,
+    make_tum,
+    matrix_text,
+    write_pair,
+)
+
+IDENTITY = " ".join(str(int(value)) for value in np.eye(4).ravel())
+
+
+def lens_text(fx: float, fy: float, cx: float, cy: float) -> str:
+    return f"{fx} 0 {cx} 0 0 {fy} {cy} 0 0 0 1 0 0 0 0 1"
+
+
+def write_info(path: Path, *, scale: float = 1.0, extrinsic: str = IDENTITY, shift: int = 1000) -> None:
+    """As sensorData.h writes it; the depth lens is `scale` of the colour lens."""
+    lines = (
+        "m_versionNumber = 4",
+        "m_sensorName = StructureSensor",
+        f"m_colorWidth = {WIDTH}",
+        f"m_depthShift = {shift}",
+        f"m_calibrationColorIntrinsic = {lens_text(*K)} ",
+        f"m_calibrationColorExtrinsic = {IDENTITY} ",
+        f"m_calibrationDepthIntrinsic = {lens_text(*(scale * value for value in K))} ",
+        f"m_calibrationDepthExtrinsic = {extrinsic} ",
+        "m_frames.size = 3",
+    )
+    path.write_text("\n".join(lines) + "\n")
+
+
+def seen_by(frame: RgbdFrame) -> Float64:
+    """World points of a frame's depth."""
+    return transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[frame.depth > 0])
+
+
+@pytest.mark.parametrize("name", ["rgbd_dataset_freiburg3_x", "fr3_office", "renamed"])
+def test_a_tum_camera_is_known_by_the_folder_or_by_the_heads_of_its_lists(tmp_path: Path, name: str) -> None:
+    folder = make_tum(tmp_path / name)
+    head = "# color images\n# file: 'rgbd_dataset_freiburg3_long_office_household.bag'\n"
+    (folder / "rgb.txt").write_text(head + (folder / "rgb.txt").read_text())
+    assert frames_of(folder)[0].intrinsics.cx == 320.1
+
+
+def test_an_eth3d_sequence_brings_its_lens(tmp_path: Path) -> None:
+    folder = make_tum(tmp_path / "table_3")
+    (folder / "calibration.txt").write_text("{} {} {} {}\n".format(*K))
+    check(frames_of(folder), 1 / 5000)
+
+
+def test_poses_of_bonn_are_moved_from_the_markers_to_the_camera(tmp_path: Path) -> None:
+    folder = make_tum(tmp_path / "rgbd_bonn_balloon")
+    source = open_source(folder, SourceOptions(intrinsics={"camera": K}))
+    frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
+    assert frames[1].T_world_camera == pytest.approx(marker_to_camera(POSES[1]), abs=1e-9)
+    assert "without the scale of 1.059" in source.loss.notes[0]
+    T_m = invert_transform(marker_to_camera(np.eye(4)))  # T_ros cancels around the identity
+    assert T_m[:3, :3] @ T_m[:3, :3].T == pytest.approx(np.eye(3))
+    assert invert_transform(T_m)[:3, 0] * 1.0593 == pytest.approx([1.0157, 0.0009, -0.3009], abs=1e-4)
+    assert invert_transform(T_m)[:3, 3] == pytest.approx([0.0113, -0.0098, 0.0111])
+
+
+def test_a_point_of_icl_nuim_is_where_its_negative_focal_length_says(tmp_path: Path) -> None:
+    folder = make_icl(tmp_path)
+    source = open_source(folder)
+    frame = next(record for record in source.records() if isinstance(record, RgbdFrame))
+    assert source.loss.without_pose == 1  # image 0
+    z, v, u = float(frame.depth[1, 2]), 1, 2
+    left = np.array([(u - 319.5) / 481.2 * z, (v - 239.5) / -480.0 * z, z])  # the page's own camera
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    world_left = transform_points(mirror @ POSES[0] @ mirror, left[None])[0]
+    ours = transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[v, u][None])[0]
+    assert ours * [1, -1, 1] == pytest.approx(world_left, abs=1e-6)
+
+
+def test_replica_without_parameters_must_have_the_size_of_nice_slam(tmp_path: Path) -> None:
+    folder = make_replica(tmp_path)
+    (folder / "cam_params.json").unlink()
+    with pytest.raises(InputError, match=r"images of 8x6 instead of 1200x680; give --intrinsics camera="):
+        open_source(folder)
+    check(frames_of(folder, SourceOptions(intrinsics={"camera": K})), 1 / 6553.5)
+
+
+def test_replica_of_semantic_nerf_has_a_right_angle_of_view(tmp_path: Path) -> None:
+    for index in range(3):
+        write_pair(tmp_path / f"rgb/rgb_{index}.png", tmp_path / f"depth/depth_{index}.png", index)
+    lines = [matrix_text(T).replace("\n", " ") + "\n" for T in POSES]
+    (tmp_path / "traj_w_c.txt").write_text("".join(lines))
+    check(frames_of(tmp_path), k=(4.0, 4.0, 3.5, 2.5))
+
+
+def test_smaller_depth_of_arkit_scenes_is_fitted_to_colour(tmp_path: Path) -> None:
+    folder = make_arkit(tmp_path)
+    for index, path in enumerate(sorted(folder.glob("*/lowres_depth/*"))):
+        cv2.imwrite(str(path), counts_of(index)[::2, ::2])
+    for index, frame in enumerate(frames_of(folder)):
+        nearest = cv2.resize(counts_of(index)[::2, ::2], (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST)
+        assert np.array_equal(frame.depth, nearest.astype(np.float32) * np.float32(1e-3))
+
+
+def test_seven_scenes_register_depth_and_its_poses_to_colour(tmp_path: Path) -> None:
+    """A plane of the depth image is the same plane in the world, and lies where the colour camera sees it."""
+    sequence = tmp_path / "seq-01"
+    write_pair(sequence / "frame-000000.color.png", sequence / "frame-000000.depth.png", 0)
+    cv2.imwrite(str(sequence / "frame-000000.color.png"), np.full((480, 640, 3), 90, np.uint8))
+    depth = np.full((480, 640), 65535, np.uint16)
+    depth[100:400, 100:500] = 2000
+    cv2.imwrite(str(sequence / "frame-000000.depth.png"), depth)
+    pose = look_at([0.5, 0.2, 1.0], [0.0, 0.0, 0.0])
+    (sequence / "frame-000000.pose.txt").write_text(matrix_text(pose))
+    source = open_source(tmp_path)
+    frame = frames_of(tmp_path)[0]
+    fx, fy, cx, cy = DEPTH_LENS
+    own = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=640, height=480)
+    metres = np.where(depth == 65535, 0, depth).astype(np.float32) * np.float32(1e-3)
+    corner = transform_points(pose, back_project(own, metres)[100, 100][None])
+    assert (frame.intrinsics.fx, frame.intrinsics.cx) == (COLOR_LENS[0], COLOR_LENS[2])
+    assert frame.T_world_camera == pytest.approx(pose @ invert_transform(T_COLOR_DEPTH), abs=1e-9)
+    pixel = project(frame.intrinsics, transform_points(invert_transform(frame.T_world_camera), corner))[0]
+    rows, columns = np.nonzero(frame.depth)
+    assert np.array([columns.min(), rows.min()]) == pytest.approx(pixel, abs=2.0)
+    normal = pose[:3, 2]
+    assert seen_by(frame) @ normal == pytest.approx(float((corner @ normal)[0]), abs=0.02)
+    assert "registered to colour by another Kinect's" in source.loss.notes[0]
+
+
+def test_frames_with_an_info_file_bring_both_lenses_and_the_depth_unit(tmp_path: Path) -> None:
+    folder = make_frames(tmp_path / "kitchen", "data")
+    write_info(folder / "info.txt", shift=1000)
+    check(frames_of(folder))
+    write_info(folder / "info.txt", shift=500)
+    assert frames_of(folder)[0].depth[1, 1] == pytest.approx(1.09 * 2, abs=1e-6)
+
+
+def test_a_pose_that_windows_writes_as_infinite_is_lost(tmp_path: Path) -> None:
+    folder = make_frames(tmp_path, "data")
+    write_info(folder / "info.txt")
+    (folder / "data/frame-000001.pose.txt").write_text("-1.#INF -1.#INF00 1.#QNAN -1.#IND\n" * 4)
+    source = open_source(folder)
+    assert len(list(source.records())) == 2 and source.loss.without_pose == 1
+
+
+def test_depth_in_a_pgm_is_read_as_sensreader_writes_it(tmp_path: Path) -> None:
+    folder = make_frames(tmp_path, "sequence")
+    write_info(folder / "sequence/_info.txt")
+    for index in range(3):
+        (folder / f"sequence/frame-{index:06d}.depth.png").unlink()
+        head = b"P5\n# data values are 16-bit each; depth shift is 1000\n%d %d\n65535\n" % (WIDTH, HEIGHT)
+        (folder / f"sequence/frame-{index:06d}.depth.pgm").write_bytes(
+            head + counts_of(index).astype(">u2").tobytes()
+        )
+    check(frames_of(folder))
+
+
+def test_scannet_extrinsics_register_depth_to_colour(tmp_path: Path) -> None:
+    """Colour sits 0.2 m to the right of the base, depth 0.1 m above it; a wall 2 m before the base."""
+    folder = make_scannet(tmp_path)
+    T_base_color, T_base_depth = np.eye(4), np.eye(4)
+    T_base_color[0, 3], T_base_depth[1, 3] = 0.2, -0.1
+    (folder / "intrinsic/extrinsic_color.txt").write_text(matrix_text(T_base_color))
+    (folder / "intrinsic/extrinsic_depth.txt").write_text(matrix_text(T_base_depth))
+    depth = np.zeros((HEIGHT, WIDTH), np.uint16)
+    depth[3, 4] = 2000
+    cv2.imwrite(str(folder / "depth/8.png"), depth)
+    frame = frames_of(folder)[0]
+    assert frame.T_world_camera == pytest.approx(POSES[0] @ T_base_color, abs=1e-9)
+    own = np.array([(4 - K[2]) / K[0] * 2.0, (3 - K[3]) / K[1] * 2.0 - 0.1, 2.0])  # in the base
+    u, v = K[0] * (own[0] - 0.2) / 2.0 + K[2], K[1] * own[1] / 2.0 + K[3]
+    rows, columns = np.nonzero(frame.depth)
+    assert [list(rows), list(columns)] == [[round(v)], [round(u)]]
+    assert frame.depth.max() == pytest.approx(2.0)
+
+
+def test_the_small_scannet_has_its_lenses_beside_the_images(tmp_path: Path) -> None:
+    folder = make_scannet(tmp_path)
+    for name in ("color", "depth"):
+        (folder / f"intrinsic/intrinsic_{name}.txt").rename(folder / f"intrinsics_{name}.txt")
+        (folder / f"intrinsic/extrinsic_{name}.txt").unlink()
+    (folder / "intrinsic").rmdir()
+    check(frames_of(folder))
+
+
+@pytest.mark.parametrize("trajectory", ["livingroom1-traj.txt", "lounge_trajectory.log", "scene/trajectory.log"])
+def test_open3d_scenes_are_known_by_the_names_of_its_downloads(tmp_path: Path, trajectory: str) -> None:
+    folder = make_redwood(tmp_path)
+    (folder / "color").rename(folder / "colors")
+    (folder / trajectory).parent.mkdir(exist_ok=True)
+    (folder / "trajectory.log").rename(folder / trajectory)
+    check(frames_of(folder))
+
+
+def of_transforms(folder: Path, **changed: Any) -> Path:
+    """make_nerfstudio with other values of the file; None takes a value out."""
+    make_nerfstudio(folder)
+    content = json.loads((folder / "transforms.json").read_text()) | changed
+    content = {key: value for key, value in content.items() if value is not None}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_transforms_of_instant_ngp_have_their_own_names(tmp_path: Path) -> None:
+    """camera_angle_x for fl_x, no centre and size, depth_path, its unit in the file, names without suffix."""
+    folder = make_nerfstudio(tmp_path)
+    content = json.loads((folder / "transforms.json").read_text())
+    for entry in content["frames"]:
+        entry["depth_path"] = entry.pop("depth_file_path")
+        entry["file_path"] = entry["file_path"].removesuffix(".png")
+    short = {"camera_angle_x": 2 * math.atan(4 / 10.0), "fl_y": 11.0, "integer_depth_scale": 1e-3 / 2}
+    (folder / "transforms.json").write_text(json.dumps({**short, "aabb_scale": 4, "frames": content["frames"]}))
+    frame = frames_of(folder)[1]
+    i = frame.intrinsics
+    assert (i.fx, i.fy, i.cx, i.cy, i.width, i.height) == pytest.approx((10.0, 11.0, 3.5, 2.5, WIDTH, HEIGHT))
+    assert frame.depth == pytest.approx(counts_of(1) * 0.5e-3, abs=1e-6)
+    assert frame.T_world_camera == pytest.approx(POSES[1], abs=1e-12)
+
+
+def test_poses_that_were_scaled_are_scaled_back(tmp_path: Path) -> None:
+    folder = of_transforms(tmp_path, applied_scale=0.5)
+    assert frames_of(folder)[0].T_world_camera[:3, 3] == pytest.approx(POSES[0][:3, 3] / 0.5)
+
+
+def test_masks_of_nerfstudio_leave_pixels_out(tmp_path: Path) -> None:
+    folder = make_nerfstudio(tmp_path)
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :3] = 0
+    cv2.imwrite(str(folder / "mask.png"), mask)
+    content = json.loads((folder / "transforms.json").read_text())
+    for entry in content["frames"]:
+        entry["mask_path"] = "mask.png"
+    (folder / "transforms.json").write_text(json.dumps(content))
+    source = open_source(folder)
+    frame = next(r for r in source.records() if isinstance(r, RgbdFrame))
+    assert frame.valid is not None and np.array_equal(frame.valid, mask > 0)
+    assert not frame.depth[:, :3].any() and (frame.depth[:, 3:] > 0).all()
+    assert "mask.png" in source.digests()
+    (folder / "mask.png").write_bytes(b"no image")
+    damaged = open_source(folder)
+    assert not any(r.valid.any() for r in damaged.records() if isinstance(r, RgbdFrame) and r.valid is not None)
+    assert damaged.loss.damaged == 3
+
+
+def test_depth_of_nerfstudio_may_be_smaller_or_float(tmp_path: Path) -> None:
+    folder = make_nerfstudio(tmp_path)
+    cv2.imwrite(str(folder / "depths/d_0.png"), counts_of(0)[::2, ::2])
+    np.save(folder / "depths/d_1.npy", counts_of(1).astype(np.float32) + np.float32(0.25))
+    text = (folder / "transforms.json").read_text().replace("depths/d_1.png", "depths/d_1.npy")
+    (folder / "transforms.json").write_text(text)
+    small, floats, _ = frames_of(folder)
+    nearest = cv2.resize(counts_of(0)[::2, ::2], (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST)
+    assert np.array_equal(small.depth, nearest.astype(np.float32) * np.float32(1e-3))
+    assert floats.depth[1:] == pytest.approx((counts_of(1)[1:] + 0.25) * 1e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "model"),
+    [
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.02, "k3": 0.03, "k4": 0.04}, "equidistant"),
+        ({"camera_model": None, "is_fisheye": True, "k1": 0.01, "k2": 0.02, "k3": 0.03, "k4": 0.04}, "equidistant"),
+        ({"camera_model": "SIMPLE_RADIAL", "k1": 0.01}, "plumb_bob"),
+    ],
+)
+def test_lens_models_of_nerfstudio_are_those_of_opencv(tmp_path: Path, changed: dict[str, Any], model: str) -> None:
+    folder = of_transforms(tmp_path, **changed)
+    views = layout_nerfstudio.read(folder, SourceOptions()).listed
+    assert views[0].camera is not None and views[0].camera.distortion_model == model
+    values = [value for key, value in changed.items() if key.startswith("k")]
+    assert views[0].camera.distortion[: len(values)] == values
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model: expected one of SIMPLE_PINHOLE.*got 'EQUIRECTANGULAR'"),
+        ({"k4": 0.1}, "expected no k4, got 0.1"),
+        ({"fl_x": None}, "no usable 'camera_angle_x' in the intrinsics"),
+        ({"applied_scale": 0.0}, "expected numbers, got float division by zero"),
+    ],
+)
+def test_a_transforms_file_that_cannot_be_used_is_refused(
+    tmp_path: Path, changed: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        open_source(of_transforms(tmp_path, **changed))
+
+
+def test_a_bop_scene_of_several_sensors_gives_a_camera_each(tmp_path: Path) -> None:
+    for sensor in ("cam1", "photoneo"):
+        folder = make_bop(tmp_path / sensor)
+        for name in ("rgb", "depth"):
+            (folder / name).rename(tmp_path / f"{name}_{sensor}")
+        (folder / "scene_camera.json").rename(tmp_path / f"scene_camera_{sensor}.json")
+        folder.rmdir()
+    source = open_source(tmp_path)
+    assert source.cameras == ("cam1", "photoneo")
+    frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
+    check([frame for frame in frames if frame.camera == "photoneo"], 1e-4)
+
+
+def test_grey_tiff_images_of_bop_are_read(tmp_path: Path) -> None:
+    folder = make_bop(tmp_path)
+    (folder / "rgb").rename(folder / "gray")
+    for path in [*(folder / "gray").iterdir(), *(folder / "depth").iterdir()]:
+        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path.with_suffix(".tif")), pixels)
+        path.unlink()
+    check(frames_of(folder), 1e-4)
+
+
+@pytest.mark.parametrize("scale", [0.0, -0.001, math.nan, math.inf])
+def test_a_depth_unit_that_is_none_is_refused(tmp_path: Path, scale: float) -> None:
+    folder = of_transforms(tmp_path, integer_depth_scale=scale)
+    with pytest.raises(InputError, match=r"depth of frame_0: expected metres per count, got .*give --depth-scale"):
+        open_source(folder)
+    assert frames_of(folder, SourceOptions(depth_scale=1e-3))[0].depth[1, 1] > 1.0
+
+
+def test_a_stamp_keeps_every_nanosecond_that_is_written() -> None:
+    assert stamp_of_text("1700000000.123456789") == 1_700_000_000_123_456_789
+    assert stamp_of_text("12.5e-6") == 12_500
+
+
+@pytest.mark.parametrize("text", ["1e300", "-99999999999999999999", "nan", "inf", "x"])
+def test_a_stamp_that_is_no_time_is_none(text: str) -> None:
+    assert stamp_of_text(text) is None
+
+
+@pytest.mark.parametrize("word", ["inf", "1e200"])
+def test_a_pose_of_tum_that_is_none_is_named_by_its_line(tmp_path: Path, word: str) -> None:
+    folder = make_tum(tmp_path / "fr3_x")
+    lines = (folder / "groundtruth.txt").read_text().splitlines()
+    (folder / "groundtruth.txt").write_text("\n".join([*lines, f"1305031109.0 {word} 0 0 {word} 0 0 1"]))
+    with pytest.raises(InputError, match=r"groundtruth.txt:8: expected 'stamp tx ty tz qx qy qz qw'"):
+        open_source(folder)
+
+
+def test_a_lens_of_arkit_scenes_that_is_none_is_refused(tmp_path: Path) -> None:
+    folder = make_arkit(tmp_path)
+    next((folder / "41069021_frames/lowres_wide_intrinsics").iterdir()).write_text("inf 6 10 11 3.5 2.5")
+    with pytest.raises(InputError, match=r"expected width, height, fx, fy, cx, cy, got .*copy the file again"):
+        open_source(folder)
+
+
+def test_a_focal_length_of_next_to_nothing_is_refused(tmp_path: Path) -> None:
+    folder = make_scannet(tmp_path, (WIDTH // 2, HEIGHT // 2))
+    file = folder / "intrinsic/intrinsic_depth.txt"
+    file.write_text(file.read_text().replace("5.0", "1e-320"))
+    with pytest.raises(InputError, match="expected a positive number of pixels, got 1e-320"):
+        open_source(folder)

@@ -1,0 +1,272 @@
+"""Folders of public datasets, opened by their own files: small trees with a known pose and depth."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.recording.capture.capture_writer import write_capture
+from splatctrl_cli.recording.folder.layout import Layout
+from splatctrl_cli.recording.folder.layouts import LAYOUTS, layout_of
+from splatctrl_cli.recording.source import describe, open_source
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import RgbdFrame
+from tests.recording.folder.make_layout import (
+    EXAMPLES,
+    GIVEN,
+    HEIGHT,
+    POSES,
+    WIDTH,
+    K,
+    check,
+    color_of,
+    frames_of,
+    make_bop,
+    make_frames,
+    make_mvsnet,
+    make_nerfstudio,
+    make_redwood,
+    make_scannet,
+    make_tum,
+    matrix_text,
+)
+
+
+@pytest.fixture(params=LAYOUTS, ids=lambda layout: layout.name)
+def layout(request: pytest.FixtureRequest) -> Layout:
+    """Each layout; tests of one of its own are below, and in test_layout_forms.py."""
+    found: Layout = request.param
+    return found
+
+
+def test_a_layout_is_known_by_its_files_described_and_read_to_the_value(tmp_path: Path, layout: Layout) -> None:
+    example = EXAMPLES[layout.name]
+    folder = example.make(tmp_path / "freiburg3")
+    assert layout_of(folder) is layout
+    summary = describe(folder)
+    assert (summary.kind, summary.grids[0].rows) == (layout.name, [["camera", 3]])
+    source = open_source(folder, example.options)
+    frames = [record for record in source.records() if isinstance(record, RgbdFrame)]
+    check(frames, example.unit)
+    assert source.has_clock == (example.stamps_ns is not None)
+    if example.stamps_ns is not None:
+        first, step = example.stamps_ns
+        assert [frame.stamp_ns for frame in frames] == [first + i * step for i in range(3)]
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{}", b"[]", b"null", b"1 2 3\n", b"\xff\xfe nonsense \x00", b'{"0": 3, "frames": [1]}']
+)
+def test_a_damaged_text_of_a_layout_is_refused_in_one_line_or_read_around(
+    tmp_path: Path, layout: Layout, content: bytes
+) -> None:
+    make = EXAMPLES[layout.name].make
+    names = [p.relative_to(tmp_path / "whole") for p in make(tmp_path / "whole").rglob("*") if p.suffix != ".png"]
+    names = [name for name in names if name.suffix]
+    assert names
+    for number, name in enumerate(names):
+        folder = make(tmp_path / f"freiburg3_{number}")
+        (folder / name).write_bytes(content)
+        try:
+            source = open_source(folder, SourceOptions())
+            list(source.records())
+        except InputError as error:
+            assert "\n" not in str(error) and error.remedy
+
+
+def test_the_camera_of_a_tum_folder_is_known_by_its_name(tmp_path: Path) -> None:
+    frame = frames_of(make_tum(tmp_path / "rgbd_dataset_freiburg3_x"))[0]
+    assert (frame.intrinsics.fx, frame.intrinsics.cy) == (535.4, 247.6)
+    assert np.array_equal(frame.color, color_of(0))  # no distortion
+    with pytest.raises(InputError, match=r"expected calibration.txt, or a name with.*give --intrinsics camera="):
+        open_source(make_tum(tmp_path / "desk"))
+
+
+def test_tum_images_without_partner_or_pose_are_counted(tmp_path: Path) -> None:
+    folder = make_tum(tmp_path / "freiburg3")
+    lines = (folder / "depth.txt").read_text().splitlines()
+    (folder / "depth.txt").write_text("\n".join(lines[1:]) + "\n")
+    rows = (folder / "groundtruth.txt").read_text().splitlines()
+    (folder / "groundtruth.txt").write_text("\n".join(rows[:5]) + "\n")
+    source = open_source(folder, GIVEN)
+    assert len(list(source.records())) == 1
+    assert (source.loss.unpaired_color, source.loss.unpaired_depth, source.loss.without_pose) == (1, 0, 1)
+
+
+def test_an_open3d_scene_goes_by_number_where_there_are_more_poses(tmp_path: Path) -> None:
+    folder = make_redwood(tmp_path)
+    text = (folder / "trajectory.log").read_text()
+    for index in range(3):
+        text = text.replace(f"{index} {index} {index + 1}\n", f"{index + 9} {index + 9} {index + 10}\n")
+    (folder / "trajectory.log").write_text(f"0 0 1\n{matrix_text(np.eye(4))}" + text)
+    check(frames_of(folder))
+
+
+def test_an_open3d_scene_without_intrinsics_asks_for_them(tmp_path: Path) -> None:
+    folder = make_redwood(tmp_path / "scene")
+    (folder / "camera_intrinsic.json").unlink()
+    with pytest.raises(InputError, match=r"no camera_intrinsic.json in it or above it; give --intrinsics"):
+        open_source(folder)
+    check(frames_of(folder, GIVEN))
+
+
+@pytest.mark.parametrize("sequence", ["seq-01", "", "data"])
+def test_seven_scenes_take_65535_for_no_depth(tmp_path: Path, sequence: str) -> None:
+    source = open_source(make_frames(tmp_path, sequence), GIVEN)
+    check([r for r in source.records() if isinstance(r, RgbdFrame)])
+    assert source.loss.notes == []
+    assert not source.has_clock
+
+
+def test_frames_with_their_own_intrinsics_need_no_default(tmp_path: Path) -> None:
+    folder = make_frames(tmp_path)
+    matrix = [[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]]
+    (folder / "camera-intrinsics.txt").write_text("\n".join(" ".join(map(str, row)) for row in matrix))
+    source = open_source(folder)
+    check([r for r in source.records() if isinstance(r, RgbdFrame)])
+    assert source.loss.notes == []
+
+
+def test_a_lost_pose_of_scannet_is_counted_not_refused(tmp_path: Path) -> None:
+    folder = make_scannet(tmp_path)
+    (folder / "pose/9.txt").write_text(matrix_text(np.full((4, 4), -np.inf)))
+    source = open_source(folder)
+    assert [int(r.color[0, 0, 0]) for r in source.records() if isinstance(r, RgbdFrame)] == [50, 70]
+    assert source.loss.without_pose == 1
+
+
+def test_scannet_depth_of_another_size_is_registered_to_colour(tmp_path: Path) -> None:
+    frame = frames_of(make_scannet(tmp_path, (WIDTH // 2, HEIGHT // 2)))[0]
+    assert frame.depth.shape == (HEIGHT, WIDTH)
+    assert frame.depth[1:-1, 1:-1] == pytest.approx(1.5)
+
+
+def test_a_bop_scene_without_poses_needs_a_camera_that_stands_still(tmp_path: Path) -> None:
+    folder = make_bop(tmp_path, with_poses=False)
+    with pytest.raises(InputError, match=r"scene_camera.json has no pose for any image.*give --camera-pose"):
+        open_source(folder)
+    still = SourceOptions(camera_poses={"camera": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)})
+    assert [frame.T_world_camera[:3, 3].tolist() for frame in frames_of(folder, still)] == [[1.0, 2.0, 3.0]] * 3
+    assert "camera camera: stands still where --camera-pose puts it" in open_source(folder, still).loss.notes[0]
+
+
+def test_frames_with_a_lens_of_their_own_become_a_camera_of_their_own(tmp_path: Path) -> None:
+    frames = frames_of(make_nerfstudio(tmp_path, fl_x=20.0))
+    assert [(frame.camera, frame.intrinsics.fx) for frame in frames] == [
+        ("camera", 10.0),
+        ("camera-1", 20.0),
+        ("camera", 10.0),
+    ]
+
+
+def test_a_capture_refuses_a_camera_that_changes_its_lens(tmp_path: Path) -> None:
+    folder = make_nerfstudio(tmp_path, fl_x=20.0)
+    (tmp_path / "out").mkdir()
+    write_capture(tmp_path / "out", open_source(folder))
+    with pytest.raises(InputError, match="camera holdout changes its intrinsics"):
+        write_capture(tmp_path / "again", open_source(folder, SourceOptions(holdout=("0", "1"))))
+
+
+def test_a_nerfstudio_frame_without_depth_is_named(tmp_path: Path) -> None:
+    folder = make_nerfstudio(tmp_path)
+    content = json.loads((folder / "transforms.json").read_text())
+    del content["frames"][2]["depth_file_path"]
+    (folder / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"frame_2.png: depth_file_path is missing \(1 of 3 frames\)"):
+        open_source(folder)
+
+
+def test_a_folder_of_scenes_names_them(tmp_path: Path) -> None:
+    make_redwood(tmp_path / "kitchen")
+    make_scannet(tmp_path / "scene0000_00")
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "run.bag").write_bytes(b"")
+    with pytest.raises(InputError, match=r"give one that is in it: kitchen \(Open3D scene\), run.bag, scene0000_00"):
+        open_source(tmp_path)
+    with pytest.raises(InputError, match=r"of no known kind; give one that is in it: kitchen"):
+        describe(tmp_path)
+
+
+def test_files_that_are_named_but_not_there_are_counted(tmp_path: Path) -> None:
+    folder = make_tum(tmp_path / "freiburg3")
+    next((folder / "depth").iterdir()).unlink()
+    source = open_source(folder, GIVEN)
+    assert len(list(source.records())) == 2
+    assert (source.loss.unpaired_color, source.loss.unpaired_depth) == (1, 0)
+    assert "1 of 3 views lack a file" in source.loss.notes[0]
+    (folder / "rgb").rename(tmp_path / "rgb")
+    (folder / "rgb.txt").write_text((folder / "rgb.txt").read_text().replace("rgb/", "../rgb/"))
+    with pytest.raises(InputError, match="is not in"):
+        open_source(folder, GIVEN)
+
+
+def test_a_name_that_no_camera_has_is_refused(tmp_path: Path) -> None:
+    folder = make_redwood(tmp_path)
+    with pytest.raises(InputError, match="no camera 'cam0'; use one of: camera"):
+        open_source(folder, SourceOptions(camera_poses={"cam0": (0, 0, 0, 0, 0, 0, 1)}))
+    with pytest.raises(InputError, match="--intrinsics does not apply to a BOP scene"):
+        open_source(make_bop(tmp_path / "bop"), GIVEN)
+
+
+def test_frames_can_be_held_out_of_a_layout(tmp_path: Path) -> None:
+    frames = frames_of(make_bop(tmp_path), SourceOptions(holdout=("1",)))
+    assert [frame.camera for frame in frames] == ["camera", "holdout", "camera"]
+
+
+def test_a_tum_folder_without_its_poses_names_the_file(tmp_path: Path) -> None:
+    folder = make_tum(tmp_path / "rgbd_dataset_freiburg3_x")
+    (folder / "groundtruth.txt").unlink()
+    with pytest.raises(InputError, match=r"groundtruth.txt: no such file.*; copy it too, or give --camera-pose"):
+        open_source(folder)
+    assert open_source(folder, SourceOptions(camera_poses={"camera": (0, 0, 0, 0, 0, 0, 1)})).cameras == ("camera",)
+
+
+def without_depth(folder: Path, kind: str) -> Path:
+    """Colour, poses and lenses of three views, as sets for novel views have them."""
+    if kind == "MVSNet":
+        shutil.rmtree(make_mvsnet(folder) / "depths")
+        return folder
+    content = json.loads((make_nerfstudio(folder) / "transforms.json").read_text())
+    frames = [{k: v for k, v in frame.items() if k != "depth_file_path"} for frame in content["frames"]]
+    if kind == "nerfstudio":
+        (folder / "transforms.json").write_text(json.dumps({**content, "frames": frames}))
+        return folder
+    angle = 2 * math.atan(WIDTH / 2 / K[0])
+    frames = [{**frame, "file_path": frame["file_path"].removesuffix(".png"), "rotation": 0.01} for frame in frames]
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    (folder / "transforms.json").unlink()
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["nerfstudio", "Blender", "MVSNet"])
+def test_views_without_depth_say_so_first_and_what_works_without(tmp_path: Path, kind: str) -> None:
+    folder = without_depth(tmp_path / "set", kind)
+    with pytest.raises(InputError) as caught:
+        open_source(folder)
+    message = str(caught.value)
+    assert "depth is missing: none of its 3 views has any; add " in message
+    assert "info, score and reconstruct --points CLOUD.ply work without depth" in message
+    assert "\n" not in message
+    assert describe(folder).missing[0].startswith("depth is missing: none of its 3 views has any; add ")
+    frames = [r for r in open_source(folder, needs_depth=False).records() if isinstance(r, RgbdFrame)]
+    assert len(frames) == 3
+    for index, frame in enumerate(frames):
+        assert not frame.depth.any()
+        assert np.array_equal(frame.color, color_of(index))
+        assert frame.T_world_camera == pytest.approx(POSES[index], abs=1e-9)
+        assert frame.intrinsics.fx == pytest.approx(K[0])
+
+
+@pytest.mark.parametrize("places", [["a.png"], ["images/a.jpg", "sparse/0/cameras.bin"]])
+def test_images_alone_say_that_depth_is_missing(tmp_path: Path, places: list[str]) -> None:
+    for place in places:
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).write_bytes(b"x")
+    what = "images of a COLMAP model" if len(places) > 1 else "images"
+    for look in (open_source, describe):
+        with pytest.raises(InputError, match=rf"depth is missing: {what} alone \(1\); describe colour"):
+            look(tmp_path)

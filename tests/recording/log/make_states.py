@@ -1,0 +1,115 @@
+"""Small logs of a robot's motion, made in code, in the types that robots publish."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from tests.recording.log.make_log import STORE, encoded, write_bag, write_raw
+
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 10_000_000
+POINT = "trajectory_msgs/JointTrajectoryPoint"
+OLD_CONTROLLER = f"std_msgs/Header header\nstring[] joint_names\n{POINT} desired\n{POINT} actual\n{POINT} error\n"
+NEW_CONTROLLER = (
+    f"std_msgs/Header header\nstring[] joint_names\n{POINT} reference\n{POINT} feedback\n{POINT} error\n"
+    f"{POINT} output\n{POINT} desired\n{POINT} actual\n"
+)
+FRANKA_STATE = (
+    "std_msgs/Header header\nfloat64[7] q\nfloat64[7] q_d\nfloat64[7] dq\nfloat64[7] dq_d\nfloat64[16] O_T_EE\n"
+    "float64[16] O_T_EE_d\nfloat64 time\n"
+)
+FRANKA_ROBOT_STATE = (
+    "std_msgs/Header header\nsensor_msgs/JointState measured_joint_state\n"
+    "sensor_msgs/JointState desired_joint_state\ngeometry_msgs/PoseStamped o_t_ee\nfloat64 time\n"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Message:
+    """A message of a log: when it was logged, its topic, type and content."""
+
+    log_ns: int
+    topic: str
+    type_name: str
+    content: Any
+
+
+def store_with(**definitions: str) -> Any:
+    """The ROS 2 type store and types by name (package__Type) and definition."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in definitions.items():
+        store.register(get_types_from_msg(text, name.replace("__", "/msg/")))
+    return store
+
+
+def header(store: Any, stamp_ns: int, frame: str = "") -> Any:
+    """A std_msgs/Header of either ROS."""
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    kind, time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+    stamp = time(sec=seconds, nanosec=nanoseconds)
+    return (
+        kind(seq=0, stamp=stamp, frame_id=frame)
+        if "seq" in kind.__dataclass_fields__
+        else kind(stamp=stamp, frame_id=frame)
+    )
+
+
+def joint_state(
+    stamp_ns: int,
+    names: Sequence[str],
+    position: Sequence[float],
+    velocity: Sequence[float] = (),
+    *,
+    store: Any = STORE,
+) -> Any:
+    """A sensor_msgs/JointState."""
+    return store.types["sensor_msgs/msg/JointState"](
+        header=header(store, stamp_ns),
+        name=list(names),
+        position=np.array(position, dtype=np.float64),
+        velocity=np.array(velocity, dtype=np.float64),
+        effort=np.zeros(0),
+    )
+
+
+def states_of(
+    q: Any,
+    names: Sequence[str],
+    *,
+    topic: str = "/joint_states",
+    stamps: Sequence[int] | None = None,
+    velocity: Any = None,
+    log_delay_ns: int = 0,
+) -> list[Message]:
+    """JointState messages of positions (T, J), every 10 ms."""
+    times = [START_NS + i * STEP_NS for i in range(len(q))] if stamps is None else list(stamps)
+    return [
+        Message(
+            log_ns=stamp + log_delay_ns,
+            topic=topic,
+            type_name="sensor_msgs/msg/JointState",
+            content=joint_state(stamp, names, q[i], () if velocity is None else velocity[i]),
+        )
+        for i, stamp in enumerate(times)
+    ]
+
+
+def write_mcap(path: Path, messages: Sequence[Message], store: Any = STORE) -> Path:
+    """An MCAP log of the messages, in their order."""
+    return write_raw(path, [encoded(m.log_ns, m.topic, m.content, store) for m in messages])
+
+
+def write_bag2(path: Path, messages: Sequence[Message], store: Any = STORE) -> Path:
+    """A ROS 2 bag folder (sqlite3)."""
+    written = [encoded(m.log_ns, m.topic, m.content, store) for m in messages]
+    return write_bag(path, written, store, StoragePlugin.SQLITE3)
+
+
+def write_bag1(path: Path, messages: Sequence[Message], store: Any) -> Path:
+    """A ROS 1 bag."""
+    return write_bag(path, [encoded(m.log_ns, m.topic, m.content, store, ros=1) for m in messages], store)

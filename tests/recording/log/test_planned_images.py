@@ -1,0 +1,98 @@
+"""Images that wait for others: in memory, and beyond a bound in a file; the plan that says which are needed; and
+pairs by stamp.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.recording.log import frame_plan
+from splatctrl_cli.recording.log.frame_plan import HeldMessages, PlannedImages
+from splatctrl_cli.recording.log.ros_log import RosLogSource
+from splatctrl_cli.recording.log.survey import pair_by_stamp
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import RgbdFrame
+from tests.recording.log.make_log import LogRecipe, make_log, messages_of, write_raw
+
+TOPIC = Topic(name="/a", type_name="t", encoding="cdr")
+
+
+def topic_by_topic(log: Path, path: Path) -> Path:
+    """The log with all messages of a topic before those of the next."""
+    return write_raw(path, sorted(messages_of(log), key=lambda m: m.topic.name))
+
+
+@pytest.mark.parametrize("held_bytes", [0, 1000, 1 << 20])
+def test_a_log_that_keeps_its_topics_apart_gives_the_same_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, held_bytes: int
+) -> None:
+    monkeypatch.setattr(frame_plan, "HELD_BYTES", held_bytes)
+    log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
+    apart = topic_by_topic(log, tmp_path / "apart.mcap")
+    good, other = ([r for r in open_source(p).records() if isinstance(r, RgbdFrame)] for p in (log, apart))
+    assert len(good) == len(other) == 10
+    for a, b in zip(good, other, strict=True):
+        assert (a.stamp_ns, a.camera) == (b.stamp_ns, b.camera)
+        assert np.array_equal(a.color, b.color) and np.array_equal(a.depth, b.depth)
+        assert np.array_equal(a.T_world_camera, b.T_world_camera)
+
+
+def test_held_messages_come_back_and_memory_holds_few_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_plan, "HELD_BYTES", 100)
+    held = HeldMessages()
+    data = [bytes([i]) * 40 for i in range(10)]
+    for i, content in enumerate(data):
+        held.add(("/a", i), RawMessage(topic=TOPIC, log_time_ns=i, data=content))
+    assert sum(len(message.data) for message in held._messages.values()) == 80
+    for i in (9, 0, 5, 5, 1, 2, 3):
+        assert held.get(("/a", i)) == RawMessage(topic=TOPIC, log_time_ns=i, data=data[i])
+    for i in range(10):
+        assert held.pop(("/a", i)).data == data[i] and ("/a", i) not in held
+    held.add(("/a", 10), RawMessage(topic=TOPIC, log_time_ns=0, data=bytes(100)))
+    assert not held._places  # what went has made room
+
+
+def test_the_plan_takes_few_bytes_a_frame(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1"), mask_every=2)))
+    assert isinstance(source, RosLogSource)
+    plan = source._plan
+    assert plan._columns.nbytes == 48 * len(plan) == 48 * 10
+    assert [planned.stamp_ns for planned in plan] == sorted(planned.stamp_ns for planned in plan)
+    assert [planned.camera.name for planned in plan][:4] == ["cam0", "cam1"] * 2
+    uses = plan.uses()
+    assert {topic: int(counts.sum()) for topic, counts in uses.items()} == {
+        f"/cam{i}/{name}": 5 for i in range(2) for name in ("color/image_raw/compressed", "depth/image_raw")
+    }
+
+
+def test_frames_come_by_stamp_then_camera_in_whatever_order_these_are_named(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
+    named = [SourceOptions(cameras=names) for names in (("cam0", "cam1"), ("cam1", "cam0"))]
+    orders = [[(s, c) for s, c, _ in open_source(log, options).poses()] for options in named]
+    assert orders[0] == orders[1] == sorted(orders[0])
+
+
+def test_images_that_no_frame_needs_any_more_are_let_go(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1"))))
+    assert isinstance(source, RosLogSource)
+    images = PlannedImages(source._log, source._plan)
+    most = [len(images._held._messages) for _ in images.of_frames(Damage())]
+    assert len(most) == 10 and max(most) <= 4 and most[-1] == 0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_pairs_are_those_of_every_pair_tried_in_turn(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    color, depth = (random.integers(0, 200, random.integers(0, 40)).tolist() for _ in range(2))
+    tolerance = int(random.integers(0, 30))
+    near = [(abs(a - b), a, b, i, j) for i, a in enumerate(color) for j, b in enumerate(depth)]
+    expected: dict[int, int] = {}
+    for gap, _, _, i, j in sorted(near):
+        if gap <= tolerance and i not in expected and j not in expected.values():
+            expected[i] = j
+    assert pair_by_stamp(color, depth, tolerance) == sorted(
+        expected.items(), key=lambda pair: (color[pair[0]], pair[0])
+    )

@@ -1,0 +1,157 @@
+"""Depth warped into the colour camera; lens distortion removed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pinocchio.rpy import rpyToMatrix
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import pose_at
+from splatctrl_cli.recording.log.registration import DepthToColor, Undistortion
+from splatctrl_cli.records import Intrinsics
+
+SMALL = Intrinsics(fx=40, fy=40, cx=19.5, cy=14.5, width=40, height=30)
+LARGE = Intrinsics(fx=64, fy=64, cx=31.5, cy=23.5, width=64, height=48)
+
+
+def shift(x: float = 0.0, z: float = 0.0) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    return pose_at([x, 0, z])
+
+
+def test_the_same_camera_gives_the_same_depth() -> None:
+    depth = np.random.default_rng(0).uniform(0.5, 2.0, (30, 40)).astype(np.float32)
+    depth[5, 5] = 0
+    warped = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=SMALL, T_color_depth=np.eye(4)).warp(depth)
+    assert warped == pytest.approx(depth, abs=1e-6)
+
+
+def test_a_wall_fills_a_finer_color_camera_without_holes() -> None:
+    wall = np.full((30, 40), 1.5, dtype=np.float32)
+    warped = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=LARGE, T_color_depth=shift(z=0.1)).warp(wall)
+    inside = warped[4:-4, 4:-4]
+    assert inside == pytest.approx(1.6, abs=1e-6)
+
+
+def test_a_baseline_moves_a_column_by_its_disparity() -> None:
+    depth = np.zeros((30, 40), dtype=np.float32)
+    depth[:, 10] = 0.8
+    warped = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=SMALL, T_color_depth=shift(x=0.1)).warp(depth)
+    columns = np.flatnonzero(warped[15])
+    assert columns.tolist() == [10 + round(40 * 0.1 / 0.8)]
+
+
+def test_the_nearest_of_two_surfaces_on_a_pixel_counts() -> None:
+    depth = np.zeros((30, 40), dtype=np.float32)
+    depth[15, 20], depth[15, 24] = 0.5, 2.0  # with x = 0.1: disparities 8 and 2 px
+    depth[15, 26] = 2.0
+    warped = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=SMALL, T_color_depth=shift(x=0.1)).warp(depth)
+    assert warped[15, 28] == pytest.approx(0.5)
+    assert warped[15, 26] == pytest.approx(2.0)
+
+
+def test_points_behind_the_color_camera_are_left_out() -> None:
+    depth = np.full((30, 40), 0.3, dtype=np.float32)
+    warp = DepthToColor(depth_intrinsics=SMALL, color_intrinsics=SMALL, T_color_depth=shift(z=-0.5))
+    assert not warp.warp(depth).any()
+
+
+def test_undistorting_without_distortion_changes_nothing() -> None:
+    image = np.random.default_rng(1).integers(0, 256, (30, 40, 3)).astype(np.uint8)
+    assert np.array_equal(Undistortion(SMALL, "plumb_bob", np.zeros(5)).color(image), image)
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+def test_a_distorted_point_lands_where_the_pinhole_puts_it(model: str) -> None:
+    k1 = -0.3
+    x, y = 0.35, 0.2  # normalised pinhole coordinates
+    r = np.hypot(x, y)
+    theta = np.arctan(r)
+    factor = 1 + k1 * r * r if model == "plumb_bob" else theta * (1 + k1 * theta**2) / r
+    big = Intrinsics(fx=400, fy=400, cx=199.5, cy=149.5, width=400, height=300)
+    u, v = 400 * x * factor + 199.5, 400 * y * factor + 149.5
+    columns, rows = np.meshgrid(np.arange(400), np.arange(300))
+    spot = np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 18.0)
+    image = np.repeat((255 * spot).astype(np.uint8)[..., None], 3, axis=2)
+    flat = Undistortion(big, model, np.array([k1, 0, 0, 0])).color(image)[..., 0].astype(float)
+    found = np.array([(flat * columns).sum(), (flat * rows).sum()]) / flat.sum()
+    assert found == pytest.approx([400 * x + 199.5, 400 * y + 149.5], abs=0.5)
+
+
+def test_a_pincushion_keeps_its_focal_length_and_marks_the_corners_that_it_did_not_see() -> None:
+    lens = Undistortion(LARGE, "plumb_bob", np.array([0.4, 0, 0, 0, 0]))
+    assert lens.intrinsics == LARGE and lens.valid is not None
+    u, v = np.meshgrid(np.arange(64), np.arange(48))
+    x, y = (u - LARGE.cx) / LARGE.fx, (v - LARGE.cy) / LARGE.fy
+    r2 = x * x + y * y
+    column, row = LARGE.fx * x * (1 + 0.4 * r2) + LARGE.cx, LARGE.fy * y * (1 + 0.4 * r2) + LARGE.cy
+    seen = (column >= 0) & (column <= 63) & (row >= 0) & (row <= 47)
+    assert np.array_equal(lens.valid, seen) and not seen[0, 0] and seen[24, 32]
+    depth = lens.depth(np.full((48, 64), 2.0, np.float32))
+    color = lens.color(np.full((48, 64, 3), 200, np.uint8))
+    assert (depth[seen] == 2.0).all() and not depth[~seen].any()
+    assert (color[seen] == 200).all() and not color[~seen].any()
+
+
+def test_a_turned_and_zoomed_result_shows_what_the_lens_saw_there() -> None:
+    """As a stereo pair is rectified: the result's axes are turned from the lens's, its focal length is shorter."""
+    R = rpyToMatrix(0.02, -0.1, 0.05)
+    result = replace(LARGE, fx=0.8 * LARGE.fx, fy=0.8 * LARGE.fy)
+    seen = Undistortion(result, "plumb_bob", np.array([0.1, 0, 0, 0, 0]), lens=LARGE, R=R).valid
+    u, v = np.meshgrid(np.arange(64), np.arange(48))
+    rays = np.stack([(u - result.cx) / result.fx, (v - result.cy) / result.fy, np.ones(u.shape)], axis=2)
+    x, y, z = np.moveaxis(rays @ R, 2, 0)  # R leads from the lens's axes to the result's
+    x, y = x / z, y / z
+    bent = 1 + 0.1 * (x * x + y * y)
+    column, row = LARGE.fx * x * bent + LARGE.cx, LARGE.fy * y * bent + LARGE.cy
+    assert np.array_equal(seen, (column >= 0) & (column <= 63) & (row >= 0) & (row <= 47))
+
+
+def test_a_barrel_shows_every_pixel_of_its_own_pinhole() -> None:
+    assert Undistortion(SMALL, "plumb_bob", np.array([-0.3, 0.1, 0, 0, 0])).valid is None
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "turns_at"),
+    [
+        ("plumb_bob", [-0.3, 0, 0, 0, 0], np.sqrt(1 / 0.9)),  # d(r - 0.3 r^3)/dr = 0
+        ("equidistant", [-0.3, 0, 0, 0], np.tan(np.sqrt(1 / 0.9))),
+        ("rational_polynomial", [0, 0, 0, 0, 0, 1.0, 0, 0], 1.0),  # r / (1 + r^2)
+    ],
+)
+def test_where_a_polynomial_turns_back_nothing_is_shown_twice(
+    model: str, coefficients: list[float], turns_at: float
+) -> None:
+    wide = Intrinsics(fx=16, fy=16, cx=31.5, cy=23.5, width=64, height=48)
+    valid = Undistortion(wide, model, np.array(coefficients, dtype=float)).valid
+    assert valid is not None
+    u, v = np.meshgrid(np.arange(64), np.arange(48))
+    radius = np.hypot((u - wide.cx) / wide.fx, (v - wide.cy) / wide.fy)
+    assert radius[valid].max() == pytest.approx(turns_at, abs=0.1)
+    assert np.array_equal(valid, radius < turns_at)
+
+
+def test_a_lens_that_saw_hardly_anything_is_refused() -> None:
+    with pytest.raises(InputError, match=r"the camera saw 0% of the pinhole's image, expected at least 25%"):
+        Undistortion(SMALL, "plumb_bob", np.array([-500.0, 0, 0, 0, 0]))
+
+
+@pytest.mark.parametrize(("model", "counts"), [("plumb_bob", "4, 5, 8, 12, 14"), ("equidistant", "4")])
+def test_a_number_of_coefficients_that_no_model_has_is_refused(model: str, counts: str) -> None:
+    with pytest.raises(InputError, match=rf"{model}: expected {counts} coefficients, got 3; calibrate again"):
+        Undistortion(SMALL, model, np.array([0.01, 0, 0]))
+
+
+def test_the_depth_cameras_own_lens_is_undone_before_its_depth_is_registered() -> None:
+    """A distorted column of depth becomes straight."""
+    k1 = 0.3
+    own = Undistortion(LARGE, "plumb_bob", np.array([k1, 0, 0, 0, 0]))
+    x = 0.25
+    y = np.linspace(-0.3, 0.3, 400)
+    factor = 1 + k1 * (x * x + y * y)
+    bent = np.zeros((48, 64), np.float32)
+    row, column = np.rint(LARGE.fy * y * factor + LARGE.cy), np.rint(LARGE.fx * x * factor + LARGE.cx)
+    bent[row.astype(int), column.astype(int)] = 1.0
+    warp = DepthToColor(depth_intrinsics=LARGE, color_intrinsics=LARGE, T_color_depth=np.eye(4), undistortion=own)
+    found = np.nonzero(warp.warp(bent))[1]
+    assert np.abs(found - (LARGE.fx * x + LARGE.cx)).max() <= 1.0

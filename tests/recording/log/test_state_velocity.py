@@ -1,0 +1,138 @@
+"""Velocities from positions, and the two clocks of a log."""
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.recording.log.state_topics import checked_stamps
+from splatctrl_cli.recording.log.state_track import RawTrack, cleaned, differentiated, gaps_of, smoothed_seconds
+from splatctrl_cli.records import LossReport
+
+MS = 1_000_000
+START_NS = 1_700_000_000_000_000_000
+
+
+def regular(num: int, period_ms: float = 10.0) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    return START_NS + np.round(np.arange(num) * period_ms * MS).astype(np.int64)
+
+
+def test_the_derivative_of_a_parabola_is_exact_at_uneven_steps() -> None:
+    rng = np.random.default_rng(1)
+    stamps = START_NS + np.cumsum(rng.integers(4, 30, 60)) * MS
+    t = (stamps - stamps[0]) * 1e-9
+    position = np.stack([1 + 2 * t + 3 * t**2, -t], axis=1)
+    assert differentiated(stamps, position) == pytest.approx(np.stack([2 + 6 * t, -np.ones(60)], axis=1), abs=1e-6)
+
+
+def test_jitter_of_sending_is_smoothed_out_of_a_fixed_rate() -> None:
+    rng = np.random.default_rng(2)
+    true = regular(500)
+    sent = true + rng.integers(-3 * MS, 3 * MS, 500)
+    t = (true - true[0]) * 1e-9
+    position, truth = np.sin(2 * t)[:, None], 2 * np.cos(2 * t)[:, None]
+    error = np.abs(differentiated(sent, position) - truth)
+    raw = np.abs(np.gradient(position[:, 0], (sent - sent[0]) * 1e-9)[:, None] - truth)
+    assert error.max() < 0.04
+    assert np.median(error) < np.median(raw) / 10
+
+
+def test_lost_states_do_not_bend_the_smoothed_clock() -> None:
+    keep = np.ones(200, dtype=bool)
+    keep[[30, 31, 77, 150]] = False
+    stamps = regular(200)[keep]
+    assert smoothed_seconds(stamps) == pytest.approx((stamps - stamps[0]) * 1e-9, abs=1e-9)
+
+
+def test_stamps_without_a_rate_are_left_as_they_are() -> None:
+    rng = np.random.default_rng(3)
+    stamps = START_NS + np.cumsum(rng.integers(1, 100, 300)) * MS
+    assert np.array_equal(smoothed_seconds(stamps), (stamps - stamps[0]) * 1e-9)
+
+
+def test_nothing_is_fitted_across_a_gap() -> None:
+    stamps = regular(20)
+    stamps[10:] += 5_000 * MS
+    position = np.where(np.arange(20) < 10, 0.0, 1.0)[:, None]
+    assert list(gaps_of(stamps)) == [9]
+    assert differentiated(stamps, position) == pytest.approx(np.zeros((20, 1)), abs=1e-9)
+
+
+def track(position: np.ndarray[tuple[int, int], np.dtype[np.float64]], velocity: float | None) -> RawTrack:
+    return RawTrack(
+        where="log",
+        names=("a", "b"),
+        stamp_ns=regular(len(position)),
+        position=position,
+        velocity=np.full(position.shape, np.nan if velocity is None else velocity),
+    )
+
+
+def test_a_velocity_of_zero_is_believed_of_a_joint_that_stands_still_only() -> None:
+    position = np.stack([np.arange(50) * 0.01, np.full(50, 0.3)], axis=1)
+    loss = LossReport()
+    states = cleaned(track(position, 0.0), loss)
+    assert states[20].velocity == pytest.approx([1.0, 0.0])
+    assert loss.differentiated_velocities == 50
+    assert loss.notes == [
+        "log: velocities of a are zero throughout although they move; they are differences of the positions"
+    ]
+
+
+def test_recorded_velocities_are_kept_and_other_units_are_said() -> None:
+    position = np.stack([np.arange(50) * 0.01, np.arange(50) * 0.01], axis=1)
+    loss = LossReport()
+    assert cleaned(track(position, 1.1), loss)[20].velocity == pytest.approx([1.1, 1.1])
+    assert (loss.notes, loss.differentiated_velocities) == ([], 0)
+    cleaned(track(position, float(np.degrees(1.0))), loss)
+    assert "57.3 times the change of the positions" in loss.notes[0]
+
+
+def test_stamps_that_were_never_set_give_way_to_the_time_of_logging() -> None:
+    loss, log = LossReport(), regular(5)
+    assert np.array_equal(checked_stamps(np.zeros(5, dtype=np.int64), log, "t", loss), log)
+    assert "no state has a stamp" in loss.notes[0]
+
+
+def test_stamps_that_are_set_in_part_are_mixed_clocks() -> None:
+    stamps = regular(20)
+    stamps[3] = 0
+    with pytest.raises(InputError, match="t: mixed clocks: 1 of 20 states have no stamp"):
+        checked_stamps(stamps, regular(20), "t", LossReport())
+
+
+@pytest.mark.parametrize("num", [6, 60])
+def test_a_jump_from_simulated_to_wall_time_is_mixed_clocks(num: int) -> None:
+    stamps = regular(num)
+    stamps[: num // 2] -= START_NS
+    with pytest.raises(InputError, match=f"mixed clocks: stamps jump by .* at state {num // 2}"):
+        checked_stamps(stamps, regular(num), "t", LossReport())
+
+
+def test_a_clock_that_was_set_is_said_and_one_late_message_is_not() -> None:
+    stamps, log, loss = regular(60), regular(60), LossReport()
+    log[30] += 3_000 * MS
+    checked_stamps(stamps, log, "t", loss)
+    assert loss.notes == []
+    stamps[40:] += 2_500 * MS
+    checked_stamps(stamps, log, "t", loss)
+    assert "stamps step by 2.500 s against the time of logging at state 40" in loss.notes[0]
+
+
+def test_another_clock_and_its_drift_are_measured() -> None:
+    log = regular(2000)
+    seconds = np.arange(2000) * 0.01
+    stamps = log - START_NS - np.round(seconds * 1e9 * 1e-3).astype(np.int64)  # simulated, 1000 ppm slow
+    delay = np.random.default_rng(4).exponential(2 * MS, 2000).astype(np.int64)
+    loss = LossReport()
+    assert np.array_equal(checked_stamps(stamps, log + delay, "t", loss), stamps)
+    assert "two clocks" in loss.notes[0]
+    ppm = float(loss.notes[1].split("(")[1].split(" ")[0])
+    assert ppm == pytest.approx(1000, rel=0.03)
+
+
+def test_delays_of_logging_alone_are_no_drift() -> None:
+    delay = np.random.default_rng(5).exponential(5 * MS, 2000).astype(np.int64)
+    delay[1700:] += 30 * MS  # a disk that stalls near the end
+    loss = LossReport()
+    checked_stamps(regular(2000), regular(2000) + delay, "t", loss)
+    assert loss.notes == []

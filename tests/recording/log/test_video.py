@@ -1,0 +1,293 @@
+"""Compressed video in logs and beside them: images where their messages were, and what is missing left out."""
+
+import json
+from base64 import b64encode
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+from mcap_protobuf.schema import build_file_descriptor_set
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from splatctrl_cli import libraries
+from splatctrl_cli.checks.check_log import check_log
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.recording.container.foxglove import DEFINITIONS
+from splatctrl_cli.recording.container.raw_log import RawMessage, Topic
+from splatctrl_cli.recording.log import cameras
+from splatctrl_cli.recording.log.decoder import COMPRESSED_IMAGE
+from splatctrl_cli.recording.log.video import VideoFileLog, open_log
+from splatctrl_cli.recording.source import describe, open_logs, open_session, open_source
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import RgbdFrame
+from tests.recording.log.make_log import (
+    FRAME_NS,
+    HEIGHT,
+    START_NS,
+    WIDTH,
+    LogRecipe,
+    color_pixels,
+    header,
+    make_log,
+    messages_of,
+    write_raw,
+)
+
+NUM, GOP = 12, 5
+RECIPE = LogRecipe(has_joints=False, num_frames=NUM, color_format="png")
+FFMPEG = (
+    "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\nbool is_bigendian\n"
+    "uint8[] data\n"
+)  # ffmpeg_image_transport_msgs/msg/FFMPEGPacket.msg
+Change = Callable[[list[tuple[int, bytes]]], list[tuple[int, bytes]]]
+
+
+def packets(codec: str = "libx264", num: int = NUM) -> list[bytes]:
+    """The colour of a log's frames, a packet each, a key frame every GOP; as good as lossless."""
+    context: Any = av.CodecContext.create(codec, "w")
+    context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, "yuv444p"
+    context.time_base, context.framerate = Fraction(1, 10), Fraction(10)
+    context.gop_size, context.max_b_frames, context.thread_count = GOP, 0, 1
+    context.options = {
+        **{"tune": "zerolatency", "qp": "4", "sc_threshold": "0"},
+        "x265-params": "log-level=none:qp=4:min-cu-size=8:ctu=16:scenecut=0:pools=none:frame-threads=1",
+    }
+    frames = [av.VideoFrame.from_ndarray(color_pixels(i), format="rgb24") for i in range(num)]
+    found: list[bytes] = []
+    for i, frame in enumerate(frames):
+        frame.pts = i
+        found += [bytes(packet) for packet in context.encode(frame)]
+    return found + [bytes(packet) for packet in context.encode(None)]
+
+
+def as_message(message: RawMessage, data: bytes, kind: str, form: str) -> RawMessage:
+    """A packet in place of an image's message."""
+    stamp, frame, topic = message.log_time_ns, "cam0_optical", message.topic.name
+    seconds, nanoseconds = divmod(stamp, 10**9)
+    if kind == "protobuf":
+        said = CompressedVideo(frame_id=frame, data=data, format=form)
+        said.timestamp.FromNanoseconds(stamp)
+        definition = build_file_descriptor_set(CompressedVideo).SerializeToString().decode("latin-1")
+        channel = Topic(name=topic, type_name="foxglove.CompressedVideo", encoding="protobuf", definition=definition)
+        return replace(message, topic=channel, data=said.SerializeToString())
+    if kind == "json":
+        fields = {"timestamp": {"sec": seconds, "nsec": nanoseconds}, "frame_id": frame, "format": form}
+        channel = Topic(name=topic, type_name="foxglove.CompressedVideo", encoding="json", definition="{}")
+        return replace(message, topic=channel, data=json.dumps({**fields, "data": b64encode(data).decode()}).encode())
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    name = "foxglove_msgs/msg/CompressedVideo" if kind == "cdr" else "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
+    store.register(get_types_from_msg(DEFINITIONS[name] if kind == "cdr" else FFMPEG, name))
+    array = np.frombuffer(data, np.uint8)
+    if kind == "cdr":
+        time = store.types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+        content = store.types[name](timestamp=time, frame_id=frame, data=array, format=form)
+    else:
+        rest: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "pts": 0, "flags": 0, "is_bigendian": False}
+        content = store.types[name](header=header(stamp, frame), encoding=form, data=array, **rest)
+    definition = store.generate_msgdef(name, ros_version=2)[0]
+    channel = Topic(name=topic, type_name=name, encoding="cdr", definition=definition)
+    return replace(message, topic=channel, data=bytes(store.serialize_cdr(content, name)))
+
+
+def video_log(
+    path: Path,
+    kind: str = "cdr",
+    form: str = "h264",
+    *,
+    codec: str = "libx264",
+    change: Change = lambda numbered: numbered,
+) -> Path:
+    """A log of RECIPE whose colour is video, its packets by number as `change` leaves them."""
+    log = make_log(path.with_name("images.mcap"), RECIPE)
+    kept, number, written = dict(change(list(enumerate(packets(codec))))), -1, []
+    for message in messages_of(log):
+        if message.topic.type_name != COMPRESSED_IMAGE:
+            written.append(message)
+            continue
+        number += 1
+        if number in kept:
+            written.append(as_message(message, kept[number], kind, form))
+    return write_raw(path, written)
+
+
+def frames_of(source: Any) -> list[RgbdFrame]:
+    return [record for record in source.records() if isinstance(record, RgbdFrame)]
+
+
+def numbers_of(frames: list[RgbdFrame]) -> list[int]:
+    """Of the images, by what is in them; it must be what their stamps say."""
+    for frame in frames:
+        number = (frame.stamp_ns - START_NS) // FRAME_NS
+        assert np.abs(frame.color.astype(int) - color_pixels(number)).max() <= 4
+    return [(frame.stamp_ns - START_NS) // FRAME_NS for frame in frames]
+
+
+@pytest.mark.parametrize(
+    ("kind", "form", "codec"),
+    [
+        ("protobuf", "h264", "libx264"),
+        ("json", "h264", "libx264"),
+        ("cdr", "h265", "libx265"),
+        ("ffmpeg", "hevc", "libx265"),
+        ("ffmpeg", "libx264;yuv420p", "libx264"),
+    ],
+)
+def test_every_image_of_a_video_has_its_stamp_pose_and_depth(
+    tmp_path: Path, kind: str, form: str, codec: str
+) -> None:
+    path = video_log(tmp_path / "video.mcap", kind, form, codec=codec)
+    source = open_source(path)
+    frames = frames_of(source)
+    assert numbers_of(frames) == list(range(NUM))
+    assert source.loss.damaged == 0
+    for frame, same in zip(frames, frames_of(open_source(tmp_path / "images.mcap")), strict=True):
+        assert np.array_equal(frame.depth, same.depth)
+        assert np.array_equal(frame.T_world_camera, same.T_world_camera)
+
+
+def test_info_and_check_take_video_for_the_colour_that_it_is(tmp_path: Path) -> None:
+    path = video_log(tmp_path / "video.mcap")
+    rows = {str(row[0]): row[1:] for row in describe(path).grids[0].rows}
+    assert rows["/cam0/color/image_raw/compressed"][:3] == ["foxglove_msgs/msg/CompressedVideo", "video", NUM]
+    report = check_log(open_log(path), SourceOptions())
+    images = check_log(open_log(tmp_path / "images.mcap"), SourceOptions())
+    assert [finding.code for finding in report.findings] == [finding.code for finding in images.findings]
+
+
+def test_images_before_the_first_key_frame_are_left_out_and_counted(tmp_path: Path) -> None:
+    source = open_source(video_log(tmp_path / "video.mcap", change=lambda numbered: numbered[2:]))
+    assert numbers_of(frames_of(source)) == list(range(GOP, NUM))
+    assert source.loss.damaged == GOP - 2
+    said = "3 images of video before its first key frame left out: record a key frame every second, or cut the log"
+    assert said in source.loss.notes[0]
+
+
+@pytest.mark.parametrize(("codec", "form"), [("libx264", "h264"), ("libx265", "h265")])
+def test_images_after_one_that_is_missing_are_left_out_up_to_the_next_key_frame(
+    tmp_path: Path, codec: str, form: str
+) -> None:
+    """FFmpeg shows those of H.264, with the blocks of the wrong image."""
+    log = video_log(
+        tmp_path / "video.mcap", form=form, codec=codec, change=lambda numbered: numbered[:2] + numbered[3:]
+    )
+    source = open_source(log)
+    assert numbers_of(frames_of(source)) == [0, 1, *range(GOP, NUM)]
+    assert source.loss.damaged == 2
+    assert "2 images of video that follow missing or damaged ones, up to the next key frame" in source.loss.notes[0]
+
+
+def test_a_damaged_key_frame_takes_its_images_with_it(tmp_path: Path) -> None:
+    def cut(numbered: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+        return [(i, data[: len(data) // 2] if i == GOP else data) for i, data in numbered]
+
+    source = open_source(video_log(tmp_path / "video.mcap", change=cut))
+    assert numbers_of(frames_of(source)) == [*range(GOP), *range(2 * GOP, NUM)]
+    assert source.loss.damaged == GOP
+
+
+def test_video_without_any_key_frame_is_refused(tmp_path: Path) -> None:
+    log = video_log(tmp_path / "video.mcap", change=lambda numbered: [n for n in numbered if n[0] % GOP])
+    with pytest.raises(InputError, match=r"no image of the video can be decoded \(.*: 9 images of video before its"):
+        open_source(log)
+
+
+def test_video_of_another_codec_is_named_with_what_to_do(tmp_path: Path) -> None:
+    log = video_log(tmp_path / "video.mcap", form="vp9")
+    with pytest.raises(
+        InputError, match=r"colour is video \(/cam0/.*\), which is neither H.264 nor H.265; decode it"
+    ):
+        open_source(log)
+
+
+def test_without_the_library_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = video_log(tmp_path / "video.mcap")
+    monkeypatch.setattr("splatctrl_cli.recording.log.video.is_installed", lambda name: False)
+    monkeypatch.setattr(cameras, "is_installed", lambda name: False)
+    with pytest.raises(InputError, match=r"the library av is not installed; pip install 'splatctrl-cli\[video\]'"):
+        open_source(log)
+    monkeypatch.setattr(libraries, "import_module", lambda name: (_ for _ in ()).throw(ImportError(name)))
+    with pytest.raises(UsageError, match=r"video files need the library av.*splatctrl-cli\[video\]"):
+        (tmp_path / "color.csv").write_text("0.0\n")
+        open_logs([write_mp4(tmp_path / "color.mp4")])
+
+
+def write_mp4(path: Path, *, b_frames: int = 0) -> Path:
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv444p"
+        stream.options = {"qp": "4"}
+        stream.codec_context.max_b_frames = b_frames
+        for i in range(NUM):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(color_pixels(i), format="rgb24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def stamped(folder: Path, lines: list[str], *, b_frames: int = 0) -> Path:
+    """The log without its colour, and a video beside it whose stamps are these lines."""
+    log = make_log(folder / "images.mcap", RECIPE)
+    kept = [m for m in messages_of(log) if m.topic.type_name != COMPRESSED_IMAGE]
+    write_raw(folder / "run.mcap", kept)
+    (folder / "color.csv").write_text("\n".join(lines) + "\n")
+    return write_mp4(folder / "color.mp4", b_frames=b_frames)
+
+
+STAMPS = [START_NS + i * FRAME_NS for i in range(NUM)]
+
+
+@pytest.mark.parametrize("b_frames", [0, 3])
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in STAMPS],
+        ["# ns", *(str(stamp) for stamp in STAMPS)],
+        ["frame,timestamp_us", *(f"{i},{stamp // 1000}" for i, stamp in enumerate(STAMPS))],
+        [str(stamp // 10**6) for stamp in STAMPS],
+    ],
+    ids=["seconds", "nanoseconds", "microseconds", "milliseconds"],
+)
+def test_a_video_file_beside_a_log_is_its_colour(tmp_path: Path, lines: list[str], b_frames: int) -> None:
+    stamped(tmp_path, lines, b_frames=b_frames)
+    source = open_session([tmp_path / "run.mcap", tmp_path / "color.mp4"])
+    frames = frames_of(source)
+    assert numbers_of(frames) == list(range(NUM))
+    for frame, same in zip(frames, frames_of(open_source(tmp_path / "images.mcap")), strict=True):
+        assert np.array_equal(frame.T_world_camera, same.T_world_camera)
+        assert frame.intrinsics == same.intrinsics
+    assert set(source.digests()) == {"run.mcap", "color.mp4", "color.csv"}
+    assert describe(tmp_path / "color.mp4").kind == "video"
+
+
+def test_stamps_that_are_missing_or_too_few_or_unreadable_are_named(tmp_path: Path) -> None:
+    video = stamped(tmp_path, [str(stamp) for stamp in STAMPS[1:]])
+    with pytest.raises(InputError, match=r"color\.mp4: 12 images, but 11 stamps in color\.csv"):
+        open_session([tmp_path / "run.mcap", video])
+    for lines, words in (
+        (["1 2", "2 3"], "expected a stamp a line, or columns whose first line names one"),
+        (["frame,image", "0,1"], "expected a stamp a line"),
+        (["1.0", "soon"], "expected a time, got 'soon'"),
+        ([], "expected a stamp a line"),
+    ):
+        (tmp_path / "color.csv").write_text("\n".join(lines))
+        with pytest.raises(InputError, match=words):
+            VideoFileLog(video)
+    (tmp_path / "color.csv").unlink()
+    with pytest.raises(InputError, match=r"color.mp4: no stamps beside it; write color.csv"):
+        VideoFileLog(video)
+
+
+def test_a_cut_video_file_has_fewer_images_than_stamps_and_is_refused(tmp_path: Path) -> None:
+    stamped(tmp_path, [str(stamp) for stamp in STAMPS])
+    mkv = tmp_path / "other.mkv"
+    write_mp4(mkv)
+    data = mkv.read_bytes()
+    mkv.write_bytes(data[: len(data) // 3])
+    (tmp_path / "other.txt").write_text((tmp_path / "color.csv").read_text())
+    with pytest.raises(InputError, match=r"other\.mkv: \d images, but 12 stamps in other\.txt"):
+        open_session([tmp_path / "run.mcap", mkv])

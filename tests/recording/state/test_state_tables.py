@@ -1,0 +1,229 @@
+"""Joint states from libfranka's CSV, and from CSV and NPZ that a TOML file describes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.state.state_source import open_states
+from splatctrl_cli.records import Float64, JointState, RecordSource
+
+ARM = tuple(f"panda_joint{i}" for i in range(1, 8))
+
+
+def opened(path: Path, joints: tuple[str, ...] = ("a", "b")) -> RecordSource:
+    return open_states(path, SourceOptions(), joints)
+
+
+def states(path: Path, joints: tuple[str, ...] = ("a", "b")) -> list[JointState]:
+    return [record for record in opened(path, joints).records() if isinstance(record, JointState)]
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        opened(path)
+    assert caught.value.exit_code == 4
+    assert caught.value.remedy
+    return str(caught.value)
+
+
+def block(name: str, num: int = 7, separator: str = ", ") -> str:
+    return separator.join(f"{name}[{i}]" for i in range(num))
+
+
+def values(*rows: Float64) -> str:
+    return ",".join(",".join(f"{v:.17g}" for v in row) for row in rows)
+
+
+def q_at(i: int) -> Float64:
+    return np.arange(7) * 0.1 + 0.001 * i * np.arange(1, 8)
+
+
+def old_log(path: Path, *, is_commanded: bool) -> Path:
+    """As libfranka before 0.14 writes it: a column `sent commands` without values, q_d and dq_d twice."""
+    state = ",".join(block(n) for n in ("q", "q_d", "dq", "dq_d", "tau_J", "tau_ext_hat_filtered"))
+    sent = ",".join((block("q_d"), block("dq_d"), block("O_T_EE_d", 16), block("O_dP_EE_d", 6), block("tau_J_d")))
+    lines = [f"duration, success rate, {state},sent commands,{sent}"]
+    for i in range(20):
+        measured = values(q_at(i), q_at(i), np.arange(1.0, 8), np.full(7, 0.25), np.zeros(14))
+        command = values(np.zeros(7), np.full(7, 0.5 * is_commanded), np.zeros(16 + 6 + 7))
+        lines.append(f"{5000 + i},1,{measured},,{command}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def new_log(path: Path) -> Path:
+    """As libfranka since 0.14 writes it."""
+    names = [f"state.{n}" for n in ("q", "q_d", "dq", "dq_d", "tau_J", "tau_ext_hat_filtered")]
+    state = ",".join(block(n, separator=",") for n in names)
+    sent = ",".join(
+        block(f"cmd.{n}", num, ",")
+        for n, num in (("q_d", 7), ("dq_d", 7), ("O_T_EE_d", 16), ("O_dP_EE_d", 6), ("tau_J_d", 7))
+    )
+    lines = [f"time,success_rate,{state},{sent}"]
+    for i in range(20):
+        measured = values(q_at(i), q_at(i), np.arange(1.0, 8), np.full(7, 0.25), np.zeros(14))
+        lines.append(f"{5000 + i},1,{measured},{values(np.zeros(7), np.full(7, 0.5), np.zeros(29))}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("is_new", [False, True])
+def test_libfranka_logs_of_both_kinds_are_read(tmp_path: Path, is_new: bool) -> None:
+    path = tmp_path / "x.csv"
+    source = opened(new_log(path) if is_new else old_log(path, is_commanded=True), ARM)
+    found = [record for record in source.records() if isinstance(record, JointState)]
+    assert source.joint_names == ARM
+    assert [s.stamp_ns for s in found] == [(5000 + i) * 1_000_000 for i in range(20)]
+    assert found[3].position == pytest.approx(q_at(3))
+    assert found[3].velocity == pytest.approx(np.arange(1.0, 8))
+    assert found[3].commanded_velocity == pytest.approx(np.full(7, 0.5))
+    assert any("since it was switched on" in note for note in source.loss.notes)
+
+
+def test_without_a_velocity_command_the_desired_velocity_stands_for_it(tmp_path: Path) -> None:
+    found = states(old_log(tmp_path / "x.csv", is_commanded=False), ARM)
+    assert found[3].commanded_velocity == pytest.approx(np.full(7, 0.25))
+
+
+def test_an_end_effector_pose_that_a_program_added_is_read_by_columns(tmp_path: Path) -> None:
+    T = np.eye(4)
+    T[:3] = [[0, -1, 0, 0.4], [1, 0, 0, -0.1], [0, 0, 1, 0.6]]
+    path = tmp_path / "x.csv"
+    rows = [f"{i},1,{values(q_at(i), T.T.ravel())}" for i in range(5)]
+    path.write_text("\n".join([f"duration, success rate, {block('q')},{block('O_T_EE', 16)}", *rows]))
+    assert states(path, ARM)[2].T_base_ee == pytest.approx(T)
+
+
+def test_a_csv_of_no_known_kind_asks_for_a_description(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text("t,j1\n0,1\n")
+    assert "expected libfranka's columns" in refusal(path)
+    assert "describe the columns in a .toml" in refusal(path)
+
+
+def test_a_csv_without_states_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text("time,success_rate,q[0]\n")
+    assert "expected joint states, got none" in refusal(path)
+
+
+def test_a_line_that_was_cut_is_named(tmp_path: Path) -> None:
+    path = old_log(tmp_path / "x.csv", is_commanded=True)
+    path.write_text(path.read_text()[:-100])
+    assert f"{path}:21: expected" in refusal(path)
+
+
+DESCRIPTION: dict[str, Any] = {
+    "file": "run.csv",
+    "joints": ["a", "b"],
+    "time": "t",
+    "position": ["qa", "qb"],
+    "unit": "deg",
+    "time_unit": "ms",
+}
+
+
+def described(folder: Path, **changes: Any) -> Path:
+    table = {key: value for key, value in {**DESCRIPTION, **changes}.items() if value is not None}
+    path = folder / "run.toml"
+    path.write_text("[states]\n" + "\n".join(f"{key} = {value!r}" for key, value in table.items()))
+    return path
+
+
+def csv_run(folder: Path) -> Path:
+    """20 states at 100 Hz in degrees; qa rises by 10 deg/s, qb falls; the end effector at x = i, turned about z."""
+    half = np.sqrt(0.5)
+    rows = [f"{10 * i},{0.1 * i},{-0.1 * i},10,-10,{i},0,0.5,0,0,{half:.17g},{half:.17g}" for i in range(20)]
+    path = folder / "run.csv"
+    path.write_text("\n".join(["t,qa,qb,va,vb,x,y,z,qx,qy,qz,qw", *rows]))
+    return path
+
+
+def test_degrees_milliseconds_and_an_epoch_become_radians_and_nanoseconds(tmp_path: Path) -> None:
+    csv_run(tmp_path)
+    epoch = 1_700_000_000_123_456_789
+    path = described(
+        tmp_path,
+        velocity=["va", "vb"],
+        commanded_velocity=["vb", "va"],
+        epoch_ns=epoch,
+        pose=["x", "y", "z", "qx", "qy", "qz", "qw"],
+        pose_frame="world",
+    )
+    found = states(path)
+    assert [s.stamp_ns for s in found] == [epoch + 10_000_000 * i for i in range(20)]
+    assert found[7].position == pytest.approx(np.radians([0.7, -0.7]))
+    assert found[7].velocity == pytest.approx(np.radians([10, -10]))
+    assert found[7].commanded_velocity == pytest.approx(np.radians([-10, 10]))
+    assert found[7].T_base_ee is None
+    assert found[7].T_world_ee is not None
+    assert found[7].T_world_ee[:3] == pytest.approx(np.array([[0, -1, 0, 7], [1, 0, 0, 0], [0, 0, 1, 0.5]]))
+
+
+def test_velocities_that_are_not_described_are_differences(tmp_path: Path) -> None:
+    csv_run(tmp_path)
+    source = opened(described(tmp_path))
+    assert next(iter(source.records())).velocity == pytest.approx(np.radians([10, -10]))  # type: ignore[union-attr]
+    assert source.loss.differentiated_velocities == 20
+
+
+def test_nanoseconds_keep_every_digit(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("t,qa,qb\n1700000000123456789,0,0\n1700000000133456791,0,0\n")
+    found = states(described(tmp_path, time_unit="ns"))
+    assert [s.stamp_ns for s in found] == [1700000000123456789, 1700000000133456791]
+
+
+def test_npz_arrays_give_their_columns(tmp_path: Path) -> None:
+    T = np.eye(4)
+    T[:3] = [[0, -1, 0, 0.4], [1, 0, 0, -0.1], [0, 0, 1, 0.6]]
+    q = np.linspace(0, 1, 40).reshape(20, 2)
+    np.savez(tmp_path / "run.npz", t=np.arange(20) * 0.01, q=q, T=np.broadcast_to(T, (20, 4, 4)))
+    path = described(tmp_path, file="run.npz", position=["q"], unit="rad", time_unit="s", pose=["T"])
+    found = states(path)
+    assert [s.stamp_ns for s in found] == [10_000_000 * i for i in range(20)]
+    assert np.array_equal([s.position for s in found], q)
+    assert found[5].T_base_ee == pytest.approx(T)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"unit": "degrees"}, "states.unit: expected one of rad, deg, got 'degrees'"),
+        ({"time_unit": "min"}, "states.time_unit: expected one of s, ms, us, ns"),
+        ({"positions": ["qa"]}, "unknown key states.positions; did you mean states.position?"),
+        ({"position": None}, "states.position is missing"),
+        ({"position": ["qa"]}, "states.position: expected 2 columns of 20 states, got (1, 20)"),
+        ({"position": ["qa", "qc"]}, "no column 'qc'; columns there: t, qa, qb"),
+        ({"file": "none.csv"}, "none.csv: no such file"),
+        ({"pose": ["x", "y", "z"]}, "states.pose: expected 7 or 16 columns"),
+        ({"joints": ["a", "a"]}, "states.joints: expected names, each once"),
+    ],
+)
+def test_a_wrong_description_names_the_key(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+    csv_run(tmp_path)
+    assert said in refusal(described(tmp_path, **changes))
+
+
+def test_a_cell_that_is_no_number_is_named(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("t,qa,qb\n0,0,0\n10,zero,0\n")
+    assert "run.csv:3: column qa: expected a number, got 'zero'" in refusal(described(tmp_path))
+    (tmp_path / "run.csv").write_text("t,qa,qb\n0,0,0\nnan,0,0\n")
+    assert "run.csv:3: column t: expected a number, got 'nan'" in refusal(described(tmp_path))
+
+
+def test_an_npz_without_the_array_lists_those_there(tmp_path: Path) -> None:
+    np.savez(tmp_path / "run.npz", t=np.arange(3.0), q=np.zeros((3, 2)))
+    path = described(tmp_path, file="run.npz", position=["angles"])
+    assert "'angles': expected an array of numbers, got none; arrays there: t, q" in refusal(path)
+    np.savez(tmp_path / "run.npz", t=np.array([0.0, np.nan, 1.0]), q=np.zeros((3, 2)))
+    assert "t: expected times, got NaN" in refusal(described(tmp_path, file="run.npz", position=["q"]))
+    np.savez(tmp_path / "run.npz", t=np.zeros(0), q=np.zeros((0, 2)))
+    assert "q: expected rows, got none; record it again" in refusal(
+        described(tmp_path, file="run.npz", position=["q"])
+    )
+    (tmp_path / "run.npz").write_bytes(b"PK no")
+    assert "cannot be read as NPZ" in refusal(path)
