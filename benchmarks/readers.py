@@ -12,15 +12,18 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin
+from splatctrl_cli.formats.arrays import DAMAGE, npy_of, read_arrays, savez
+from splatctrl_cli.formats.grid.grid_formats import write_grid
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.grid.nrrd import read_nrrd_head
+from splatctrl_cli.formats.grid.vti import read_vti
+from splatctrl_cli.formats.image_file import image_head, read_pfm, write_pfm
+from splatctrl_cli.formats.splat.splats import FORMATS
+from tests.formats.grid.make_grid import random_grid
+from tests.formats.splat.test_gaussian_ply import gaussian_set
 
 from benchmarks.fuzz_samples import ROBOT, capture_of, plain_log
 from splatctrl_cli.errors import SplatCtrlError
-from splatctrl_cli.files.arrays import DAMAGE, npy_of, read_arrays, savez
-from splatctrl_cli.files.image_file import image_head, read_pfm, write_pfm
-from splatctrl_cli.grid_files.grid_formats import write_grid
-from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.grid_files.nrrd import read_nrrd_head
-from splatctrl_cli.grid_files.vti import read_vti
 from splatctrl_cli.recording.capture.capture import CaptureSource
 from splatctrl_cli.recording.container.bag_logs import Bag1Log, Db3Log
 from splatctrl_cli.recording.container.foxglove import MessageTypes
@@ -33,14 +36,11 @@ from splatctrl_cli.recording.log.messages import decode_rvl, read_image
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.urdf import read_urdf
-from splatctrl_cli.splat_files.splats import FORMATS
-from tests.grid_files.make_grid import random_grid
 from tests.recording.container.test_foxglove import descriptor_set
 from tests.recording.container.test_log_formats import as_ros1_bag, as_ros2_folder
 from tests.recording.folder.make_layout import make_nerfstudio, make_redwood, make_tum
 from tests.recording.log.make_log import LogRecipe, make_log
 from tests.recording.log.test_decoder import encoded_rvl
-from tests.splat_files.test_gaussian_ply import gaussian_set
 
 Read = Callable[[bytes], object]
 DEPTH = np.arange(48, dtype=np.uint16).reshape(6, 8) * 700

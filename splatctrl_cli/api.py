@@ -7,19 +7,18 @@ from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.control.user_controller import ClearanceRow, Controller, ControllerInput, ControllerStart
 from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, UsageError, WriteError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict
-from splatctrl_cli.jobs.bakes.bake import BakeResult, bake
-from splatctrl_cli.jobs.bakes.request import BakeRequest
-from splatctrl_cli.jobs.compare import CompareRequest, CompareResult, compare
-from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
-from splatctrl_cli.jobs.export_run import ExportRunRequest, ExportRunResult, export_run
-from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.jobs.query import QueryRequest, QueryResult, query
-from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult, reconstruct
-from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.replay import ReplayResult, replay
-from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.jobs.report import (
+from splatctrl_cli.jobs.bake.bake import BakeResult, bake
+from splatctrl_cli.jobs.bake.request import BakeRequest
+from splatctrl_cli.jobs.compare.compare import CompareRequest, CompareResult, compare
+from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult, export
+from splatctrl_cli.jobs.export.export_run import ExportRunRequest, ExportRunResult, export_run
+from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
+from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
+from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.report.report import (
     ViewRequest,
     ViewResult,
     WriteReportRequest,
@@ -27,7 +26,8 @@ from splatctrl_cli.jobs.report import (
     view,
     write_report,
 )
-from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.running.progress import Progress
+from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Box, Label
 

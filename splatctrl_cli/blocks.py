@@ -27,6 +27,8 @@ from splatctrl_cli.files.output import (
     write_json,
     write_run,
 )
+from splatctrl_cli.formats.splat.gaussian_ply import write_gaussian_ply
+from splatctrl_cli.formats.splat.splats import nearest_splats
 from splatctrl_cli.geometry import (
     back_project,
     frame_along,
@@ -38,12 +40,11 @@ from splatctrl_cli.geometry import (
     transform_points,
     turn_about_z,
 )
-from splatctrl_cli.jobs.progress import SILENT
-from splatctrl_cli.jobs.replays.criteria_input import Judged
-from splatctrl_cli.jobs.replays.detours import ROUNDING, Certified, certified_distance
-from splatctrl_cli.jobs.replays.goal import checked_pose, goal_waypoints
-from splatctrl_cli.jobs.replays.inputs import LoggedStates, MeasuredRobot, measured_robot
-from splatctrl_cli.jobs.replays.known_scene import (
+from splatctrl_cli.jobs.replay.criteria_input import Judged
+from splatctrl_cli.jobs.replay.detours import ROUNDING, Certified, certified_distance
+from splatctrl_cli.jobs.replay.goal import checked_pose, goal_waypoints
+from splatctrl_cli.jobs.replay.inputs import LoggedStates, MeasuredRobot, measured_robot
+from splatctrl_cli.jobs.replay.known_scene import (
     KnownFields,
     KnownScene,
     fields_at,
@@ -51,11 +52,12 @@ from splatctrl_cli.jobs.replays.known_scene import (
     seen_of,
     splat_fields,
 )
-from splatctrl_cli.jobs.replays.metrics import metrics_of
-from splatctrl_cli.jobs.replays.modes import replayed
-from splatctrl_cli.jobs.replays.request import ReplayInputs
-from splatctrl_cli.jobs.replays.verdict import replay_verdict
-from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
+from splatctrl_cli.jobs.replay.metrics import metrics_of
+from splatctrl_cli.jobs.replay.modes import replayed
+from splatctrl_cli.jobs.replay.request import ReplayInputs
+from splatctrl_cli.jobs.replay.verdict import replay_verdict
+from splatctrl_cli.jobs.running.progress import SILENT
+from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.kernels import gaussians as gaussian_kernels
 from splatctrl_cli.kernels import native, num_threads
 from splatctrl_cli.kernels.raster import ImageLoss, LossTerms
@@ -111,8 +113,6 @@ from splatctrl_cli.simulate.recording import START_NS, Recording, RecordingOptio
 from splatctrl_cli.simulate.render import Camera, Renderer
 from splatctrl_cli.simulate.tabletop import PALETTE, arm_solids, cameras, furniture, texture
 from splatctrl_cli.simulate.truth import closest_of, distance_to
-from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
-from splatctrl_cli.splat_files.splats import nearest_splats
 from splatctrl_cli.voxels import Balls, OccupancyGrid, SeenVoxels, VoxelState
 
 __all__ = [

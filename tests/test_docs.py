@@ -10,6 +10,7 @@ from pathlib import Path
 from string import Template
 
 import pytest
+from splatctrl_cli.jobs.replay.metrics import metric_names
 
 from experiments.__main__ import EXPERIMENTS
 from splatctrl_cli.cli.commands import COMMANDS, build_parser
@@ -17,7 +18,6 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.parser import GONE
 from splatctrl_cli.config import PRESETS, load_config
 from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.jobs.replays.metrics import metric_names
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_data/*.md")])

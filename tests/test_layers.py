@@ -7,10 +7,10 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "splatctrl_cli"
 ROOMS = [  # a room imports those of the rows above its own
-    ["records", "geometry", "config", "errors", "kernels", "libraries", "mesh_distance", "voxels"],
-    ["robot", "files"],
-    ["splat_files", "grid_files", "report"],
-    ["scene_files"],
+    ["records", "geometry", "config", "errors", "kernels", "libraries", "voxels"],
+    ["files"],
+    ["formats"],
+    ["robot", "report"],
     ["scene", "field", "control", "simulate", "evaluate", "calibration"],
     ["recording", "planner"],
     ["checks"],
@@ -19,6 +19,7 @@ ROOMS = [  # a room imports those of the rows above its own
     ["cli"],
 ]
 INSIDE = {  # of a room, its folders and the modules beside them, likewise
+    "formats": [["summary", "unpacking", "mesh"], ["arrays", "image_file", "ply"], ["splat", "grid"], ["scene"]],
     "recording": [
         ["source_options"],
         ["container"],
@@ -46,7 +47,7 @@ HOMES = {
     "rosbags": {"recording"},
     "mcap": {"recording"},
     "google": {"recording"},
-    "pxr": {"splat_files"},
+    "pxr": {"formats"},
     "matplotlib": {"libraries"},
 }
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from splatctrl_cli.formats.splat.splats import write_ply
 
 from benchmarks.scenes import surface_splats
 from splatctrl_cli.config import FieldConfig
@@ -26,7 +27,6 @@ from splatctrl_cli.kernels.cuda.card import CudaDevice
 from splatctrl_cli.kernels.cuda.field import Answers
 from splatctrl_cli.kernels.cuda.memory import FIELD
 from splatctrl_cli.records import Box, Float64
-from splatctrl_cli.splat_files.splats import write_ply
 
 COUNTS = (5_000, 50_000)
 CELLS, VOXEL = 256, 0.01

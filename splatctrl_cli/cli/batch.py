@@ -18,7 +18,7 @@ from splatctrl_cli.cli.reports import publish
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import damage_mark
-from splatctrl_cli.jobs.batches.batch import (
+from splatctrl_cli.jobs.batch.batch import (
     BatchRequest,
     BatchResult,
     batch,
@@ -27,10 +27,10 @@ from splatctrl_cli.jobs.batches.batch import (
     planned,
     suites_of,
 )
-from splatctrl_cli.jobs.batches.graph import TABLES, Parsed, columns_of, of_shard
-from splatctrl_cli.jobs.batches.ledger import NAME, Ledger, Run, write_csv
-from splatctrl_cli.jobs.batches.run import DONE, FAILED, told
-from splatctrl_cli.jobs.batches.suite import Table
+from splatctrl_cli.jobs.batch.graph import TABLES, Parsed, columns_of, of_shard
+from splatctrl_cli.jobs.batch.ledger import NAME, Ledger, Run, write_csv
+from splatctrl_cli.jobs.batch.run import DONE, FAILED, told
+from splatctrl_cli.jobs.batch.suite import Table
 
 PRELOADED = (
     "check",

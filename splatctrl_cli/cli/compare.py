@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from splatctrl_cli.cli.common import Console, shown, table
 from splatctrl_cli.cli.options import request_of
-from splatctrl_cli.jobs.compare import Change, CompareRequest, CompareResult, FigureChange, compare
+from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, CompareResult, FigureChange, compare
 
 FORM = ".6g"
 MOST_ROWS = 20  # of changes that are no regression; --json has all

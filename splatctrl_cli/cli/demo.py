@@ -16,15 +16,15 @@ from splatctrl_cli.cli.recordings import show_ingested
 from splatctrl_cli.cli.replay import show_replayed
 from splatctrl_cli.cli.score import show_scored
 from splatctrl_cli.cli.sdf_bake import show_baked
-from splatctrl_cli.files.summary import Summary
-from splatctrl_cli.jobs.bakes.bake import BakeResult
+from splatctrl_cli.formats.summary import Summary
+from splatctrl_cli.jobs.bake.bake import BakeResult
 from splatctrl_cli.jobs.demo import DemoRequest, StepResult, demo
-from splatctrl_cli.jobs.export import ExportResult
+from splatctrl_cli.jobs.export.export import ExportResult
 from splatctrl_cli.jobs.ingest import IngestResult
-from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult
-from splatctrl_cli.jobs.replay import ReplayResult
-from splatctrl_cli.jobs.scores.score import ScoreResult
-from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
+from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult
+from splatctrl_cli.jobs.replay.replay import ReplayResult
+from splatctrl_cli.jobs.score.score import ScoreResult
+from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, SimulateResult, simulate
 from splatctrl_cli.simulate.arm import UNMODELLED
 from splatctrl_cli.simulate.recording import RecordingOptions
 

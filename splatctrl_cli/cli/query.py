@@ -11,7 +11,7 @@ from pathlib import Path
 from splatctrl_cli.cli.common import Console, labels_of, table
 from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.config import load_config
-from splatctrl_cli.jobs.query import QueryRequest, QueryResult, query
+from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
 
 RATED = 1000  # points from which on a rate says something
 

@@ -8,12 +8,12 @@ from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of, source_options
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.jobs.device import shown
-from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.jobs.reconstructions.correct_views import Corrections
-from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult, reconstruct
-from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.reconstructions.resume import DECIDING_OPTIONS
+from splatctrl_cli.jobs.reconstruct.correct_views import Corrections
+from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
+from splatctrl_cli.jobs.running.device import shown
+from splatctrl_cli.jobs.running.resume import DECIDING_OPTIONS
 from splatctrl_cli.kernels import native
 from splatctrl_cli.records import Box
 

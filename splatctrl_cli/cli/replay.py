@@ -8,10 +8,10 @@ from splatctrl_cli.cli.common import Console, long_table, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.config import load_config
 from splatctrl_cli.control.preconditions import StaticViolation
-from splatctrl_cli.jobs.replay import ReplayResult, replay
-from splatctrl_cli.jobs.replays.files import chunks_of, when_and_why
-from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.jobs.replays.result import Replay
+from splatctrl_cli.jobs.replay.files import chunks_of, when_and_why
+from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.replay.result import Replay
 
 HEADLINE = (
     *("min_clearance", "min_clearance_certified", "min_clearance_true", "min_self_clearance", "min_limit_margin"),

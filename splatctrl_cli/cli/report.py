@@ -8,7 +8,7 @@ from pathlib import Path
 
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.options import request_of
-from splatctrl_cli.jobs.report import ViewRequest, WriteReportRequest, view, write_report
+from splatctrl_cli.jobs.report.report import ViewRequest, WriteReportRequest, view, write_report
 
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")  # one of which is set on Linux where a browser can open a window
 MOST_NOTES = 5

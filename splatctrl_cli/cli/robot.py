@@ -8,7 +8,8 @@ from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.files.output import finite
-from splatctrl_cli.jobs.robot import (
+from splatctrl_cli.jobs.reconstruct.self_model import LearnRequest, learn_robot
+from splatctrl_cli.jobs.robot.robot import (
     CoverageResult,
     PairsResult,
     RobotRequest,
@@ -20,7 +21,6 @@ from splatctrl_cli.jobs.robot import (
     fit_robot,
     robot_pairs,
 )
-from splatctrl_cli.jobs.self_model import LearnRequest, learn_robot
 from splatctrl_cli.robot.coverage import LinkCoverage
 from splatctrl_cli.robot.self_collision import LinkPair
 from splatctrl_cli.robot.self_model import LearnedLink

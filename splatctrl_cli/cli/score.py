@@ -11,8 +11,8 @@ from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.score_report import PREFIX
 from splatctrl_cli.evaluate.verdict import counted
-from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.jobs.scores.views import CloudSettings
+from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.score.views import CloudSettings
 from splatctrl_cli.records import MILLIMETRE
 
 COLUMNS = {

@@ -12,9 +12,9 @@ from splatctrl_cli.config import load_config
 from splatctrl_cli.config.fixed import PROBABILITY_NEAR
 from splatctrl_cli.evaluate.field_accuracy import BandAccuracy, TruthComparison
 from splatctrl_cli.field.baker import CHANNELS
-from splatctrl_cli.grid_files.grid_formats import FORMATS
-from splatctrl_cli.jobs.bakes.bake import BakeResult, bake
-from splatctrl_cli.jobs.bakes.request import BakeRequest
+from splatctrl_cli.formats.grid.grid_formats import FORMATS
+from splatctrl_cli.jobs.bake.bake import BakeResult, bake
+from splatctrl_cli.jobs.bake.request import BakeRequest
 from splatctrl_cli.records import Box
 
 SETTINGS = ("distance", "weights", "unknown", "probability", "voxel", "length_scale")  # of the field, as options

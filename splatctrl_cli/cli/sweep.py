@@ -8,7 +8,7 @@ from pathlib import Path
 from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of
-from splatctrl_cli.jobs.sweeps.sweep import KeyFlip, SweepRequest, SweepResult, Tried, sweep
+from splatctrl_cli.jobs.sweep.sweep import KeyFlip, SweepRequest, SweepResult, Tried, sweep
 
 
 def run(args: argparse.Namespace) -> int:

@@ -29,9 +29,9 @@ from splatctrl_cli.evaluate.field_accuracy import (
 )
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
 from splatctrl_cli.evaluate.views import measured_along
+from splatctrl_cli.formats.mesh import TriangleMesh
 from splatctrl_cli.geometry import back_project, face_normals, transform_points
 from splatctrl_cli.kernels.field import interpolate
-from splatctrl_cli.mesh_distance import TriangleMesh
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, RgbdFrame
 
 MAX_POINTS = 2_000_000  # on a mesh

@@ -19,8 +19,8 @@ from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.jobs.check import posed_robot
-from splatctrl_cli.jobs.logged_robot import RobotOptions
-from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source import open_session
 from splatctrl_cli.recording.source_options import SourceOptions

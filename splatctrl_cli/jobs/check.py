@@ -12,7 +12,7 @@ from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.jobs.logged_robot import TAKE, differs, logged_urdf
+from splatctrl_cli.jobs.robot.logged_robot import TAKE, differs, logged_urdf
 from splatctrl_cli.recording.source import open_logs
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel

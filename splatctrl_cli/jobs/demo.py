@@ -15,28 +15,28 @@ from splatctrl_cli.errors import DAMAGED, InputError, UsageError
 from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
-from splatctrl_cli.files.summary import Summary
-from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.jobs.bakes.bake import BakeResult, bake
-from splatctrl_cli.jobs.bakes.request import BakeRequest
-from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
+from splatctrl_cli.formats.summary import Summary
+from splatctrl_cli.jobs.bake.bake import BakeResult, bake
+from splatctrl_cli.jobs.bake.request import BakeRequest
+from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult, export
 from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
-from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.jobs.reconstructions.reconstruct import ReconstructResult, reconstruct
-from splatctrl_cli.jobs.reconstructions.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.reconstructions.resume import DECIDING_OPTIONS
-from splatctrl_cli.jobs.replay import ReplayResult, replay
-from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.jobs.scores.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
+from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
+from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.jobs.running.resume import DECIDING_OPTIONS
+from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, SimulateResult, simulate
 from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.render import render
-from splatctrl_cli.scene_files.scene_folder import SceneFolder, open_scene
 
 TRAINING, SCORING = ("cam0", "cam1", "cam2"), ("cam3",)
 CLOSED_LOOP_START = 1.8  # [s]: the visitor appears ahead of the driven arm; started earlier, right where it is

@@ -10,8 +10,8 @@ from typing import Any
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import DAMAGED, UsageError
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
-from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.jobs.reconstructions.resume import check_same_run, told_how_to_go_on
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.jobs.running.resume import check_same_run, told_how_to_go_on
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.capture.capture_writer import JOURNAL, CaptureSummary, read_identity, write_capture
 from splatctrl_cli.recording.folder.image_folder import HOLDOUT

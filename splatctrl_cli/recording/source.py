@@ -9,8 +9,10 @@ from typing import Any
 from splatctrl_cli.calibration.calibration_file import describe_calibration, is_calibration
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.summary import Grid, Summary, files_below, names_in
-from splatctrl_cli.grid_files.grid_format import FORMAT, covers, header_facts
+from splatctrl_cli.formats.grid.grid_format import FORMAT, covers, header_facts
+from splatctrl_cli.formats.scene.scene_folder import run_value
+from splatctrl_cli.formats.scene.voxel_file import known_space, read_occupancy
+from splatctrl_cli.formats.summary import Grid, Summary, files_below, names_in
 from splatctrl_cli.recording.calibrated import calibrated
 from splatctrl_cli.recording.capture.capture import CaptureSource, robot_description_of
 from splatctrl_cli.recording.capture.capture_header import is_capture, read_capture_header
@@ -44,8 +46,6 @@ from splatctrl_cli.recording.log.survey import RobotDescription, TopicSurvey, ro
 from splatctrl_cli.recording.log.video import SUFFIXES as VIDEOS
 from splatctrl_cli.recording.log.video import open_log
 from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions
-from splatctrl_cli.scene_files.scene_folder import run_value
-from splatctrl_cli.scene_files.voxel_file import known_space, read_occupancy
 
 __all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_source"]
 

@@ -11,8 +11,8 @@ from scipy.spatial import ConvexHull, QhullError
 
 from splatctrl_cli.config.fixed import CYLINDER_SIDES, SPHERE_ROUNDS
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.mesh import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.geometry import face_normals, transform_points
-from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.records import Float64, Index
 from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
 

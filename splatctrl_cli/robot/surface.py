@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
 from splatctrl_cli.kernels.points import solid_distance
 from splatctrl_cli.kernels.surface_image import (
@@ -20,7 +21,6 @@ from splatctrl_cli.kernels.surface_image import (
     render_surface,
 )
 from splatctrl_cli.kernels.triangles import TriangleTree
-from splatctrl_cli.mesh_distance import load_mesh
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Intrinsics, SphereSet
 from splatctrl_cli.robot.link_meshes import mesh_path, placed
 from splatctrl_cli.robot.urdf import Shape, UrdfFile, visual_urdf

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from splatctrl_cli.formats.mesh import MeshDistance
 
 from benchmarks.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh, thin
-from splatctrl_cli.mesh_distance import MeshDistance
-from tests.test_mesh_distance import box_distance, box_mesh
+from tests.formats.test_mesh import box_distance, box_mesh
 
 SIZE = (0.3, 0.2, 0.1)
 

@@ -16,17 +16,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from splatctrl_cli.formats.arrays import npy_of
+from splatctrl_cli.formats.splat.splats import FORMATS
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.arrays import npy_of
 from splatctrl_cli.robot.link_meshes import mesh_path
 from splatctrl_cli.robot.urdf import MeshShape
-from splatctrl_cli.splat_files.splats import FORMATS
-from tests.files.make_npz import write_zeros
+from tests.formats.make_npz import write_zeros
+from tests.formats.splat.test_gaussian_ply import gaussian_set
 from tests.recording.folder.make_layout import make_tum
 from tests.recording.log.make_log import LogRecipe, make_log
-from tests.splat_files.test_gaussian_ply import gaussian_set
 
 CAMERA = "[camera]\nwidth = 8\nheight = 6\nfx = 10\nfy = 10\ncx = 4.0\ncy = 3.0\n"
 LAUGHS = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
@@ -192,7 +192,7 @@ def test_a_npy_file_is_read_as_numpy_reads_it_and_no_further() -> None:
 RUN_LINES = """
 import contextlib, io, sys
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.splat_files.splats import FORMATS
+from splatctrl_cli.formats.splat.splats import FORMATS
 for line in sys.stdin:
     said = io.StringIO()
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):

@@ -13,7 +13,7 @@ from splatctrl_cli.recording.folder.dtu import read_dtu
 from splatctrl_cli.recording.folder.idr import write_idr
 from splatctrl_cli.records import LossReport
 from tests.cli import here
-from tests.jobs.scores.wall import FRAMES, FakeScene, FakeSource, set_up, write_scene
+from tests.jobs.score.wall import FRAMES, FakeScene, FakeSource, set_up, write_scene
 from tests.recording.folder.make_layout import half_size
 
 

@@ -4,6 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from splatctrl_cli.formats.grid import grid_formats
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.scene.scene_writer import SceneWriter
+from splatctrl_cli.formats.splat.splats import FORMATS, write_ply
+from splatctrl_cli.jobs.bake.bake import SUMMARY_METRICS
 
 from splatctrl_cli.cli import scene_options
 from splatctrl_cli.cli.parser import words
@@ -14,12 +19,7 @@ from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_names
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_field import exact_channel
-from splatctrl_cli.grid_files import grid_formats
-from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.jobs.bakes.bake import SUMMARY_METRICS
-from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.truth import load_truth
-from splatctrl_cli.splat_files.splats import FORMATS, write_ply
 from tests.cli import here
 from tests.cli.test_command_line import splatctrl
 from tests.field.scenes import cloud, splat_set

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from splatctrl_cli.formats.splat.splats import check_splats
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.kernels.points import SplatTree
@@ -14,7 +15,6 @@ from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import BLACK, render
 from splatctrl_cli.scene.seeding import world_points
 from splatctrl_cli.scene.shell import beyond
-from splatctrl_cli.splat_files.splats import check_splats
 from tests.scene.wall import INTRINSICS, WORKSPACE, frame, looking_down
 
 REACH = Box(lower=np.array([-0.2, -0.35, -0.05]), upper=np.array([0.2, 0.35, 0.6]))  # the floor is seen to 0.49 m

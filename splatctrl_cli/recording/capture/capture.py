@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.arrays import DAMAGE, NpzFile, npy_of
-from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.files.output import sha256
+from splatctrl_cli.formats.arrays import DAMAGE, NpzFile, npy_of
+from splatctrl_cli.formats.image_file import decode_file
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.recording.capture.capture_header import COLUMNS, ROBOT, FileSums, FrameRows, read_capture_header
 from splatctrl_cli.recording.log.messages import metres

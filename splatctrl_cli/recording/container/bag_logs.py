@@ -22,7 +22,7 @@ from urllib.parse import quote
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import scratch_folder
-from splatctrl_cli.files.unpacking import MAX_BLOCK, PIECE, BadBlockError, Budget, unpacked_start
+from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE, BadBlockError, Budget, unpacked_start
 from splatctrl_cli.recording.container.foxglove import standing_in
 from splatctrl_cli.recording.container.mcap_log import ros_type_name
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic

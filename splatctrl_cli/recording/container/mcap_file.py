@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from splatctrl_cli.files.unpacking import MAX_BLOCK, PIECE
+from splatctrl_cli.formats.unpacking import MAX_BLOCK, PIECE
 from splatctrl_cli.recording.container.mcap_records import (
     ATTACHMENT,
     CHUNK,

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatctrl_cli.files.unpacking import BadBlockError, Budget, unpacked_start
+from splatctrl_cli.formats.unpacking import BadBlockError, Budget, unpacked_start
 from splatctrl_cli.recording.container.foxglove import standing_in, stands_for
 from splatctrl_cli.recording.container.mcap_file import McapFile
 from splatctrl_cli.recording.container.mcap_records import (

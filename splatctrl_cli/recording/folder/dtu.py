@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.image_file import decode_file, read_pfm, write_pfm
+from splatctrl_cli.formats.image_file import decode_file, read_pfm, write_pfm
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import MILLIMETRES, Bool, Float32, Float64, Intrinsics, UInt8
 

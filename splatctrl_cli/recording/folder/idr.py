@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.arrays import read_arrays, savez
-from splatctrl_cli.files.image_file import write_pfm
+from splatctrl_cli.formats.arrays import read_arrays, savez
+from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.recording.folder.dtu import (
     DtuScan,

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import UNIT_BASELINE
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.arrays import DAMAGE, npy_of
-from splatctrl_cli.files.image_file import decode_file, read_pfm
 from splatctrl_cli.files.output import sha256
+from splatctrl_cli.formats.arrays import DAMAGE, npy_of
+from splatctrl_cli.formats.image_file import decode_file, read_pfm
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
     Description,

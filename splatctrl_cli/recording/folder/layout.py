@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.image_file import decode_file, image_head
+from splatctrl_cli.formats.image_file import decode_file, image_head
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
     DepthTable,

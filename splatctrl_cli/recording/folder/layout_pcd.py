@@ -18,7 +18,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import CLOUD_POINTS, CLOUD_RESIDUAL
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.image_file import MOST_PIXELS
+from splatctrl_cli.formats.image_file import MOST_PIXELS
 from splatctrl_cli.geometry import invert_transform, project, transform_from, transform_points
 from splatctrl_cli.libraries import of_extra
 from splatctrl_cli.recording.folder.folder_description import (

@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.image_file import MOST_PIXELS
+from splatctrl_cli.formats.image_file import MOST_PIXELS
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,

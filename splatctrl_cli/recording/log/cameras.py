@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.image_file import JPEG
+from splatctrl_cli.formats.image_file import JPEG
 from splatctrl_cli.libraries import is_installed
 from splatctrl_cli.recording.container.log_formats import told_formats
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage, Topic

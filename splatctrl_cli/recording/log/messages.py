@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.files.image_file import JPEG, PNG, decode_file, image_head
+from splatctrl_cli.formats.image_file import JPEG, PNG, decode_file, image_head
 from splatctrl_cli.recording.log.decoder import IMAGE, UndecodableMessageError, UnreadFormError, stamp_ns
 from splatctrl_cli.records import MILLIMETRE, Float32, UInt8
 

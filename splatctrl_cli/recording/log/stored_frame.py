@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_DEPTH
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.arrays import npy_head, npy_of
-from splatctrl_cli.files.image_file import JPEG, PNG
 from splatctrl_cli.files.spilled_rows import Rows, blocks_of, ranges
+from splatctrl_cli.formats.arrays import npy_head, npy_of
+from splatctrl_cli.formats.image_file import JPEG, PNG
 from splatctrl_cli.recording.container.raw_log import RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import UndecodableMessageError
 from splatctrl_cli.recording.log.state_columns import StateColumns

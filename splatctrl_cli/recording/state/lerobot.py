@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.arrays import ParquetFile
+from splatctrl_cli.formats.arrays import ParquetFile
 from splatctrl_cli.recording.folder.layout import read_json
 
 INFO, POSITION, EPISODE = Path("meta/info.json"), "observation.state", "episode_index"

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.arrays import ArrayFile, Hdf5File, NpzFile, ParquetFile
 from splatctrl_cli.files.spilled_rows import Rows, absent, scaled
+from splatctrl_cli.formats.arrays import ArrayFile, Hdf5File, NpzFile, ParquetFile
 from splatctrl_cli.recording.folder.folder_description import read_table
 from splatctrl_cli.recording.log.state_messages import pose_of_columns, pose_of_quat, rigid_or_none
 from splatctrl_cli.recording.log.state_track import RawTrack

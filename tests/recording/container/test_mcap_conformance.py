@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from splatctrl_cli.formats.unpacking import unpacked
 
-from splatctrl_cli.files.unpacking import unpacked
 from splatctrl_cli.recording.container.mcap_file import McapFile
 from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.mcap_records import Chunk, parse_record

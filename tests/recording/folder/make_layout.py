@@ -12,8 +12,8 @@ import cv2
 import lzf
 import numpy as np
 import pytest
+from splatctrl_cli.formats.image_file import write_pfm
 
-from splatctrl_cli.files.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, quat_from_rotation
 from splatctrl_cli.recording.folder.dtu import DtuView
 from splatctrl_cli.recording.folder.dtu_source import shrunk

@@ -1,0 +1,402 @@
+"""Arrays in a ``.npz`` without the clock in it: the same arrays give the same bytes; and arrays out of one, no more
+than may be meant: ten megabytes of a ``.npz`` can hold ten gigabytes of zeros.
+
+Files of arrays (T, ...) are read as columns, a block of rows at a time: NPZ, HDF5 and Parquet (extra `tables`: h5py,
+pyarrow). An array of HDF5 is named by its path (``observations/qpos``), one of Parquet by its column; a column of
+lists of one length is an array (T, K).
+"""
+
+import tokenize
+import zipfile
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from math import prod
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.formats.unpacking import PIECE
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, ranges
+from splatctrl_cli.libraries import of_extra
+from splatctrl_cli.records import Float64, Stamps
+
+DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a place in it lies before its start
+    *(zipfile.BadZipFile, zlib.error, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError),
+    *(SyntaxError, tokenize.TokenError, OverflowError),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pieces:
+    """An array that is made while it is written: its dtype and shape, and its values in C order, piece by piece."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    make: Callable[[], Iterable[NDArray[np.generic]]]
+
+
+def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, level: int = 6) -> None:
+    """What `np.savez_compressed` writes, at zlib's `level` (0: stored), one array at a time."""
+    method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
+    with zipfile.ZipFile(path, "w", method, compresslevel=level) as archive:
+        for name, array in arrays.items():
+            size = np.dtype(array.dtype).itemsize * int(np.prod(array.shape))
+            with archive.open(f"{name}.npy", "w", force_zip64=size >= 2**30) as stream:
+                if isinstance(array, Pieces):
+                    layout = {"descr": array.dtype, "fortran_order": False, "shape": array.shape}
+                    np.lib.format.write_array_header_1_0(stream, layout)
+                    for piece in array.make():
+                        stream.write(piece.tobytes())
+                else:
+                    np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)
+
+
+def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, NDArray[np.generic]]:
+    """The arrays `names` (default: all) of a ``.npz``, of together at most `most` bytes.
+
+    Raises OSError, KeyError for an array that is not there, ValueError for objects, for more bytes than
+    `most` and for other bytes than the array's own head says, and what is in `DAMAGE`.
+    """
+    with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
+        chosen = (
+            [n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")] if names is None else names
+        )
+        left, found = most, {}
+        for name in dict.fromkeys(chosen):
+            with archive.open(f"{name}.npy") as member:
+                found[name] = _array(member, name, archive.getinfo(f"{name}.npy").file_size, left)
+            left -= found[name].nbytes
+    return found
+
+
+def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
+    """Whether a file, whose first bytes are `head`, is a ``.npz`` with all of these arrays."""
+    if not head.startswith(b"PK\x03\x04"):
+        return False
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {f"{name}.npy" for name in names} <= set(archive.namelist())
+    except (*DAMAGE, OSError):
+        return False
+
+
+def npy_head(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether by columns, and type of the array whose ``.npy`` begins here; the stream is left behind it.
+
+    Raises ValueError for none.
+    """
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, is_fortran, dtype = read(stream)
+    if any(not isinstance(n, int) or n < 0 for n in shape):
+        raise ValueError(f"shape {shape}, expected whole numbers")
+    return tuple(shape), is_fortran, dtype
+
+
+def check_numbers(dtype: np.dtype[Any]) -> None:
+    """Raise ValueError for objects, which would be unpickled."""
+    if dtype.hasobject:
+        raise ValueError("objects, expected numbers")
+
+
+def _array(member: IO[bytes], name: str, file_size: int, most: int) -> NDArray[np.generic]:
+    shape, is_fortran, dtype = npy_head(member)
+    check_numbers(dtype)
+    size = prod(shape) * dtype.itemsize
+    if size > most:
+        raise ValueError(f"{name}: {size} bytes, expected at most {most}")
+    if size != file_size - member.tell():
+        raise ValueError(f"{name}: announces {size} bytes, holds {file_size - member.tell()}")
+    content = bytearray(size)
+    view, at = memoryview(content), 0
+    while at < size and (piece := member.read(min(size - at, PIECE))):
+        view[at : at + len(piece)] = piece
+        at += len(piece)
+    if at < size or member.read(1):  # reading to the end is what checks the sum
+        raise ValueError(f"{name}: expected {size} bytes, got {'more' if at == size else at}")
+    values: NDArray[np.generic] = np.frombuffer(content, dtype) if size else np.zeros(0, dtype)
+    return values.reshape(shape, order="F" if is_fortran else "C")
+
+
+def npy_of(data: bytes) -> NDArray[np.generic]:
+    """The array of a ``.npy`` file's bytes. Raises ValueError for one that announces more than there is, or objects.
+
+    `np.load` allocates what the header announces before it looks.
+    """
+    stream = BytesIO(data)
+    shape, is_fortran, dtype = npy_head(stream)
+    check_numbers(dtype)
+    size = prod(shape) * dtype.itemsize
+    if size != len(data) - stream.tell():
+        raise ValueError(f"announces {size} bytes, holds {len(data) - stream.tell()}")
+    values = np.frombuffer(data, dtype, offset=stream.tell()) if size else np.zeros(0, dtype)
+    return values.reshape(shape, order="F" if is_fortran else "C")
+
+
+FREE_BYTES = 1 << 30  # of an array, unpacked, and beside it:
+MOST_RATIO = 100  # times the file's size; joint states as recorded compress 2 to 20 times
+
+
+class ArrayFile(ABC):
+    """A file of columns: arrays (T, ...) by name, of which each row is flattened."""
+
+    names: Sequence[str]
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @abstractmethod
+    def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
+        """Shape and type of an array, None where it is not there. Raises InputError for what cannot be read."""
+
+    @abstractmethod
+    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+        """The rows of an array, about `BLOCK` at a time. Raises InputError for what cannot be read."""
+
+    def columns(self, names: Sequence[str]) -> Rows:
+        """(T, K) of the columns of arrays side by side. Raises InputError for arrays that are not there, hold no
+        numbers, or are of several lengths.
+        """
+        headers = [self._checked(name) for name in names]
+        lengths = [shape[0] for shape, _ in headers]
+        if len(set(lengths)) > 1:
+            said = ", ".join(f"{name} {length}" for name, length in zip(names, lengths, strict=True))
+            raise InputError(f"{self.path}: expected arrays of one length, got {said}", remedy="check the file")
+        parts = [self._flat(name, prod(shape[1:])) for name, (shape, _) in zip(names, headers, strict=True)]
+        width = sum(prod(shape[1:]) for shape, _ in headers)
+        blocks = (np.hstack([part.read(*block) for part in parts]) for block in ranges(max(lengths, default=0)))
+        return Rows(RowFile((width,), blocks))
+
+    def _flat(self, name: str, width: int) -> RowFile:
+        """An array as (T, width); how many rows its blocks have is its own."""
+        blocks = (block.reshape(len(block), width).astype(np.float64) for block in self._blocks(name))
+        return RowFile((width,), blocks)
+
+    def read(
+        self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
+    ) -> tuple[Stamps, dict[str, Rows]]:
+        """`stamps`, and of each group of names its `columns`."""
+        columns = {key: self.columns(names) for key, names in groups.items()}
+        return self.stamps(time, unit_ns, epoch_ns), columns
+
+    def numbers(self, names: Sequence[str]) -> Float64:
+        """`columns`, all rows at once."""
+        rows = self.columns(names)
+        return rows[: len(rows)]
+
+    def rows(self, name: str) -> Rows:
+        """An array (T, ...), each row in its shape; T may be 0. Raises InputError where it holds no numbers."""
+        shape, _ = self._checked(name, least=0)
+        return Rows(RowFile(shape[1:], (block.astype(np.float64) for block in self._blocks(name))))
+
+    def stamps(self, name: str, unit_ns: int, epoch_ns: int, *, least: int = 1) -> Stamps:
+        """Stamps (T,) [ns] of an array of times in units of `unit_ns`, or of a type that says its unit."""
+        _, dtype = self._checked(name, least=least, kinds="iufM")
+        times = np.concatenate([np.zeros(0, dtype), *(block.reshape(-1) for block in self._blocks(name))])
+        if times.dtype.kind == "M":
+            times, unit_ns = times.astype("datetime64[ns]").astype(np.int64), 1
+        if times.dtype.kind in "iu":
+            return np.asarray(times.astype(np.int64) * unit_ns + epoch_ns)
+        if not np.isfinite(times).all():
+            raise InputError(f"{self.path}: {name}: expected times, got NaN or infinity", remedy="check the file")
+        whole = np.floor(times)
+        parts = np.round((times - whole) * unit_ns).astype(np.int64)
+        return np.asarray(whole.astype(np.int64) * unit_ns + parts + epoch_ns)
+
+    def _checked(self, name: str, *, least: int = 1, kinds: str = "iuf") -> tuple[tuple[int, ...], np.dtype[Any]]:
+        """Shape and type of an array of `least` rows or more, of types of these kinds."""
+        header = self._header(name)
+        if header is not None and header[1].kind in kinds and header[0]:
+            shape, dtype = header
+            size = prod(shape) * dtype.itemsize
+            if size > FREE_BYTES + MOST_RATIO * self.path.stat().st_size:  # no recording packs so small
+                raise InputError(
+                    f"{self.path}: {name}: {size} bytes unpacked, over {MOST_RATIO} times the size of the file",
+                    remedy="check the file",
+                )
+            if shape[0] >= least:
+                return header
+            raise InputError(f"{self.path}: {name}: expected rows, got none", remedy="record it again")
+        found = "none" if header is None else f"{header[1]} of shape {header[0]}"
+        raise InputError(
+            f"{self.path}: {name!r}: expected an array of numbers, got {found}",
+            remedy=f"arrays there: {', '.join(self.names)}",
+        )
+
+    def _unreadable(self, kind: str, error: Exception) -> InputError:
+        said = " ".join(str(error).split()) or type(error).__name__
+        return InputError(f"{self.path}: cannot be read as {kind}: {said}", remedy="check the file")
+
+
+_MOST_BY_COLUMNS = 1 << 28  # bytes, as they are in memory at once
+_DAMAGE = (OSError, *DAMAGE)
+
+
+class NpzFile(ArrayFile):
+    def __init__(self, path: Path) -> None:
+        """Raises InputError for a file of another kind."""
+        super().__init__(path)
+        try:
+            with zipfile.ZipFile(path) as archive:
+                self.names = [name.removesuffix(".npy") for name in archive.namelist()]
+        except _DAMAGE as error:
+            raise self._unreadable("NPZ", error) from None
+
+    def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
+        if name not in self.names:
+            return None
+        with ExitStack() as stack:
+            shape, dtype, _, _ = self._opened(stack, name)
+            return shape, dtype
+
+    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+        """One that is stored by columns is read at once."""
+        with ExitStack() as stack:
+            shape, dtype, is_by_columns, stream = self._opened(stack, name)
+            try:
+                if is_by_columns:
+                    if prod(shape) * dtype.itemsize > _MOST_BY_COLUMNS:
+                        raise ValueError(f"{name}: over {_MOST_BY_COLUMNS} bytes by columns, expected rows")
+                    whole = np.frombuffer(_read(stream, prod(shape) * dtype.itemsize), dtype).reshape(
+                        shape, order="F"
+                    )
+                    yield from (whole[first : first + BLOCK] for first in range(0, shape[0], BLOCK))
+                    return
+                row = prod(shape[1:]) * dtype.itemsize
+                for first in range(0, shape[0], BLOCK):
+                    num = min(BLOCK, shape[0] - first)
+                    yield np.frombuffer(_read(stream, num * row), dtype).reshape(num, *shape[1:])
+            except _DAMAGE as error:
+                raise self._unreadable("NPZ", error) from None
+
+    def _opened(self, stack: ExitStack, name: str) -> tuple[tuple[int, ...], np.dtype[Any], bool, IO[bytes]]:
+        """Shape, type, whether by columns, and the stream behind the header."""
+        try:
+            archive = stack.enter_context(zipfile.ZipFile(self.path))
+            stream = stack.enter_context(archive.open(f"{name}.npy"))
+            shape, is_by_columns, dtype = npy_head(stream)
+        except _DAMAGE as error:
+            raise self._unreadable("NPZ", error) from None
+        return shape, dtype, is_by_columns and len(shape) > 1, stream
+
+
+def _read(stream: IO[bytes], num: int) -> bytes:
+    content = stream.read(num)
+    if len(content) < num:
+        raise EOFError(f"expected {num} bytes, got {len(content)}")
+    return content
+
+
+_RAGGED = "write rows of one length: an array (T, K), or a column for each joint"
+_EXTRA = "tables"
+
+
+class Hdf5File(ArrayFile):
+    def __init__(self, path: Path) -> None:
+        """Raises InputError for a file of another kind."""
+        super().__init__(path)
+        self._h5py = of_extra("h5py", _EXTRA, "HDF5 files")
+        found: list[str] = []
+
+        def visit(name: str, item: Any) -> None:
+            if isinstance(item, self._h5py.Dataset):
+                found.append(name)
+
+        with self._opened() as file:
+            file.visititems(visit)
+        self.names = found
+
+    def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
+        name = name.strip("/")
+        if name not in self.names:
+            return None
+        with self._opened() as file:
+            array = file[name]
+            if self._h5py.check_vlen_dtype(array.dtype) not in {None, str, bytes}:
+                raise InputError(f"{self.path}: {name}: ragged: its rows differ in length", remedy=_RAGGED)
+            return array.shape, array.dtype
+
+    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+        with self._opened() as file:
+            array = file[name]
+            for first in range(0, array.shape[0], BLOCK):
+                yield np.asarray(array[first : first + BLOCK])
+
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        try:
+            with self._h5py.File(self.path, "r") as file:
+                yield file
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
+            raise self._unreadable("HDF5", error) from None
+
+
+class ParquetFile(ArrayFile):
+    """A Parquet file, or of one its rows whose column `only` has a value."""
+
+    def __init__(self, path: Path, only: tuple[str, int] | None = None) -> None:
+        """Raises InputError for a file of another kind."""
+        super().__init__(path)
+        self._arrow, self._parquet = (
+            of_extra(name, _EXTRA, "Parquet files") for name in ("pyarrow", "pyarrow.parquet")
+        )
+        self._only = only
+        with self._opened() as file:
+            self.names = list(file.schema_arrow.names)
+            self._num: int = file.metadata.num_rows
+        if only is not None:
+            if only[0] not in self.names:
+                raise InputError(f"{path}: no column {only[0]}", remedy=f"columns there: {', '.join(self.names)}")
+            self._num = sum(len(block) for block in self._blocks(only[0]))
+
+    def __len__(self) -> int:
+        return self._num
+
+    def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
+        if name not in self.names:
+            return None
+        block = next(self._blocks(name), None)
+        return ((0,), np.dtype(np.float64)) if block is None else ((self._num, *block.shape[1:]), block.dtype)
+
+    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+        """Raises InputError for a column whose lists differ in length."""
+        shape: tuple[int, ...] | None = None
+        names = [name] if self._only is None else list(dict.fromkeys([name, self._only[0]]))
+        with self._opened() as file:
+            for batch in file.iter_batches(batch_size=BLOCK, columns=names):
+                values = self._values(batch.column(name), name)
+                if self._only is not None:
+                    values = values[self._values(batch.column(self._only[0]), self._only[0]) == self._only[1]]
+                if shape not in (None, values.shape[1:]):
+                    raise self._ragged(name)
+                shape = values.shape[1:]
+                if len(values):
+                    yield values
+
+    def _values(self, column: Any, name: str) -> NDArray[Any]:
+        """A column (T, ...), of floats NaN where it has no value."""
+        if not hasattr(column.type, "value_type") or self._arrow.types.is_dictionary(column.type):
+            return np.asarray(column.to_numpy(zero_copy_only=False))
+        lengths = column.value_lengths().to_numpy(zero_copy_only=False)
+        if column.null_count or len(set(lengths.tolist())) > 1:
+            raise self._ragged(name)
+        inner = self._values(column.flatten(), name)
+        return inner.reshape(len(column), -1, *inner.shape[1:])
+
+    def _ragged(self, name: str) -> InputError:
+        return InputError(f"{self.path}: {name}: ragged: its rows differ in length, or have none", remedy=_RAGGED)
+
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        try:
+            with self._parquet.ParquetFile(self.path) as file:
+                yield file
+        except (OSError, ValueError, KeyError, self._arrow.ArrowException) as error:
+            raise self._unreadable("Parquet", error) from None

@@ -1,0 +1,375 @@
+"""What a file format of a baked distance grid declares, the channels it may hold, and what `info` says of its head.
+
+A channel may be a memory map larger than memory: nothing here holds more of one than `CHUNK` bytes at a time.
+
+`GridSlabs` fills the channels of a grid on disk from one end of x to the other. A folder holds one ``NAME.npy`` a
+channel, at its full size from the start, and ``progress.json``: what is being baked and how many layers of x are on
+disk. A slab of layers is one run of bytes in each file. An interrupted bake goes on from there; what is finished is
+written into every format from memory maps.
+"""
+
+import json
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.formats.summary import Grid, Summary
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.files.output import write_durably, write_json
+from splatctrl_cli.records import DistanceGrid
+
+FORMAT = "splatctrl distance grid"
+VERSION = 2
+CHUNK = 1 << 24  # [bytes] of a channel that are copied at a time
+TILE = 16  # layers of x that are turned at a time: four times as fast as all at once, 512 x 512 x 512 float32
+Shape = tuple[int, int, int]
+STEM = "field"
+FIELD_FACTS = (
+    *("distance", "kernel", "length_scale", "weights", "unknown", "probability", "sign", "frame", "labels"),
+    *("splats_used", "observed", "stamp_ns"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Channel:
+    """How a channel is stored: dtype, values per cell, unit, and whether the policy on unknown space may blank it."""
+
+    dtype: str
+    components: int = 1
+    unit: str = ""
+    may_be_unknown: bool = False
+
+    def shape(self, cells: Shape) -> tuple[int, ...]:
+        """The array's shape on a grid of `cells`."""
+        return cells if self.components == 1 else (*cells, self.components)
+
+
+_DISTANCE = Channel(dtype="<f4", unit="m")
+CHANNELS: Mapping[str, Channel] = {
+    "sdf": Channel(dtype="<f4", unit="m", may_be_unknown=True),
+    "gradient": Channel(dtype="<f4", components=3, may_be_unknown=True),
+    "bound": _DISTANCE,
+    "observed": Channel(dtype="|u1"),
+    "probability": Channel(dtype="<f4", may_be_unknown=True),
+    "label": Channel(dtype="|u1"),
+    "hard": _DISTANCE,
+    "se": _DISTANCE,
+    "gpdf": _DISTANCE,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridHead:
+    """A file of a distance grid without its values: origin (3,) float64 and voxel [m], cells along x, y, z."""
+
+    origin: NDArray[np.float64]
+    voxel: float
+    shape: Shape
+    channels: tuple[str, ...]
+    header: dict[str, object]
+
+
+def file_header(grid: DistanceGrid) -> dict[str, object]:
+    """The header as files hold it: with the format and version that they are written in."""
+    return {**grid.header, "format": FORMAT, "version": VERSION}
+
+
+def header_text(grid: DistanceGrid) -> str:
+    return json.dumps(file_header(grid), indent=1, allow_nan=False)
+
+
+def parse_header(name: str, text: str) -> dict[str, object]:
+    """The header that `text` is. Raises InputError naming `name` for other text, or another version."""
+    try:
+        parsed = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{name}: header: not JSON: {error}", remedy="bake it again") from None
+    if not isinstance(parsed, dict) or parsed.get("version") != VERSION:
+        version = parsed.get("version") if isinstance(parsed, dict) else None
+        raise InputError(
+            f"{name}: header: expected version {VERSION}, got {version!r}", remedy="bake it again with this splatctrl"
+        )
+    return parsed
+
+
+def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -> Shape:
+    """Cells along x, y and z of channels given as dtype and shape by name.
+
+    Raises InputError naming `name` and the channel where there is no sdf, or one of a name, dtype or shape that a
+    grid does not have.
+    """
+    strange = [channel for channel in arrays if channel not in CHANNELS]
+    if strange or "sdf" not in arrays:
+        raise InputError(
+            f"{name}: expected the channel sdf and any of {', '.join(list(CHANNELS)[1:])}, "
+            f"got {', '.join(arrays) or 'none'}",
+            remedy="give a grid that sdf-bake wrote",
+        )
+    cells = arrays["sdf"][1]
+    if len(cells) != 3 or min(cells) < 1:
+        raise InputError(f"{name}: sdf: expected (X, Y, Z) cells, got {cells}", remedy="bake it again")
+    shape = (cells[0], cells[1], cells[2])
+    for channel, got in arrays.items():
+        wanted = (CHANNELS[channel].dtype, CHANNELS[channel].shape(shape))
+        if got != wanted:
+            raise InputError(
+                f"{name}: {channel}: expected {wanted[0]} {wanted[1]}, got {got[0]} {got[1]}", remedy="bake it again"
+            )
+    return shape
+
+
+def check_grid(grid: DistanceGrid) -> Shape:
+    """Cells along x, y and z of a grid to write. Raises InputError as `check_layout` does."""
+    return check_layout("grid to write", {name: (v.dtype.str, v.shape) for name, v in grid.channels.items()})
+
+
+def check_finite(name: str, grid: DistanceGrid) -> None:
+    """Raise InputError for a value that is not finite, where the header's policy on unknown space is not `nan`."""
+    for channel, values in grid.channels.items():
+        if not np.issubdtype(values.dtype, np.floating):
+            continue
+        blank = CHANNELS[channel].may_be_unknown and grid.header.get("unknown") == "nan"
+        for layers in slabs(values):
+            bad = np.isinf(layers) if blank else ~np.isfinite(layers)
+            if bad.any():
+                raise InputError(
+                    f"{name}: {channel}: expected finite values, got {layers[bad][0]}", remedy="bake it again"
+                )
+
+
+def slabs(values: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
+    """The channel in runs of layers of x, of `CHUNK` bytes or one layer."""
+    step = max(1, CHUNK // max(1, values.nbytes // len(values)))
+    for start in range(0, len(values), step):
+        yield np.ascontiguousarray(values[start : start + step])
+
+
+def x_fastest(values: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
+    """The channel in runs of planes of z, as (z, y, x) or (z, y, x, 3), of `CHUNK` bytes or one plane."""
+    x, y, z = values.shape[:3]
+    step = max(1, CHUNK // max(1, values.nbytes // z))
+    for start in range(0, z, step):
+        planes = np.empty((min(step, z - start), y, x, *values.shape[3:]), values.dtype)
+        for at in range(0, x, TILE):
+            tile = values[at : at + TILE, :, start : start + step]
+            planes[:, :, at : at + TILE] = tile.transpose(2, 1, 0, *range(3, values.ndim))
+        yield planes
+
+
+def from_x_fastest(planes: NDArray[np.generic]) -> NDArray[np.generic]:
+    """The channel (X, Y, Z[, 3]) of values that lie as `x_fastest` yields them."""
+    return np.ascontiguousarray(planes.transpose(2, 1, 0, *range(3, planes.ndim)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridFormat:
+    """One kind of file, in the ``ENTRIES`` of its module: all that the program and its docs know of it.
+
+    `name` is what --formats takes; `write` writes the grid as a path that ends in `suffix`, or with `is_per_channel`
+    a file a channel beside it; `describe` takes a path and the file's first bytes and returns None for a file of
+    another kind; `read` gives back a grid that was written.
+    `needs` are channels of which the grid must have one; `holds_unknown`: it can mark cells without a distance;
+    `bytes_per_cell` is its size on the disk, None for that of all channels; `check` raises UsageError where what
+    writes it is not installed. `docs` is its row in docs/artefacts.md, cells between bars: name, file, who opens it,
+    checked, cost.
+    """
+
+    name: str
+    order: int
+    suffix: str
+    write: Callable[[Path, DistanceGrid], None]
+    describe: Callable[[Path, bytes], Summary | None]
+    read: Callable[[Path], DistanceGrid] | None = None
+    is_per_channel: bool = False
+    needs: frozenset[str] = frozenset({"sdf"})
+    holds_unknown: bool = True
+    bytes_per_cell: int | None = None
+    check: Callable[[], object] = lambda: None
+    docs: str = ""
+
+    def files(self, channels: Collection[str]) -> tuple[str, ...]:
+        """The names of the files that hold a grid of some channels."""
+        stems = [f"{STEM}.{channel}" for channel in channels] if self.is_per_channel else [STEM]
+        return tuple(f"{stem}{self.suffix}" for stem in stems)
+
+    def size_per_cell(self, bytes_of_channels: int) -> int:
+        """Bytes on the disk for a cell whose channels have so many in memory."""
+        return bytes_of_channels if self.bytes_per_cell is None else self.bytes_per_cell
+
+
+def covers(first_cell: Any, voxel: float, shape: Any) -> dict[str, object]:
+    """Cells, extent and the centres of the first and last cell [m] of a grid."""
+    first, sides = np.asarray(first_cell, np.float64), voxel * (np.asarray(shape) - 1)
+    return {
+        "shape": [int(n) for n in shape],
+        "extent_m": np.round(sides, 6).tolist(),
+        "first_cell": np.round(first, 6).tolist(),
+        "last_cell": np.round(first + sides, 6).tolist(),
+        "voxel": voxel,
+    }
+
+
+def header_facts(header: Mapping[str, Any]) -> dict[str, object]:
+    """How a grid was made, of what its header says."""
+    return {key: header[key] for key in FIELD_FACTS if header.get(key) is not None}
+
+
+def summary_of(path: Path, kind: str, head: GridHead) -> Summary:
+    """What a grid covers, how it was made, and its channels."""
+    rows = [[name, CHANNELS[name].dtype.lstrip("<|"), CHANNELS[name].unit or "-"] for name in head.channels]
+    facts = {**covers(head.origin, head.voxel, head.shape), **header_facts(head.header)}
+    table = Grid(name="channels", header=("channel", "dtype", "unit"), rows=rows)
+    return Summary(path=str(path), kind=kind, facts=facts, grids=(table,))
+
+
+def json_value(text: object) -> object:
+    """What a JSON text holds; any other value as it is."""
+    try:
+        return json.loads(text) if isinstance(text, str) else text
+    except ValueError:
+        return text
+
+
+PROGRESS = "progress.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlabPlan:
+    """What is baked: origin and voxel [m], cells, channels, and the settings that decide their values (JSON)."""
+
+    origin: tuple[float, float, float]
+    voxel: float
+    shape: Shape
+    channels: tuple[str, ...]
+    settings: Mapping[str, object] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, object]:
+        plain: dict[str, object] = json.loads(json.dumps(asdict(self)))
+        return plain
+
+
+class GridSlabs:
+    """The channels of a `SlabPlan` in `folder`; `num_layers` of x are on disk, and what was counted up to there."""
+
+    def __init__(
+        self, folder: Path, plan: SlabPlan, num_layers: int, counts: Mapping[str, int] | None = None
+    ) -> None:
+        self.folder = folder
+        self.plan = plan
+        self.num_layers = num_layers
+        self.counts = counts or {}
+
+    def write(self, slab: Mapping[str, NDArray[np.generic]], counts: Mapping[str, int] | None = None) -> None:
+        """Put the next layers of x, ``(L, Y, Z[, 3])`` of every channel, on disk, and count them when they are there.
+
+        counts: what the maker of the slabs counted up to the end of this one.
+
+        Raises InputError for channels or shapes that are not those of the plan.
+        """
+        if slab.keys() != set(self.plan.channels):
+            raise InputError(f"slab: expected the channels {', '.join(self.plan.channels)}, got {', '.join(slab)}")
+        num = len(slab[self.plan.channels[0]])
+        for name in self.plan.channels:
+            wanted = (CHANNELS[name].dtype, self._shape(name, num))
+            values = slab[name]
+            if (values.dtype.str, values.shape) != wanted or num + self.num_layers > self.plan.shape[0]:
+                raise InputError(
+                    f"slab: {name} at layer {self.num_layers} of {self.plan.shape[0]}: expected {wanted}, "
+                    f"got {(values.dtype.str, values.shape)}"
+                )
+            self._write_channel(name, values)
+        self.num_layers += num
+        self.counts = counts or {}
+        _write_progress(self.folder, self.plan, self.num_layers, self.counts)
+
+    def is_whole(self) -> bool:
+        """Whether every layer is on disk."""
+        return self.num_layers == self.plan.shape[0]
+
+    def grid(self, header: Mapping[str, object]) -> DistanceGrid:
+        """The grid, its channels read-only memory maps. Raises InputError before every layer is there."""
+        if not self.is_whole():
+            raise InputError(
+                f"{self.folder}: expected {self.plan.shape[0]} layers, got {self.num_layers}",
+                remedy="continue the bake",
+            )
+        channels: dict[str, NDArray[np.generic]] = {
+            name: np.lib.format.open_memmap(self._path(name), mode="r") for name in self.plan.channels
+        }
+        origin = np.array(self.plan.origin, np.float64)
+        return DistanceGrid(origin=origin, voxel=self.plan.voxel, channels=channels, header=dict(header))
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.npy"
+
+    def _shape(self, name: str, num_layers: int) -> tuple[int, ...]:
+        return CHANNELS[name].shape((num_layers, *self.plan.shape[1:]))
+
+    def _write_channel(self, name: str, values: NDArray[np.generic]) -> None:
+        path = self._path(name)
+        layer = np.dtype(CHANNELS[name].dtype).itemsize * int(np.prod(self._shape(name, 1)))
+        with path.open("r+b") as stream:
+            stream.seek(path.stat().st_size - layer * (self.plan.shape[0] - self.num_layers))
+            stream.write(np.ascontiguousarray(values).data)
+            stream.flush()
+            os.fsync(stream.fileno())
+
+
+def start_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
+    """An empty store in `folder`, which is made: every file at its full size. A full disk is an OSError here."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / PROGRESS).unlink(missing_ok=True)
+    for name in plan.channels:
+        path = folder / f"{name}.npy"
+        path.unlink(missing_ok=True)
+        np.lib.format.open_memmap(path, "w+", np.dtype(CHANNELS[name].dtype), CHANNELS[name].shape(plan.shape))
+        with path.open("r+b") as stream:
+            os.posix_fallocate(stream.fileno(), 0, path.stat().st_size)
+    _write_progress(folder, plan, 0, {})
+    return GridSlabs(folder, plan, 0)
+
+
+def resume_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
+    """The store that an interrupted bake of the same plan left in `folder`, an empty one where it left none.
+
+    Raises UsageError where it was of another plan, naming what differs, InputError where it is damaged.
+    """
+    try:
+        progress = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
+        left, num_layers, counts = dict(progress["plan"]), int(progress["num_layers"]), dict(progress["counts"])
+    except FileNotFoundError:
+        return start_slabs(folder, plan)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{folder / PROGRESS}: not readable: {error!r}", remedy="bake without --resume") from None
+    wanted = plan.as_dict()
+    differs = [key for key in wanted if left.get(key) != wanted[key]]
+    if differs:
+        told = ", ".join(_difference(key, left.get(key), wanted[key]) for key in differs)
+        raise UsageError(f"{folder}: cannot be continued: {told}", remedy="bake without --resume")
+    for name in plan.channels:
+        path = folder / f"{name}.npy"
+        size = CHANNELS[name].shape(plan.shape)
+        try:
+            found = np.lib.format.open_memmap(path, mode="r").shape
+        except (OSError, ValueError):  # not there, or cut
+            found = ()
+        if found != size:
+            raise InputError(f"{path}: expected {size}, got no such array", remedy="bake without --resume")
+    return GridSlabs(folder, plan, num_layers, counts)
+
+
+def _difference(key: str, left: object, wanted: object) -> str:
+    if isinstance(left, dict) and isinstance(wanted, dict):
+        names = sorted(name for name in {*left, *wanted} if left.get(name) != wanted.get(name))
+        return ", ".join(f"{name} was {left.get(name)!r}, is {wanted.get(name)!r}" for name in names)
+    return f"{key} was {left!r}, is {wanted!r}"
+
+
+def _write_progress(folder: Path, plan: SlabPlan, num_layers: int, counts: Mapping[str, int]) -> None:
+    progress = {"plan": plan.as_dict(), "num_layers": num_layers, "counts": counts}
+    write_durably(folder / PROGRESS, lambda path: write_json(path, progress))

@@ -1,0 +1,49 @@
+"""The files in which a baked distance grid can be written, by the name that ``sdf-bake --formats`` takes."""
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+from splatctrl_cli.formats.grid.grid_format import STEM, GridFormat
+
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.libraries import entries_of
+from splatctrl_cli.records import DistanceGrid
+
+FORMATS: Mapping[str, GridFormat] = {kind.name: kind for kind in entries_of(__package__, GridFormat)}
+
+
+def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: str = "free") -> None:
+    """Raise UsageError where `write_grid` could not write one of `names`: to be asked before a bake that takes long.
+
+    `unknown` is the policy on unknown space, which blanks cells where it is ``nan``.
+    """
+    strange = [name for name in names if name not in FORMATS]
+    if strange or not names:
+        raise UsageError(f"formats: expected some of {', '.join(FORMATS)}, got {', '.join(strange) or 'none'}")
+    for name in names:
+        kind = FORMATS[name]
+        if not kind.needs & set(channels):
+            raise UsageError(
+                f"format {name}: expected one of the channels {', '.join(sorted(kind.needs))}, "
+                f"got {', '.join(channels)}",
+                remedy="bake it too, or leave the format out",
+            )
+        if unknown == "nan" and not kind.holds_unknown:
+            raise UsageError(
+                f"format {name}: cannot hold cells without a distance",
+                remedy="bake with field.unknown=obstacle or free, or leave the format out",
+            )
+        kind.check()
+
+
+def write_grid(folder: Path, grid: DistanceGrid, names: Sequence[str]) -> tuple[Path, ...]:
+    """Write the grid in each of the formats `names` into `folder`, and return the files.
+
+    Channels may be memory maps: none is held in memory whole (but for vdb). Raises as `check_formats`
+    does, and NotEvaluableError where a surface is asked for that the grid does not have.
+    """
+    check_formats(names, grid.channels)
+    kinds = [FORMATS[name] for name in dict.fromkeys(names)]
+    for kind in kinds:
+        kind.write(folder / f"{STEM}{kind.suffix}", grid)
+    return tuple(folder / file for kind in kinds for file in kind.files(grid.channels))

@@ -1,0 +1,194 @@
+"""Baked grids for the planners of other programs: NVIDIA's cuRobo and MoveIt.
+
+The distance as the voxel grid of NVIDIA's cuRobo: ``field.curobo.npz``, which a few lines of its user load.
+
+Read in its source (NVlabs/curobo, 0.7.5 to 0.7.7: geom/types.py `VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu
+`compute_voxel_index`), not tried on it. It flattens (x, y, z) with z fastest and places the grid by the pose of its
+middle, ``x y z qw qx qy qz``. Values are positive inside; ``1 + floor(dims / voxel)`` cells a side; the kernel
+truncates ``(x - pose + dims / 2) / voxel``: cell i spans ``pose - dims / 2 + [i, i + 1] voxel``, so the pose is half
+a voxel below the middle of our cells. A sphere's centre takes the value of the cell that it lies in. In the first
+three and last two cells of an axis, and outside, all is free. (0.7.0 to 0.7.4 count cells otherwise, and add half a
+voxel to values.)
+
+Occupied cells as the stream of MoveIt's distance field, which propagates distances from them itself.
+
+Format: moveit_core, distance_field/src/propagation_distance_field.cpp (`readFromStream`; the same in MoveIt 1 and 2)
+and voxel_grid.h. Seven lines of text, then a zlib stream of bits: x slowest, each run of z in whole bytes, lowest bit
+first. The reader takes ``int(size * (1 / resolution))`` cells a side, and puts the centre of cell 0 at the origin.
+"""
+
+import json
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.formats.arrays import DAMAGE, Pieces, has_arrays, read_arrays, savez
+from splatctrl_cli.formats.grid.grid_format import (
+    CHUNK,
+    GridFormat,
+    check_grid,
+    covers,
+    header_facts,
+    header_text,
+    slabs,
+)
+from splatctrl_cli.formats.summary import Summary
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Bool, DistanceGrid
+
+CUROBO = "0.7"  # the version that a file is for, as it says
+
+
+def write_curobo(path: Path, grid: DistanceGrid) -> None:
+    """Write ``sdf`` for cuRobo. Raises InputError for NaN."""
+    shape, distances = check_grid(grid), grid.channels["sdf"]
+    if any(np.isnan(layers).any() for layers in slabs(distances)):
+        raise InputError(
+            "grid to write for cuRobo: sdf: expected distances, got NaN",
+            remedy="bake with field.unknown=obstacle or free",
+        )
+    sides = np.array(shape, np.float64) - 1.0
+    center = grid.origin + 0.5 * grid.voxel * sides - 0.5 * grid.voxel
+    features = Pieces(
+        dtype="<f4",
+        shape=(shape[0] * shape[1] * shape[2],),
+        make=lambda: (-layers.astype(np.float32, copy=False) for layers in slabs(distances)),
+    )
+    arrays: dict[str, NDArray[np.generic] | Pieces] = {
+        "features": features,
+        "dims": grid.voxel * sides,
+        "voxel_size": np.asarray(grid.voxel, "<f8"),
+        "pose": np.array([*center, 1.0, 0.0, 0.0, 0.0]),
+        "shape": np.array(shape, "<i8"),
+        "curobo": np.asarray(CUROBO),
+        "channel": np.asarray("sdf"),
+        "header": np.asarray(header_text(grid)),
+    }
+    savez(path, arrays, level=0)
+
+
+def describe_curobo(path: Path, head: bytes) -> Summary | None:
+    """A ``field.curobo.npz``. Raises InputError for one that is damaged."""
+    if not has_arrays(path, head, {"features", "dims", "voxel_size", "pose", "curobo"}):
+        return None
+    try:
+        content = read_arrays(
+            path, ("curobo", "channel", "shape", "voxel_size", "dims", "pose", "header"), most=1 << 20
+        )
+        facts: dict[str, object] = {
+            "curobo": str(content["curobo"]),
+            "channel": str(content["channel"]),
+            "shape": content["shape"].tolist(),
+            "voxel": float(np.asarray(content["voxel_size"], np.float64)),
+            "dims": content["dims"].tolist(),
+            "pose_xyz_qwxyz": content["pose"].tolist(),
+            **header_facts(json.loads(str(content["header"]))),
+        }
+    except (*DAMAGE, OSError, TypeError) as error:
+        raise InputError(f"{path}: not a readable .npz: {error}", remedy="the file is damaged") from None
+    return Summary(path=str(path), kind="cuRobo voxel grid", facts=facts)
+
+
+_CUROBO_DOCS = """
+`curobo` | `field.curobo.npz`: `features`, `dims`, `voxel_size`, `pose`, `shape` | NVIDIA cuRobo, by the lines
+    below | its index arithmetic; cuRobo not tried | 1.1 s, 48 MiB (one channel)
+"""
+
+
+FIELDS = ("resolution", "size_x", "size_y", "size_z", "origin_x", "origin_y", "origin_z")
+MOVEIT_MARGIN = 1e-6  # [cells] by which a size is larger, so that no rounding truncates it to a cell less
+REACH = np.sqrt(3.0) / 2.0  # [cells] from a centre to a corner
+ROUNDING = 1e-6  # [m] of float32 values a metre or two from their origin
+
+
+def write_moveit(path: Path, grid: DistanceGrid) -> None:
+    """Write the cells that are taken for occupied: a splat may reach into the cell's cube, or sdf is not above 0.
+
+    The first is ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` in a grid without bound; the second takes in the
+    distance's own zero level, unknown space where the policy makes it an obstacle, and cells that are NaN.
+    Raises InputError where the grid has neither bound nor hard.
+    """
+    shape = check_grid(grid)
+    if not {"bound", "hard"} & grid.channels.keys():
+        raise InputError(
+            f"grid to write for MoveIt: expected the channel bound or hard, got {', '.join(grid.channels)}",
+            remedy="bake it with one of them",
+        )
+    numbers = (grid.voxel, *((n + MOVEIT_MARGIN) * grid.voxel for n in shape), *grid.origin)
+    text = "".join(f"{name}: {float(value)!r}\n" for name, value in zip(FIELDS, numbers, strict=True))
+    step = max(1, CHUNK // (4 * shape[1] * shape[2]))
+    packer = zlib.compressobj()
+    with path.open("wb") as stream:
+        stream.write(text.encode("ascii"))
+        for start in range(0, shape[0], step):
+            occupied = is_occupied(grid, slice(start, start + step))
+            stream.write(packer.compress(np.packbits(occupied, axis=2, bitorder="little").tobytes()))
+        stream.write(packer.flush())
+
+
+def is_occupied(grid: DistanceGrid, layers: slice) -> Bool:
+    """(L, Y, Z) which cells of these layers of x are written as occupied."""
+    name, most = ("bound", 0.0) if "bound" in grid.channels else ("hard", REACH * grid.voxel + ROUNDING)
+    reached = np.asarray(grid.channels[name][layers]) <= np.float32(most)
+    is_clear: NDArray[np.bool_] = np.asarray(grid.channels["sdf"][layers]) > np.float32(0.0)  # False for NaN
+    return reached | ~is_clear
+
+
+def read_moveit_head(path: Path) -> tuple[dict[str, float], int]:
+    """The numbers at the head of a stream, and where its bits start. Raises InputError for a file that has none."""
+    with path.open("rb") as stream:
+        lines = [stream.readline(128) for _ in FIELDS]
+        start = stream.tell()
+    numbers: dict[str, float] = {}
+    for name, line in zip(FIELDS, lines, strict=True):
+        key, _, value = line.decode("ascii", errors="replace").partition(": ")
+        try:
+            numbers[name] = float(value)
+        except ValueError:
+            numbers[name] = np.nan
+        if key != name or not np.isfinite(numbers[name]):
+            raise InputError(f"{path}: expected '{name}: NUMBER', got {line!r}", remedy="the file is damaged")
+    return numbers, start
+
+
+def describe_moveit(path: Path, head: bytes) -> Summary | None:
+    """A stream of MoveIt's distance field."""
+    if re.match(rb"resolution: \S+\nsize_x: ", head) is None:
+        return None
+    numbers, start = read_moveit_head(path)
+    cells = [int(numbers[f"size_{axis}"] * (1.0 / numbers["resolution"])) for axis in "xyz"]
+    place = covers([numbers[f"origin_{axis}"] for axis in "xyz"], numbers["resolution"], cells)
+    facts = {**place, "packed_bytes": path.stat().st_size - start}
+    return Summary(path=str(path), kind="MoveIt distance field", facts=facts)
+
+
+_MOVEIT_DOCS = """
+`moveit` | `field.moveit`: occupied cells | `PropagationDistanceField(stream, max_distance)` of MoveIt 1 and 2 | a
+    reader that follows its source; MoveIt not tried | 0.4 s, 16 MiB (one channel)
+"""
+
+ENTRIES = (
+    GridFormat(
+        name="curobo",
+        order=4,
+        suffix=".curobo.npz",
+        write=write_curobo,
+        describe=describe_curobo,
+        holds_unknown=False,
+        bytes_per_cell=4,
+        docs=_CUROBO_DOCS,
+    ),
+    GridFormat(
+        name="moveit",
+        order=5,
+        suffix=".moveit",
+        write=write_moveit,
+        describe=describe_moveit,
+        needs=frozenset({"bound", "hard"}),
+        bytes_per_cell=0,
+        docs=_MOVEIT_DOCS,
+    ),
+)

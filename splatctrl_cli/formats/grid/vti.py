@@ -1,0 +1,222 @@
+"""Baked distance fields as ParaView's ``.vti``: VTK ImageData whose points are the cell centres.
+
+Raw appended little-endian blocks, x fastest, each behind its length; the header is a string in FieldData.
+Format: VTK's user guide and the XML file formats page of its documentation.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+from xml.etree.ElementTree import Element, ParseError
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from defusedxml import ElementTree
+from defusedxml.common import DefusedXmlException
+from numpy.typing import NDArray
+from splatctrl_cli.formats.grid.grid_format import (
+    CHANNELS,
+    FORMAT,
+    GridFormat,
+    GridHead,
+    check_finite,
+    check_grid,
+    check_layout,
+    from_x_fastest,
+    header_text,
+    parse_header,
+    summary_of,
+    x_fastest,
+)
+from splatctrl_cli.formats.summary import Grid, Summary
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import DistanceGrid
+
+_TYPES = {"<f4": "Float32", "|u1": "UInt8"}
+_DTYPES = {name: dtype for dtype, name in _TYPES.items()}
+_FILE = {"type": "ImageData", "version": "1.0", "byte_order": "LittleEndian", "header_type": "UInt64"}
+_APPENDED = b'<AppendedData encoding="raw">'
+_REMEDY = "give a .vti that sdf-bake wrote, or bake it again"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Block:
+    name: str
+    dtype: str
+    components: int
+    start: int  # [bytes] in the file, of the length before it
+
+
+def write_vti(path: Path, grid: DistanceGrid) -> None:
+    """Write the grid; NaN is kept. Raises InputError for channels that a file cannot hold."""
+    x, y, z = check_grid(grid)
+    extent = f"0 {x - 1} 0 {y - 1} 0 {z - 1}"
+    arrays, offset = [], 0
+    for name, values in grid.channels.items():
+        arrays.append(
+            f'        <DataArray type="{_TYPES[CHANNELS[name].dtype]}" Name={quoteattr(name)} '
+            f'NumberOfComponents="{CHANNELS[name].components}" format="appended" offset="{offset}"/>'
+        )
+        offset += 8 + values.nbytes
+    codes = " ".join(str(byte) for byte in (*header_text(grid).encode("utf-8"), 0))
+    vectors = ' Vectors="gradient"' if "gradient" in grid.channels else ""
+    lines = [
+        '<?xml version="1.0"?>',
+        f"<VTKFile {' '.join(f'{key}={quoteattr(value)}' for key, value in _FILE.items())}>",
+        *(f"  <!-- {line} -->" for line in _comments(grid)),
+        f'  <ImageData WholeExtent="{extent}" Origin="{_triple(grid.origin)}" Spacing="{_triple([grid.voxel] * 3)}">',
+        "    <FieldData>",
+        '      <Array type="String" Name="header" NumberOfTuples="1" format="ascii">',
+        f"        {codes}",
+        "      </Array>",
+        "    </FieldData>",
+        f'    <Piece Extent="{extent}">',
+        f'      <PointData Scalars="sdf"{vectors}>',
+        *arrays,
+        "      </PointData>",
+        "    </Piece>",
+        "  </ImageData>",
+        f"  {_APPENDED.decode()}",
+        "   _",
+    ]
+    with path.open("wb") as stream:
+        stream.write("\n".join(lines).encode("utf-8"))
+        for values in grid.channels.values():
+            stream.write(values.nbytes.to_bytes(8, "little"))
+            for planes in x_fastest(values):
+                stream.write(planes.tobytes())
+        stream.write(b"\n  </AppendedData>\n</VTKFile>\n")
+
+
+def read_vti(path: Path) -> DistanceGrid:
+    """The grid that `write_vti` wrote. Raises InputError for a file that is missing, damaged or not ours."""
+    with _opened(path) as stream:
+        head, blocks = _head(path, stream)
+        channels = {block.name: _values(path, stream, head, block) for block in blocks}
+    grid = DistanceGrid(origin=head.origin, voxel=head.voxel, channels=channels, header=head.header)
+    check_finite(str(path), grid)
+    return grid
+
+
+def read_vti_head(path: Path) -> GridHead:
+    """What `read_vti` reads without the channels' values. Raises InputError as that does."""
+    with _opened(path) as stream:
+        return _head(path, stream)[0]
+
+
+def _opened(path: Path) -> BinaryIO:
+    try:
+        return path.open("rb")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file", remedy="bake one with sdf-bake --formats vti") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: expected a file, got a folder", remedy="give the field.vti in it") from None
+
+
+def _head(path: Path, stream: BinaryIO) -> tuple[GridHead, list[_Block]]:
+    text = stream.read(1 << 22)  # bytes in which the XML must end
+    mark = text.find(_APPENDED)
+    begin = text.find(b"_", mark) + 1
+    if mark < 0 or begin == 0:
+        raise InputError(f"{path}: expected raw appended data, got none", remedy=_REMEDY)
+    try:
+        root: Any = ElementTree.fromstring(text[:begin] + b"</AppendedData></VTKFile>")
+    except (ParseError, DefusedXmlException) as error:
+        raise InputError(f"{path}: not readable XML: {error}", remedy=_REMEDY) from None
+    image, piece = root.find("ImageData"), root.find("ImageData/Piece")
+    if {key: root.get(key) for key in _FILE} != _FILE or image is None or piece is None:
+        raise InputError(f"{path}: expected a VTKFile of {_FILE}, got {dict(root.attrib)}", remedy=_REMEDY)
+    try:
+        return _parsed(path, image, piece, begin)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: not a distance grid of ours: {error!r}", remedy=_REMEDY) from None
+
+
+def _parsed(path: Path, image: Element, piece: Element, begin: int) -> tuple[GridHead, list[_Block]]:
+    bounds = [int(number) for number in piece.attrib["Extent"].split()]
+    if bounds[::2] != [0, 0, 0] or piece.attrib["Extent"] != image.attrib["WholeExtent"]:
+        raise ValueError(f"expected one piece from 0 0 0, got {piece.attrib['Extent']}")
+    shape = (bounds[1] + 1, bounds[3] + 1, bounds[5] + 1)
+    spacing = {float(number) for number in image.attrib["Spacing"].split()}
+    if len(spacing) != 1:
+        raise ValueError(f"expected cubic cells, got {image.attrib['Spacing']}")
+    codes = [int(code) for code in (image.findtext("FieldData/Array") or "").split()]
+    header = parse_header(str(path), bytes(codes[:-1]).decode("utf-8"))
+    blocks = [
+        _Block(
+            name=array.attrib["Name"],
+            dtype=_DTYPES[array.attrib["type"]],
+            components=int(array.attrib["NumberOfComponents"]),
+            start=begin + int(array.attrib["offset"]),
+        )
+        for array in piece.iterfind("PointData/DataArray")
+    ]
+    layout = {b.name: (b.dtype, shape if b.components == 1 else (*shape, b.components)) for b in blocks}
+    check_layout(str(path), layout)
+    origin = np.array([float(number) for number in image.attrib["Origin"].split()])
+    voxel = spacing.pop()
+    if origin.shape != (3,) or not np.isfinite(origin).all() or not 0.0 < voxel < np.inf:
+        raise ValueError(f"expected a place and a size above 0, got {image.attrib['Origin']}, {voxel}")
+    return GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header), blocks
+
+
+def _values(path: Path, stream: BinaryIO, head: GridHead, block: _Block) -> NDArray[np.generic]:
+    stream.seek(block.start)
+    x, y, z = head.shape
+    count = x * y * z * block.components
+    size = count * np.dtype(block.dtype).itemsize
+    there = min(int.from_bytes(stream.read(8), "little"), path.stat().st_size - block.start - 8)
+    if there != size:
+        raise InputError(
+            f"{path}: {block.name}: expected {size} bytes, got {max(there, 0)}",
+            remedy="the file is cut; bake it again",
+        )
+    flat: NDArray[np.generic] = np.fromfile(stream, block.dtype, count)
+    planes = flat.reshape((z, y, x) if block.components == 1 else (z, y, x, block.components))
+    return from_x_fastest(planes)
+
+
+def _comments(grid: DistanceGrid) -> list[str]:
+    names = ("sign", "frame", "units", "origin", "distance", "kernel", "length_scale", "weights")
+    return [f"{name}: {grid.header[name]}".replace("--", "- -") for name in names if name in grid.header]
+
+
+def _triple(values: object) -> str:
+    return " ".join(repr(float(value)) for value in np.asarray(values, dtype=np.float64))
+
+
+def describe_vti(path: Path, head: bytes) -> Summary | None:
+    """A ``.vti``: as a distance grid where it is ours, as what its XML says where not."""
+    if path.suffix != ".vti" and b'type="ImageData"' not in head[:512]:
+        return None
+    text = head.decode("latin-1")
+    image = re.search(r"<ImageData\b([^>]*)>", text)
+    if image is None:
+        raise InputError(f"{path}: a .vti without ImageData", remedy="the file is damaged")
+    if FORMAT in _field_text(text):
+        return summary_of(path, "ParaView image data", read_vti_head(path))
+    facts: dict[str, object] = dict(_ATTRIBUTE.findall(image[1]))
+    arrays = [dict(_ATTRIBUTE.findall(attributes)) for attributes in re.findall(r"<DataArray\b([^>]*)>", text)]
+    rows = [[a.get("Name", "-"), a.get("type", "-"), a.get("NumberOfComponents", "1")] for a in arrays]
+    grid = Grid(name="arrays", header=("array", "type", "components"), rows=rows)
+    return Summary(path=str(path), kind="ParaView image data", facts=facts, grids=(grid,))
+
+
+_ATTRIBUTE = re.compile(r'(\w+)="([^"]*)"')
+
+
+def _field_text(text: str) -> str:
+    """The string in FieldData, which is written as numbers."""
+    codes = re.search(r'<Array type="String"[^>]*>([\d\s]+)</Array>', text)
+    return "" if codes is None else bytes(int(code) % 256 for code in codes[1].split()).decode("utf-8", "replace")
+
+
+_DOCS = """
+`vti` | `field.vti`: ImageData, points at the cell centres; the header is a string in the field data | ParaView,
+    VTK | VTK 9.7.2, every value; ParaView not tried | 3.2 s, 48 MiB
+"""
+ENTRIES = (
+    GridFormat(name="vti", order=1, suffix=".vti", write=write_vti, describe=describe_vti, read=read_vti, docs=_DOCS),
+)

@@ -1,0 +1,178 @@
+"""Image files: what a JPEG or PNG says of itself and whether it is whole, without decoding it; and their pixels.
+
+Portable float maps, too: one float32 channel, as MVSNet stores depth, whose rows are kept bottom first in the file.
+"""
+
+import re
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.formats.unpacking import read_bytes
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Float32
+
+JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+TAIL = 64  # bytes in which the closing mark of a file stands; some encoders pad
+MOST_PIXELS = 1 << 27  # of an image that is left undecoded; OpenCV's own bound is 2^30
+_JPEG_FRAMES = frozenset({0xC0, 0xC1, 0xC2})  # baseline, extended, progressive; Huffman coded
+_JPEG_BARE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a length
+_PNG_CHANNELS = {0: 1, 2: 3}  # by colour type: grey, RGB
+_CLOSING_MARKS = ((JPEG, b"\xff\xd9"), (PNG[:4], b"IEND"))
+_PNG_HEAD = struct.Struct(">16xIIB")
+_PNG_CHUNKS = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}  # that must be understood
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageHead:
+    """Size [px], channels (1 or 3) and bits of a channel of a file whose bytes can be kept as they are."""
+
+    width: int
+    height: int
+    channels: int
+    bits: int
+
+
+def image_head(data: bytes) -> ImageHead | None:
+    """The head of a whole JPEG or PNG of the plain kinds; None for any other, which only decoding can judge.
+
+    Plain are Huffman-coded JPEG of 8 bits, grey or of three channels, up to its closing mark, and PNG of grey or RGB
+    without transparency or interlace, every chunk of which has the checksum that it says (ITU-T T.81; W3C PNG).
+    """
+    head = (_jpeg_head if data.startswith(JPEG) else _png_head)(data)
+    if head is None or not 0 < head.width * head.height <= MOST_PIXELS:
+        return None
+    return head
+
+
+def _jpeg_head(data: bytes) -> ImageHead | None:
+    if b"\xff\xd9" not in data[-TAIL:]:
+        return None
+    at, head = 2, None
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # a byte of filling
+            at += 1
+            continue
+        if marker in _JPEG_BARE:
+            at += 2
+            continue
+        length = int.from_bytes(data[at + 2 : at + 4], "big")
+        if length < 2 or marker == 0xD9:
+            return None
+        if marker == 0xDA:  # the picture begins
+            return head
+        if 0xC0 <= marker <= 0xCF and marker not in {0xC4, 0xC8, 0xCC}:
+            if marker not in _JPEG_FRAMES or head is not None or at + 10 > len(data):
+                return None
+            bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
+            if bits != 8 or channels not in {1, 3}:
+                return None
+            head = ImageHead(width=width, height=height, channels=channels, bits=bits)
+        at += 2 + length
+    return None
+
+
+def _png_head(data: bytes) -> ImageHead | None:
+    if not data.startswith(PNG):
+        return None
+    at, head, has_pixels = len(PNG), None, False
+    view = memoryview(data)
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        end = at + 12 + length
+        if end > len(data) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            return None
+        if (kind == b"IHDR") != (head is None) or kind == b"tRNS":
+            return None
+        if kind == b"IHDR":
+            if length != 13:
+                return None
+            width, height, bits, color, _, _, interlace = struct.unpack_from(">IIBBBBB", data, at + 8)
+            if interlace or bits not in {8, 16} or color not in _PNG_CHANNELS:
+                return None
+            head = ImageHead(width=width, height=height, channels=_PNG_CHANNELS[color], bits=bits)
+        has_pixels |= kind == b"IDAT"
+        if kind == b"IEND":
+            return head if has_pixels else None
+        at = end
+    return None
+
+
+def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
+    """Pixels of a JPEG, PNG, WebP, ... file, its orientation tag ignored: RGB of eight bits, or (not color) as OpenCV
+    has them, of three channels in its order BGR.
+
+    None if it is none, or was cut: OpenCV would fill the missing rows of a JPEG with grey.
+    """
+    if any(data.startswith(start) and end not in data[-TAIL:] for start, end in _CLOSING_MARKS):
+        return None
+    if data.startswith(PNG) and _says_more_than_it_holds(data):
+        return None
+    if data[:4] == b"RIFF" and len(data) < 8 + int.from_bytes(data[4:8], "little"):  # a WebP, and its length
+        return None
+    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION if color else cv2.IMREAD_UNCHANGED
+    buffer = np.frombuffer(data, dtype=np.uint8)
+    if buffer.size == 0:
+        return None
+    try:
+        pixels = cv2.imdecode(buffer, flags)
+    except cv2.error:
+        return None
+    return None if pixels is None else np.asarray(pixels)
+
+
+def _says_more_than_it_holds(png: bytes) -> bool:
+    """Whether a PNG announces an image, or a chunk, that its bytes do not hold: OpenCV takes memory for either.
+
+    So it does for one without pixels, or with a chunk that must be understood and that no PNG has.
+    """
+    if len(png) < _PNG_HEAD.size:
+        return True
+    width, height, bits = _PNG_HEAD.unpack_from(png)
+    at, end, has_pixels = len(PNG), len(png), False
+    while at < end and (kind := png[at + 4 : at + 8]) != b"IEND":
+        has_pixels |= kind == b"IDAT"
+        if kind[:1].isupper() and kind not in _PNG_CHUNKS:
+            return True
+        at += 12 + int.from_bytes(png[at : at + 4], "big")
+    return bool(not has_pixels or at + 12 > end or width * height * bits // 8 > 1100 * end)  # deflate's is 1032
+
+
+def write_pfm(path: Path, image: Float32) -> None:
+    """Write an image (H, W) as little-endian grey PFM."""
+    header = f"Pf\n{image.shape[1]} {image.shape[0]}\n-1.0\n".encode()
+    path.write_bytes(header + np.ascontiguousarray(image[::-1], dtype="<f4").tobytes())
+
+
+def read_pfm(path: Path) -> Float32:
+    """The image (H, W) float32 of a grey PFM of either byte order; |scale| must be 1.
+
+    Raises InputError for a missing file, another format, or a length other than the header's.
+    """
+    content = read_bytes(path)
+    header = re.match(rb"(PF|Pf)\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s", content[:128])
+    if header is None:
+        raise InputError(f"{path}: expected a PFM image, got another format")
+    width, height = int(header[2]), int(header[3])
+    is_little = header[4].startswith(b"-")
+    if header[1] != b"Pf" or header[4].lstrip(b"+-").rstrip(b"0").rstrip(b".") != b"1":
+        raise InputError(
+            f"{path}: expected one channel (Pf) of scale 1, got {header[1].decode()} of scale {header[4].decode()}"
+        )
+    if width == 0 or height == 0:
+        raise InputError(f"{path}: expected pixels, got {width}x{height}", remedy="copy the file anew")
+    start = header.end()
+    if len(content) - start != 4 * width * height:
+        raise InputError(
+            f"{path}: expected {4 * width * height} bytes for {width}x{height}, got {len(content) - start}",
+            remedy="copy the file anew",
+        )
+    values = np.frombuffer(content, dtype="<f4" if is_little else ">f4", offset=start)
+    return np.ascontiguousarray(values.reshape(height, width)[::-1], dtype=np.float32)

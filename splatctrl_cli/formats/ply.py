@@ -1,0 +1,352 @@
+"""One element of a PLY file as a table of numbers, read strictly: every byte the header promises, and none more; and
+coloured point clouds, as structure from motion leaves them. Points in CSV: x, y and z in metres, a block at a time.
+"""
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.formats.unpacking import read_bytes
+
+from splatctrl_cli.config.ranges import MAX_PLACE
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.records import Float64, PointCloud
+
+SCALARS = {
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
+    **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+NAMES_OF_SCALARS = {"f4": "float", "u1": "uchar"}
+BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlyFile:
+    """The rows of one element, a structured array, and the header's comment lines."""
+
+    path: Path
+    rows: NDArray[Any]
+    comments: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The properties, in the file's order."""
+        return self.rows.dtype.names or ()
+
+    def pairs(self) -> dict[str, str]:
+        """The ``key: value`` comments; one without a colon is a key with an empty value."""
+        parts = (line.partition(":") for line in self.comments)
+        return {key.strip(): value.strip() for key, _, value in parts if key.strip()}
+
+    def column(self, name: str) -> Float64:
+        """(N,) float64 values of one property; raises InputError where one is not finite, naming its index."""
+        values = self.rows[name].astype(np.float64)
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            raise InputError(
+                f"{self.path}: splat {bad[0]}: {name}: expected a finite number, got {values[bad[0]]} "
+                f"({len(bad)} of {len(self)} are not finite)"
+            )
+        return values
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Element:
+    """properties: names and scalar types; of a list those of its length and of its values, with a space between."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str]]
+
+    @property
+    def has_lists(self) -> bool:
+        return any(" " in kind for _, kind in self.properties)
+
+    def dtype(self, path: Path, byte_order: str) -> "np.dtype[Any]":
+        """Text has more digits than its type may hold: they are kept."""
+        if self.has_lists:
+            raise InputError(f"{path}: element {self.name} has list properties: expected a table of numbers")
+        types = [(name, SCALARS[kind]) for name, kind in self.properties]
+        return np.dtype(
+            [(name, "f8" if (byte_order, kind) == ("=", "f4") else byte_order + kind) for name, kind in types]
+        )
+
+    def end(self, content: bytes, offset: int, byte_order: str) -> int:
+        """Where the element ends that begins at `offset`; beyond `content` where that is cut short."""
+        kinds = [[np.dtype(byte_order + SCALARS[word]) for word in kind.split()] for _, kind in self.properties]
+        if not self.has_lists:
+            return offset + self.count * sum(kind.itemsize for (kind,) in kinds)
+        for _ in range(self.count):
+            for kind, *values in kinds:
+                if offset + kind.itemsize > len(content):
+                    return offset + kind.itemsize
+                num = max(0, int(np.frombuffer(content, kind, 1, offset)[0])) if values else 0
+                offset += kind.itemsize + sum(num * value.itemsize for value in values)
+        return offset
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Header:
+    format: str
+    elements: list[_Element]
+    comments: list[str]
+    length: int
+
+
+def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
+    """Element `element` of a PLY file (ASCII or binary, either byte order) that has all of the `required` properties.
+
+    Raises InputError for a file that is missing, no PLY, cut short or too long, compressed, or lacks a property.
+    """
+    content = read_bytes(path)
+    header = _parse_header(path, content)
+    wanted = next((found for found in header.elements if found.name == element), None)
+    if wanted is None:
+        raise InputError(f"{path}: expected an element {element}, got {[found.name for found in header.elements]}")
+    names = [name for name, _ in wanted.properties]
+    if "packed_position" in names:
+        raise InputError(
+            f"{path}: a compressed PLY of SuperSplat (packed_position, ...), expected one value per property",
+            remedy="export it there as an uncompressed PLY",
+        )
+    check_properties(path, names, required)
+    read = _read_ascii if header.format == "ascii" else _read_binary
+    return PlyFile(path=path, rows=read(path, content, header, wanted), comments=tuple(header.comments))
+
+
+def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) -> None:
+    """Raise InputError that names which of the `required` properties are not among `names`."""
+    missing = [name for name in required if name not in names]
+    if missing:
+        is_named_otherwise = {"opacity", "f_dc_0"} & {*names}
+        raise InputError(
+            f"{path}: no 3D-GS splat file: missing properties {' '.join(missing)} (it has {' '.join(names)})",
+            remedy="write them by these names: scale_* is log(sigma [m]), rot_* a quaternion w x y z, opacity a logit"
+            if is_named_otherwise
+            else "a point cloud or mesh has to be reconstructed first",
+        )
+
+
+def write_table(path: Path, rows: NDArray[Any], comments: Mapping[str, str]) -> None:
+    """Write the structured array `rows` (float32 and uint8 fields) as element vertex. Same input, same bytes.
+
+    The comments follow the properties: a reader that takes the third line for the count of vertices finds it there.
+    Characters outside ASCII in comments are written as backslash escapes, because readers of the format stop at them.
+    Raises UsageError for a comment of several lines, or a key with a colon.
+    """
+    fields: Mapping[str, Any] = rows.dtype.fields or {}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property {NAMES_OF_SCALARS[kind.str[1:]]} {name}" for name, (kind, *_) in fields.items()]
+    for key, value in comments.items():
+        if not key or ":" in key or any(mark in key + value for mark in "\r\n"):
+            raise UsageError(f"PLY comment {key!r}: expected one line and a key without a colon, got {value!r}")
+        lines.append(f"comment {key}: {value}".rstrip() if value else f"comment {key}")
+    header = "\n".join([*lines, "end_header", ""]).encode("ascii", "backslashreplace")
+    path.write_bytes(header + rows.tobytes())
+
+
+def _read_binary(path: Path, content: bytes, header: _Header, wanted: _Element) -> NDArray[Any]:
+    byte_order, start, end = BYTE_ORDERS[header.format], 0, header.length
+    dtype = wanted.dtype(path, byte_order)
+    for found in header.elements:
+        start, end = end if found is wanted else start, found.end(content, end, byte_order)
+    if len(content) != end:
+        what = "cut short" if len(content) < end else "longer than its header says"
+        raise InputError(
+            f"{path}: {what}: expected {end} bytes ({header.length} of header and the data it promises), "
+            f"got {len(content)}",
+            remedy="copy or write the file again",
+        )
+    return np.frombuffer(content, dtype, count=wanted.count, offset=start)
+
+
+def _read_ascii(path: Path, content: bytes, header: _Header, wanted: _Element) -> NDArray[Any]:
+    lines = [line.split() for line in content[header.length :].split(b"\n") if line.strip()]
+    expected = sum(found.count for found in header.elements if found.properties)
+    if len(lines) != expected:
+        raise InputError(f"{path}: expected {expected} lines of data, got {len(lines)}")
+    start = sum(found.count for found in header.elements[: header.elements.index(wanted)] if found.properties)
+    rows = lines[start : start + wanted.count]
+    table = np.zeros(wanted.count, dtype=wanted.dtype(path, BYTE_ORDERS[header.format]))
+    bad = next((i for i, row in enumerate(rows) if len(row) != len(wanted.properties)), None)
+    if bad is not None:
+        raise InputError(
+            f"{path}: {wanted.name} {bad}: expected {len(wanted.properties)} numbers, got {len(rows[bad])}"
+        )
+    for index, (name, _) in enumerate(wanted.properties):
+        try:
+            table[name] = [float(row[index]) for row in rows]
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"{path}: {wanted.name}: property {name}: {error}") from None
+    return table
+
+
+def _parse_header(path: Path, content: bytes) -> _Header:
+    if not content.startswith((b"ply\n", b"ply\r\n")):
+        raise InputError(f"{path}: no PLY file: expected it to start with 'ply', got {content[:8]!r}")
+    end = content.find(b"\nend_header")
+    newline = content.find(b"\n", end + 1)
+    if end < 0 or newline < 0 or content[end:newline].strip() != b"end_header":
+        raise InputError(f"{path}: cut short: its header has no end_header line")
+    form, elements, comments = "", list[_Element](), list[str]()
+    for line in content[:end].decode("utf-8", "backslashreplace").splitlines()[1:]:
+        match line.split():
+            case ["format", name, "1.0"] if name in BYTE_ORDERS:
+                form = name
+            case ["comment" | "obj_info", *_]:
+                comments.append(line.strip().partition(" ")[2])
+            case ["element", name, count] if count.isdigit():
+                elements.append(_Element(name=name, count=int(count), properties=[]))
+            case ["property", "list", length, kind, name] if (
+                elements and kind in SCALARS and SCALARS.get(length, "f4")[0] in "iu"
+            ):
+                elements[-1].properties.append((name, f"{length} {kind}"))
+            case ["property", kind, name] if elements and kind in SCALARS:
+                if name in (known for known, _ in elements[-1].properties):
+                    raise InputError(f"{path}: element {elements[-1].name} names property {name} twice")
+                elements[-1].properties.append((name, kind))
+            case []:
+                continue
+            case _:
+                raise InputError(f"{path}: header line not understood: {line.strip()!r}")
+    if not form:
+        raise InputError(f"{path}: its header has no format line; expected one of {', '.join(BYTE_ORDERS)}")
+    return _Header(format=form, elements=elements, comments=comments, length=newline + 1)
+
+
+def read_points(path: Path) -> PointCloud:
+    """The points of a PLY file with x, y, z [m] and red, green, blue (0 to 255).
+
+    Raises InputError for a file that is not whole, lacks one of these, or has no point.
+    """
+    table = _columns(path, ("x", "y", "z", "red", "green", "blue"), "coloured point cloud")
+    points, colors = table[:, :3], table[:, 3:] / 255.0
+    if colors.min() < 0.0 or colors.max() > 1.0:
+        raise InputError(f"{path}: red, green, blue: expected 0 to 255, got up to {255.0 * colors.max():g}")
+    return PointCloud(points=points.astype(np.float32), colors=colors.astype(np.float32))
+
+
+def read_positions(path: Path) -> Float64:
+    """The points (N, 3) of a PLY file, in the file's own unit, whatever else it says of them.
+
+    Raises InputError for a file that is not whole, lacks x, y or z, or has no point.
+    """
+    return _columns(path, ("x", "y", "z"), "point cloud")
+
+
+def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
+    """Properties (N, K) of the points, at least one."""
+    ply = read_table(path, "vertex", ())
+    missing = [name for name in names if name not in ply]
+    if missing:
+        raise InputError(f"{path}: no {what}: missing properties {' '.join(missing)}")
+    if not len(ply):
+        raise InputError(f"{path}: has no points", remedy="give a point cloud of the scene")
+    return np.column_stack([ply.column(name) for name in names])
+
+
+def is_mesh(path: Path) -> bool:
+    """Whether a file holds faces: any that is not a PLY, and a PLY whose header counts some."""
+    if path.suffix.lower() != ".ply":
+        return True
+    header = read_bytes(path, 65536).partition(b"end_header")[0]
+    counts = [line.split() for line in header.splitlines() if line.startswith(b"element face")]
+    return bool(counts) and counts[0][-1] != b"0"
+
+
+AXES = ("x", "y", "z")
+POINTS_PER_BLOCK = 1 << 15
+
+_Line = tuple[int, list[str]]
+
+
+def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
+    """Points (Q, 3) float64 [m], at most `POINTS_PER_BLOCK` at a time, of the columns x, y, z of a CSV text.
+
+    Without a header, which is a first line that is not all numbers, there are to be three columns. Other columns are
+    not looked at, empty lines are skipped. Raises InputError naming `name`, the line and the column: for columns that
+    are missing, a line of another length than the first, and what is no finite number within `MAX_PLACE`.
+    """
+    reader = csv.reader(stream)
+    lines: Iterator[_Line] = ((reader.line_num, row) for row in reader if row)
+    try:
+        first = next(lines, None)
+        if first is None:
+            raise InputError(f"{name}: has no points", remedy="give a CSV file with the columns x,y,z [m]")
+        columns, rest = _axes(name, first[1]), lines
+        if columns is None:
+            columns, rest = [0, 1, 2], chain([first], lines)
+        num_points = 0
+        while block := list(islice(rest, POINTS_PER_BLOCK)):
+            yield _numbers(name, block, columns, len(first[1]))
+            num_points += len(block)
+    except csv.Error as error:
+        raise InputError(f"{name}: line {reader.line_num}: no CSV text: {error}", remedy="correct the line") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{name}: no UTF-8 text: {error}", remedy="give a CSV file") from None
+    if not num_points:
+        raise InputError(f"{name}: has a header and no points", remedy="add a line for each point")
+
+
+def _axes(name: str, cells: Sequence[str]) -> list[int] | None:
+    """Where x, y and z stand by a header; None for a first line that is a point."""
+    if len(cells) == 3 and all(_number(cell) is not None for cell in cells):
+        return None
+    titles = [cell.strip().lstrip("\ufeff").lower() for cell in cells]
+    for axis in AXES:
+        if titles.count(axis) != 1:
+            what = "no column" if axis not in titles else "several columns"
+            raise InputError(
+                f"{name}: {what} {axis}: expected a header with x, y and z, or three numbers a line, got"
+                f" {','.join(cells)[:60]!r}",
+                remedy="name the columns x,y,z; they are in metres",
+            )
+    return [titles.index(axis) for axis in AXES]
+
+
+def _numbers(name: str, block: Sequence[_Line], columns: Sequence[int], num_columns: int) -> Float64:
+    i, j, k = columns
+    try:
+        points = np.array([(float(row[i]), float(row[j]), float(row[k])) for _, row in block])
+    except (ValueError, IndexError):
+        raise _first_wrong(name, block, columns, num_columns) from None
+    if any(len(row) != num_columns for _, row in block) or not (np.abs(points) <= MAX_PLACE).all():
+        raise _first_wrong(name, block, columns, num_columns)
+    return points
+
+
+def _first_wrong(name: str, block: Sequence[_Line], columns: Sequence[int], num_columns: int) -> InputError:
+    """What is wrong with the first line of a block that has something wrong."""
+    for number, row in block:
+        if len(row) != num_columns:
+            return InputError(
+                f"{name}: line {number}: expected {num_columns} columns, got {len(row)}", remedy="correct the line"
+            )
+        for axis, column in zip(AXES, columns, strict=True):
+            value = _number(row[column])
+            if value is None or not abs(value) <= MAX_PLACE:
+                return InputError(
+                    f"{name}: line {number}: column {axis}: expected a finite number up to {MAX_PLACE:g} m, got"
+                    f" {row[column].strip()[:40]!r}",
+                    remedy="correct the line, or leave it out",
+                )
+    raise AssertionError("expected a line that is wrong")
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return float(cell.lstrip("\ufeff"))
+    except ValueError:
+        return None

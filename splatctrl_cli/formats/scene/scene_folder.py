@@ -1,0 +1,396 @@
+"""Reads the ``scene/`` folder that `SceneWriter` writes, or a bare file of splats in its place.
+
+splats.ply  shell.ply  occupancy.npz  audit.jsonl  snapshots.csv  checkpoint/state.npz  run.json
+snapshots/NNNNNN.ply, .shell.ply and .npz
+"""
+
+import csv
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from splatctrl_cli.formats.scene.voxel_file import (
+    read_known_occupancy,
+    read_occupancy,
+    read_seen,
+    read_states,
+    read_unrepresented,
+)
+from splatctrl_cli.formats.splat.gaussian_ply import read_gaussian_ply
+from splatctrl_cli.formats.splat.splats import check_world, read_shell, read_splats, read_world_splats
+
+from splatctrl_cli.config import fixed
+from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.files.output import PARTIAL, Parts
+from splatctrl_cli.records import Float64, GaussianSet, SplatSet
+from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid, SeenVoxels
+
+FORMAT = "splatctrl-scene 1"
+SELF_MODEL = "self.npz"  # what `robot learn` finds in the recording
+SHELL_FILE = "shell.ply"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Snapshot:
+    """The splat set as it was after the frames of `stamp_ns`."""
+
+    stamp_ns: int
+    path: Path
+    num_splats: int
+    parts: Parts | None = None  # of its scene
+
+    @property
+    def occupancy_path(self) -> Path:
+        """What was known of each voxel then."""
+        return self.path.with_suffix(".npz")
+
+    def occupancy(self) -> OccupancyGrid | None:
+        """The grid of that moment, as coarse as `write_states` keeps it; None in a scene of an older version."""
+        return read_states(self._checked(self.occupancy_path)) if self._has_voxels else None
+
+    def seen(self) -> SeenVoxels | None:
+        """When each voxel was last seen; None in a scene of an older version."""
+        return read_seen(self._checked(self.occupancy_path)) if self._has_voxels else None
+
+    def unrepresented(self) -> Balls | None:
+        """The occupied voxels that had no splat then; None in a scene of an older version."""
+        return read_unrepresented(self._checked(self.occupancy_path)) if self._has_voxels else None
+
+    def splats(self) -> SplatSet:
+        return read_world_splats(self._checked(self.path))
+
+    @property
+    def shell_path(self) -> Path:
+        """What lay beyond the robot's reach then; not there where nothing did."""
+        return self.path.with_suffix(f".{SHELL_FILE}")
+
+    @property
+    def _has_voxels(self) -> bool:
+        return self.occupancy_path.is_file() if self.parts is None else self.parts.has(self.occupancy_path)
+
+    def _checked(self, path: Path) -> Path:
+        return path if self.parts is None else self.parts.checked(path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewCorrection:
+    """Where a training view is instead of where it was recorded, T_world_camera (4, 4), by what its red, green and
+    blue are divided, gain (3,), and of what its depth was freed, bend (rows, columns) [1/m]; None where they were
+    taken as recorded.
+    """
+
+    T_world_camera: Float64 | None
+    gain: Float64 | None
+    bend: Float64 | None = None
+
+
+T = TypeVar("T")
+
+
+def run_value(
+    run: Mapping[str, Any], keys: Sequence[str], kind: Callable[[Any], T], default: object = None, *, where: str
+) -> T:
+    """What `kind` makes of the value at `keys` of a ``run.json``; of the default where it is not there.
+
+    Raises InputError naming `where` for a value that is missing without a default, or of another kind.
+    """
+    value: Any = run
+    try:
+        for key in keys:
+            if default is not None and key not in value:
+                return kind(default)
+            value = value[key]
+        return kind(value)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        said = "nothing" if isinstance(error, KeyError) else str(error)
+        raise InputError(
+            f"{where}: {'.'.join(keys)}: expected what reconstruct writes, got {said}",
+            remedy="reconstruct the scene again",
+        ) from None
+
+
+def _names(value: list[Any]) -> tuple[str, ...]:
+    return tuple(str(name) for name in value)
+
+
+def _color(value: list[Any]) -> tuple[float, float, float]:
+    red, green, blue = (float(part) for part in value)
+    return red, green, blue
+
+
+def _corrections(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], ViewCorrection]:
+    def numbers(value: Any, *shape: int) -> Float64 | None:
+        return None if value is None else np.array(value, np.float64).reshape(shape)
+
+    return {
+        (str(row["camera"]), int(row["stamp_ns"])): ViewCorrection(
+            T_world_camera=numbers(row.get("T_world_camera"), 4, 4), gain=numbers(row.get("gain"), 3)
+        )
+        for row in rows
+    }
+
+
+def _bends(bends: Mapping[str, Mapping[str, Any]]) -> dict[str, Float64]:
+    grids = {str(camera): np.array(bend["offsets"], np.float64) for camera, bend in bends.items()}
+    if any(grid.shape != fixed.BEND_GRID or not np.isfinite(grid).all() for grid in grids.values()):
+        raise ValueError(f"not {fixed.BEND_GRID} finite offsets")
+    return grids
+
+
+def _inside(name: str) -> str:
+    """The name itself. Raises ValueError where it leads out of its folder."""
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise ValueError(f"{name} lies outside the scene")
+    return name
+
+
+@dataclass(frozen=True)
+class SceneFolder:
+    """A scene that `reconstruct` wrote."""
+
+    path: Path
+
+    @cached_property
+    def run(self) -> dict[str, Any]:
+        """``run.json``. Raises InputError where it is none."""
+        file = self.path / "run.json"
+        try:
+            run = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{file}: cannot be read: {error}") from None
+        for name in ("metrics", "inputs", "config"):
+            if not isinstance(run, dict) or not isinstance(run.get(name, {}), dict):
+                raise InputError(f"{file}: {name}: expected an object", remedy="reconstruct the scene again")
+        return dict(run)
+
+    @cached_property
+    def parts(self) -> Parts:
+        """By which every file is checked when it is opened."""
+        return Parts.of_run(self.path, self.run)
+
+    @property
+    def has_digests(self) -> bool:
+        """False for a scene of an older version, whose files cannot be checked."""
+        return self.parts.digests is not None
+
+    @property
+    def made_from(self) -> dict[str, Any]:
+        """Digests of the files that were read (`inputs`), the first frame of each camera, the robot's joints and
+        links, and by how much depth was corrected, where it was: what tells whether it belongs to a log and a robot.
+        """
+        metrics = self.run.get("metrics", {})
+        bend = {"depth_bend": metrics["depth_bend"]} if metrics.get("depth_bend") else {}
+        kept = {name: metrics[name] for name in ("first_frames", "robot_joints", "robot_links") if name in metrics}
+        return {"inputs": self.run.get("inputs", {}), **kept, **bend}
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that trained the scene."""
+        return self._metric("cameras", _names)
+
+    @property
+    def names_its_views(self) -> bool:
+        """Whether it is recorded which views trained the scene."""
+        return True
+
+    @property
+    def training_stamps_ns(self) -> frozenset[int]:
+        """The views that trained a scene without a clock, by their made-up stamps."""
+        return self._metric("training_stamps_ns", frozenset[int], ())
+
+    @property
+    def has_clock(self) -> bool:
+        """False where the stamps are made up."""
+        return self._metric("has_clock", bool)
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of the last frame."""
+        return self._metric("stamp_ns", int)
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """What is seen where no splat is: a colour in [0, 1]; black in a scene of an older version."""
+        return self._metric("background", _color, (0.0, 0.0, 0.0))
+
+    @property
+    def corrections(self) -> dict[tuple[str, int], ViewCorrection]:
+        """Of training views, by camera and stamp; empty where they were taken as recorded."""
+        rows, bends = self._metric("corrected_views", _corrections, ()), self._metric("depth_bends", _bends, {})
+        return {key: replace(row, bend=bends.get(key[0])) for key, row in rows.items()}
+
+    @property
+    def is_anisotropic(self) -> bool:
+        """True for what 3D Gaussian splatting made: `gaussians` instead of splats and occupancy."""
+        return self._metric("method", "3dgs".__eq__, "")
+
+    def _metric(self, name: str, kind: Callable[[Any], T], default: object = None) -> T:
+        return run_value(self.run, ("metrics", name), kind, default, where=str(self.path / "run.json"))
+
+    def gaussians(self) -> GaussianSet:
+        """The Gaussians of a scene that is anisotropic. Raises InputError where it has none."""
+        gaussians = read_gaussian_ply(self.parts.checked(self.path / "splats.ply"))[0]
+        if not len(gaussians):
+            raise InputError(
+                f"{self.path}: expected Gaussians, got none: there is nothing to render",
+                remedy="reconstruct again with views that have depth; splats.ply is empty",
+            )
+        return gaussians
+
+    def splats(self) -> SplatSet:
+        self._expect_isotropic()
+        return read_world_splats(self.parts.checked(self.path / "splats.ply"))
+
+    def _expect_isotropic(self) -> None:
+        if self.is_anisotropic:
+            raise InputError(
+                f"{self.path}: made by 3D Gaussian splatting; distances are defined on isotropic splats",
+                remedy="reconstruct the recording, or 'splatctrl score' this scene",
+            )
+
+    def occupancy(self) -> OccupancyGrid:
+        """The final occupancy grid."""
+        self._expect_isotropic()
+        return read_occupancy(self.parts.checked(self.path / "occupancy.npz"))
+
+    def known(self) -> KnownVoxels | None:
+        """What was known at the end, and when it was last seen; None in a scene of an older version."""
+        self._expect_isotropic()
+        return read_known_occupancy(self.parts.checked(self.path / "occupancy.npz"))
+
+    def seen(self) -> SeenVoxels | None:
+        """When each voxel was last seen, at the end; None in a scene of an older version."""
+        self._expect_isotropic()
+        return read_seen(self.parts.checked(self.path / "occupancy.npz"))
+
+    @cached_property
+    def snapshots(self) -> tuple[Snapshot, ...]:
+        """By time. Raises InputError for a table that is not the one written, or whose stamps do not ascend."""
+        self._expect_isotropic()
+        path = self.parts.checked(self.path / "snapshots.csv")
+        taken = self._snapshots_in(path)
+        for before, after in pairwise(taken):
+            if after.stamp_ns <= before.stamp_ns:
+                raise InputError(
+                    f"{path}: stamp {after.stamp_ns} after {before.stamp_ns}: expected stamps that ascend",
+                    remedy="reconstruct the scene again",
+                )
+        return taken
+
+    def _snapshots_in(self, path: Path) -> tuple[Snapshot, ...]:
+        try:
+            with path.open(encoding="utf-8", newline="") as stream:
+                return tuple(
+                    Snapshot(
+                        stamp_ns=int(row["stamp_ns"]),
+                        path=self.path / _inside(row["file"]),
+                        num_splats=int(row["num_splats"]),
+                        parts=self.parts,
+                    )
+                    for row in csv.DictReader(stream)
+                )
+        except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
+            raise InputError(f"{path}: cannot be read: {error}") from None
+
+    def snapshot_at(self, stamp_ns: int) -> Snapshot:
+        """The newest snapshot not later than `stamp_ns`; NotEvaluableError before the first."""
+        known = [s for s in self.snapshots if s.stamp_ns <= stamp_ns]
+        if not known:
+            raise NotEvaluableError(
+                f"{self.path}: no snapshot at or before stamp {stamp_ns}",
+                remedy="the scene was not known yet; ask for a later time",
+            )
+        return known[-1]
+
+    def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
+        """The occupied voxels without a splat, of `snapshot_at` or (None) at the end; None in an older scene."""
+        if stamp_ns is not None:
+            return self.snapshot_at(stamp_ns).unrepresented()
+        path = self.path / "occupancy.npz"
+        return read_unrepresented(self.parts.checked(path)) if self.parts.has(path) else None
+
+    def shell_at(self, stamp_ns: int | None) -> SplatSet | None:
+        """What lay beyond the robot's reach, for pictures alone, of `snapshot_at` or (None) at the end; None where
+        nothing did, and in a scene of an older version.
+        """
+        path = self.path / SHELL_FILE if stamp_ns is None else self.snapshot_at(stamp_ns).shell_path
+        return read_shell(self.parts.checked(path)) if self.parts.has(path) else None
+
+    def splats_at(self, stamp_ns: int) -> SplatSet:
+        """The splats of `snapshot_at`."""
+        return self.snapshot_at(stamp_ns).splats()
+
+
+def open_scene(path: Path) -> SceneFolder:
+    """The scene in a folder. Raises InputError where it is none."""
+    if not path.exists():
+        raise InputError(f"{path}: no such scene folder", remedy="give what 'splatctrl reconstruct' wrote")
+    if path.name.endswith(PARTIAL):
+        raise InputError(f"{path}: an interrupted run", remedy="continue it: the same command and --resume")
+    if not (path / "splats.ply").is_file() or not (path / "run.json").is_file():
+        raise InputError(
+            f"{path}: expected a scene folder with splats.ply and run.json",
+            remedy="give what 'splatctrl reconstruct' wrote",
+        )
+    return SceneFolder(path)
+
+
+@dataclass(frozen=True)
+class SplatFile(SceneFolder):
+    """Splats that are rendered as they are: of any shape, with what harmonics they have, before black."""
+
+    @cached_property
+    def run(self) -> dict[str, Any]:
+        """What is known of how they were made: nothing."""
+        return {"metrics": {"cameras": [], "has_clock": False, "stamp_ns": 0}, "inputs": {}, "config": {}}
+
+    @cached_property
+    def parts(self) -> Parts:
+        """Of the file alone."""
+        return Parts(folder=self.path.parent)
+
+    @property
+    def names_its_views(self) -> bool:
+        """False: who trained them is not recorded."""
+        return False
+
+    @property
+    def is_anisotropic(self) -> bool:
+        """Whether any is stretched, or changes its colour by side."""
+        return isinstance(self._found, GaussianSet)
+
+    @cached_property
+    def _found(self) -> SplatSet | GaussianSet:
+        """Raises InputError for a file that is damaged, of an unknown kind, in another frame or unit, or empty."""
+        found, comments = read_splats(self.path)
+        check_world(self.path, comments)
+        if not len(found):
+            raise InputError(f"{self.path}: has no splats: there is nothing to render", remedy="give another file")
+        return found
+
+    def gaussians(self) -> GaussianSet:
+        """Where they are anisotropic."""
+        assert isinstance(self._found, GaussianSet)
+        return self._found
+
+    def splats(self) -> SplatSet:
+        """Where they are not."""
+        assert isinstance(self._found, SplatSet)
+        return self._found
+
+    @cached_property
+    def snapshots(self) -> tuple[Snapshot, ...]:
+        return ()
+
+    def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
+        return None
+
+
+def open_splats(path: Path) -> SceneFolder:
+    """The scene in a folder, or a file of splats. Raises InputError where it is neither."""
+    return SplatFile(path) if path.is_file() else open_scene(path)

@@ -1,0 +1,182 @@
+"""Writes the ``scene/`` folder, and the checkpoint from which an interrupted run goes on."""
+
+import csv
+import json
+from collections import deque
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.formats.arrays import read_arrays, savez
+from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL, SHELL_FILE, Snapshot
+from splatctrl_cli.formats.scene.voxel_file import write_occupancy, write_states
+from splatctrl_cli.formats.splat.splats import SHELL, write_ply
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.output import Parts, flush, sha256, write_durably
+from splatctrl_cli.records import SplatSet, UInt8
+from splatctrl_cli.voxels import KnownVoxels
+
+CHECKPOINT = "checkpoint/state.npz"
+AUDIT = "audit.jsonl"
+START_OVER = "start over: the same command without --resume"
+
+State = Mapping[str, NDArray[np.generic]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """An interrupted run: `progress` as it was given to `SceneWriter.checkpoint`, the fitter's `state`, and what of
+    the folder was written then (bytes of the audit; stamp and number of splats of each snapshot; sha256 of the
+    snapshots' files by name, None in a checkpoint of an older version).
+    """
+
+    progress: dict[str, Any]
+    state: State
+    audit_bytes: int
+    snapshots: tuple[tuple[int, int], ...]
+    parts: dict[str, str] | None = None
+
+
+def read_checkpoint(folder: Path) -> Checkpoint:
+    """The checkpoint in a partial scene folder. Raises InputError where it cannot be read."""
+    path = folder / CHECKPOINT
+    try:
+        state = read_arrays(path, most=1 << 32)  # the largest grid takes 2.8e9 bytes, its splats the rest
+        header = json.loads(str(state.pop("progress")))
+        return Checkpoint(
+            progress=header["progress"],
+            state=state,
+            audit_bytes=int(header["audit_bytes"]),
+            snapshots=tuple((int(stamp_ns), int(count)) for stamp_ns, count in header["snapshots"]),
+            parts=header.get("parts"),
+        )
+    except Exception as error:
+        raise InputError(f"{path}: cannot be read: {error}", remedy=START_OVER) from error
+
+
+class SceneWriter:
+    """Writes a scene into a folder as the fitter goes: an empty folder, or one with `SELF_MODEL` or the
+    checkpoint to go on from.
+
+    Snapshots are written while the fitter goes on; what goes wrong with one is raised by the next call.
+    """
+
+    def __init__(self, folder: Path, comments: Mapping[str, str], checkpoint: Checkpoint | None = None) -> None:
+        self.folder = folder
+        self.comments = dict(comments)
+        self.snapshots: list[Snapshot] = []
+        self._audit = folder / AUDIT
+        self._thread, self._unwritten = ThreadPoolExecutor(1), deque[Future[None]]()
+        self._num_flushed = 0  # snapshots that are known to be on disk
+        self._digests: dict[str, str] = {}  # of their files, by name
+        if checkpoint is None:
+            (folder / "snapshots").mkdir()
+            (folder / CHECKPOINT).parent.mkdir()
+            self._audit.touch()
+            self._digests |= {path.name: sha256(path) for path in [folder / SELF_MODEL] if path.is_file()}
+        else:
+            self._go_back_to(checkpoint)
+
+    def _go_back_to(self, checkpoint: Checkpoint) -> None:
+        """Drop what was written after the checkpoint."""
+        for index, (stamp_ns, num_splats) in enumerate(checkpoint.snapshots):
+            self.snapshots.append(Snapshot(stamp_ns=stamp_ns, path=self._place(index), num_splats=num_splats))
+        self._num_flushed = len(self.snapshots)
+        kept = {self._audit, self.folder / CHECKPOINT}
+        kept |= {path for s in self.snapshots for path in (s.path, s.occupancy_path)}
+        kept |= {self.folder / name for name in checkpoint.parts or {}}
+        missing = sorted(path.name for path in kept if not path.is_file())
+        if missing or self._audit.stat().st_size < checkpoint.audit_bytes:
+            raise InputError(
+                f"{self.folder}: {missing[0] if missing else AUDIT}: not as the checkpoint left it", remedy=START_OVER
+            )
+        written = Parts(
+            folder=self.folder, digests=checkpoint.parts, remedy="start over: the same command without --resume"
+        )
+        for path in sorted(kept - {self._audit, self.folder / CHECKPOINT}):
+            written.checked(path)
+        self._digests = dict(checkpoint.parts or {})
+        for path in sorted(self.folder.rglob("*")):
+            if path not in kept and not path.is_dir():
+                path.unlink()
+        with self._audit.open("r+b") as stream:
+            stream.truncate(checkpoint.audit_bytes)
+
+    def _place(self, index: int) -> Path:
+        return self.folder / "snapshots" / f"{index:06d}.ply"
+
+    def audit(self, row: object) -> None:
+        """Append one row to ``audit.jsonl``."""
+        assert is_dataclass(row) and not isinstance(row, type)
+        with self._audit.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(asdict(row)) + "\n")
+
+    def audited(self) -> list[dict[str, Any]]:
+        """The rows written so far."""
+        return [json.loads(line) for line in self._audit.read_text(encoding="utf-8").splitlines()]
+
+    def snapshot(
+        self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, states: UInt8, shell: SplatSet | None = None
+    ) -> None:
+        """Write the splats and the shell as they are at `stamp_ns`, and the `states` (X, Y, Z) of the voxels then.
+
+        The arrays are the writer's from now on. `settle` says when they are in the files.
+        """
+        snapshot = Snapshot(stamp_ns=stamp_ns, path=self._place(len(self.snapshots)), num_splats=len(splats))
+
+        def write() -> None:
+            write_ply(snapshot.path, splats, self.comments | {"stamp_ns": str(stamp_ns)})
+            write_states(snapshot.occupancy_path, known, states)
+            self._write_shell(snapshot.shell_path, stamp_ns, shell)
+
+        self.settle(but=1)
+        self._unwritten.append(self._thread.submit(write))
+        self.snapshots.append(snapshot)
+
+    def settle(self, *, but: int = 0) -> None:
+        """Wait until all snapshots, or all but the last so many, are written. Raises what went wrong with one."""
+        while len(self._unwritten) > but:
+            self._unwritten.popleft().result()
+
+    def close(self) -> None:
+        """Wait for the snapshot that is being written, whatever comes of it."""
+        self._thread.shutdown()
+
+    def _write_shell(self, path: Path, stamp_ns: int, shell: SplatSet | None) -> None:
+        """A file of its own: what reads splats does not meet it."""
+        if shell is not None and len(shell):
+            write_ply(path, shell, self.comments | SHELL | {"stamp_ns": str(stamp_ns)})
+
+    def checkpoint(self, progress: Mapping[str, Any], state: State, *, is_last: bool = False) -> None:
+        """Replace the checkpoint in one step, when all that it counts on is on disk; the last is compressed."""
+        self.settle()
+        flush(self._audit)
+        for snapshot in self.snapshots[self._num_flushed :]:
+            for path in filter(Path.is_file, (snapshot.path, snapshot.occupancy_path, snapshot.shell_path)):
+                flush(path)
+                self._digests[path.relative_to(self.folder).as_posix()] = sha256(path)
+        self._num_flushed = len(self.snapshots)
+        header = {
+            "progress": progress,
+            "audit_bytes": self._audit.stat().st_size,
+            "snapshots": [[s.stamp_ns, s.num_splats] for s in self.snapshots],
+            "parts": self._digests,
+        }
+        arrays = {"progress": np.array(json.dumps(header)), **state}
+        write_durably(self.folder / CHECKPOINT, lambda path: savez(path, arrays, level=1 if is_last else 0))
+
+    def finish(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, shell: SplatSet | None = None) -> None:
+        """Write the final splats and shell, the occupancy grid and the index of snapshots."""
+        self.settle()
+        write_ply(self.folder / "splats.ply", splats, self.comments | {"stamp_ns": str(stamp_ns)})
+        self._write_shell(self.folder / SHELL_FILE, stamp_ns, shell)
+        write_occupancy(self.folder / "occupancy.npz", known)
+        with (self.folder / "snapshots.csv").open("w", newline="", encoding="utf-8") as stream:
+            table = csv.writer(stream, lineterminator="\n")
+            table.writerow(["stamp_ns", "file", "num_splats"])
+            table.writerows([s.stamp_ns, f"snapshots/{s.path.name}", s.num_splats] for s in self.snapshots)

@@ -1,0 +1,267 @@
+"""Voxel files of a scene: ``occupancy.npz`` and the states beside each snapshot, with the evidence behind them."""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.formats.arrays import read_arrays, savez
+
+from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Label, UInt8
+from splatctrl_cli.voxels import (
+    FIRST_REASON,
+    MOST_VOXELS,
+    NO_EDGES,
+    Balls,
+    KnownVoxels,
+    LostEdges,
+    OccupancyGrid,
+    SeenVoxels,
+    Unseen,
+    VoxelState,
+)
+
+_HEADER = 1 << 22  # bytes
+_MOST_EDGES = 1 << 26  # bytes
+_WIDE = 0xFF00  # by which `Unseen` in two bytes is larger than in one
+_GRID: Mapping[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": np.uint16, "entity": np.uint8}
+_EVIDENCE = ("last_seen", "unrepresented", "unrepresented_labels")
+_STATES, _OCCUPANCY, _OURS = "the voxel states of a snapshot", "an occupancy grid of ours", "a voxel file of ours"
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def write_occupancy(path: Path, known: KnownVoxels) -> None:
+    """Write ``occupancy.npz``: log_odds, num_updates, entity, what `_evidence` says, and a JSON header."""
+    header = {
+        "format": "splatctrl-occupancy 2",
+        "values": "log_odds of occupancy; num_updates 0 = never seen; entity bits 001 robot, 010 human, 100 swept",
+    }
+    arrays: dict[str, NDArray[np.generic]] = {
+        "header": _header(known, header),
+        "log_odds": known.grid.log_odds,
+        "num_updates": known.grid.num_updates,
+        "entity": known.grid.entity,
+        **_evidence(known),
+    }
+    savez(path, arrays)
+
+
+def write_states(path: Path, known: KnownVoxels, states: UInt8) -> None:
+    """Write `states` (X, Y, Z) of the voxels instead of their log-odds: a tenth of the size."""
+    header = {
+        "format": "splatctrl-voxel-states 2",
+        "values": {state.name.lower(): int(state) for state in VoxelState},
+    }
+    savez(path, {"header": _header(known, header), "states": states, **_evidence(known)}, level=3)
+
+
+def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.generic]:
+    """The JSON header: `special` and what both files have in common."""
+    common = {
+        "frame": "world",
+        "units": "m",
+        "origin": known.grid.origin.tolist(),
+        "voxel": known.grid.voxel,
+        "shape": list(known.last_seen.shape),
+        "last_seen": "1 + index into step_stamps_ns of the last time step with depth through or on it, 0 never, "
+        "from 0xF0 of one byte or 0xFFF0 of two on: why never",
+        "unseen": {reason.name.lower(): int(reason) & 0xFF for reason in Unseen},
+        "unrepresented": "centres (K, 3) [m] of voxels that are occupied, not the robot, and have no splat",
+        "edges": "centre and radius (K, 4) [m] of balls in which a surface may go on where its edge was lost",
+        "step_stamps_ns": known.step_stamps_ns.tolist(),
+    }
+    return np.array(json.dumps({**special, **common}))
+
+
+def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
+    """The arrays that both files have in common; last_seen in one byte where that holds it: twice as fast."""
+    balls = known.unrepresented
+    return {
+        "last_seen": known.last_seen.astype(np.uint8 if len(known.step_stamps_ns) < FIRST_REASON else np.uint16),
+        "unrepresented": balls.centers,
+        "unrepresented_labels": balls.labels,
+        "edges": np.column_stack([known.edges.centers, known.edges.radii]),
+    }
+
+
+@contextmanager
+def _refused(path: Path, what: str) -> Iterator[None]:
+    """Whatever goes wrong within, as an InputError that says what the file is not."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except Exception as error:
+        raise InputError(f"{path}: not {what}: {error}") from error
+
+
+def read_states(path: Path) -> OccupancyGrid:
+    """An occupancy grid with the states of `write_states`. Raises InputError for anything else, never unpickles."""
+    with _refused(path, _STATES):
+        arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
+        header = json.loads(str(arrays["header"]))
+        states = _voxels(arrays["states"], "states", np.uint8, header)
+        return OccupancyGrid.from_states(np.array(header["origin"], np.float64), float(header["voxel"]), states)
+
+
+def read_seen(path: Path) -> SeenVoxels | None:
+    """When the voxels of either file were last seen, and nothing else: a replay asks for it five times a second.
+
+    None where an older version wrote the file. Raises InputError for anything else.
+    """
+    try:
+        with _refused(path, _OURS):
+            header = _read_header(path)
+            arrays = read_arrays(path, ("last_seen", *_edges_in(header)), most=2 * MOST_VOXELS + _MOST_EDGES)
+            stamps_ns = np.array(header["step_stamps_ns"], np.int64)
+            return SeenVoxels(
+                origin=np.array(header["origin"], np.float64),
+                voxel=float(header["voxel"]),
+                last_seen=_last_seen(arrays["last_seen"], header, len(stamps_ns)),
+                step_stamps_ns=stamps_ns,
+                edges=_edges(arrays),
+            )
+    except InputError:
+        if _is_older(path):
+            return None
+        raise
+
+
+def _is_older(path: Path) -> bool:
+    """Whether a file of ours says nothing of evidence."""
+    try:
+        return "step_stamps_ns" not in _read_header(path)
+    except Exception:
+        return False
+
+
+def _read_header(path: Path) -> dict[str, Any]:
+    header: dict[str, Any] = json.loads(str(read_arrays(path, ("header",), most=_HEADER)["header"]))
+    return header
+
+
+def read_occupancy(path: Path) -> OccupancyGrid:
+    """Read the grid of ``occupancy.npz``. Raises InputError for anything else, never unpickles."""
+    with _refused(path, _OCCUPANCY):
+        arrays = read_arrays(path, ("header", *_GRID), most=_HEADER + 7 * MOST_VOXELS)
+        return _grid_of(arrays, json.loads(str(arrays["header"])))
+
+
+def read_known_occupancy(path: Path) -> KnownVoxels | None:
+    """All of ``occupancy.npz``, None where an older version wrote it. Raises as `read_occupancy`."""
+    with _refused(path, _OCCUPANCY):
+        header = _read_header(path)
+        if "step_stamps_ns" not in header:
+            return None
+        arrays = read_arrays(path, (*_GRID, *_EVIDENCE, *_edges_in(header)), most=22 * MOST_VOXELS + _MOST_EDGES)
+        grid = _grid_of(arrays, header)
+        stamps_ns = np.array(header["step_stamps_ns"], np.int64)
+        last_seen = _widened(_last_seen(arrays["last_seen"], header, len(stamps_ns)))
+        balls = _balls(arrays, grid.voxel)
+        return KnownVoxels(
+            grid=grid, last_seen=last_seen, step_stamps_ns=stamps_ns, unrepresented=balls, edges=_edges(arrays)
+        )
+
+
+def read_unrepresented(path: Path) -> Balls | None:
+    """The unrepresented voxels of either file, without the rest; None where an older version wrote it.
+
+    Raises InputError for anything else.
+    """
+    with _refused(path, _OURS):
+        header = _read_header(path)
+        if "step_stamps_ns" not in header:
+            return None
+        return _balls(read_arrays(path, _EVIDENCE[1:], most=13 * MOST_VOXELS), float(header["voxel"]))
+
+
+def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
+    return OccupancyGrid(
+        origin=np.array(header["origin"], np.float64),
+        voxel=float(header["voxel"]),
+        **{name: _voxels(arrays[name], name, kind, header) for name, kind in _GRID.items()},
+    )
+
+
+def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) -> NDArray[Any]:
+    """`last_seen` as it was stored, in one byte or two. Its largest numbers say why a voxel was never seen.
+
+    Raises ValueError for another shape, or time steps that there are not.
+    """
+    is_short = stored.dtype == np.uint8
+    stored = _voxels(stored, "last_seen", np.uint8 if is_short else np.uint16, header)
+    is_old = "unseen" not in header  # then only the largest number is no time step, and means `UNANSWERED`
+    if is_short and num_steps >= FIRST_REASON:
+        is_none = (stored == 0xFF) & (num_steps < 0xFF)
+        stored = np.where(is_none, np.uint16(Unseen.UNANSWERED), stored.astype(np.uint16))
+    highest = int(np.iinfo(stored.dtype).max)
+    is_late = (stored > num_steps) & (stored < (highest if is_old else highest & ~0xF))
+    if is_late.any():
+        raise ValueError(f"last_seen: expected at most {num_steps} time steps, got {stored[is_late].max()}")
+    return stored
+
+
+def _widened(last_seen: NDArray[Any]) -> NDArray[np.uint16]:
+    """In two bytes."""
+    wide = last_seen.astype(np.uint16)
+    if last_seen.dtype == np.uint8:
+        wide[last_seen >= FIRST_REASON] += _WIDE
+    return wide
+
+
+def _balls(arrays: Arrays, voxel: float) -> Balls:
+    """Raises ValueError for other types or shapes."""
+    centers, labels = arrays["unrepresented"], arrays["unrepresented_labels"]
+    if centers.dtype != np.float32 or labels.dtype != np.uint8 or centers.shape != (labels.size, 3):
+        raise ValueError(
+            f"unrepresented: expected float32 (K, 3) and uint8 (K,), got {centers.shape}, {labels.shape}"
+        )
+    if not np.isfinite(centers).all():
+        raise ValueError("unrepresented: expected finite centres")
+    return Balls.of_voxels(centers, voxel, labels)
+
+
+def _edges_in(header: Mapping[str, Any]) -> tuple[str, ...]:
+    """The array of lost edges, which older versions did not write."""
+    return ("edges",) if "edges" in header else ()
+
+
+def _edges(arrays: Arrays) -> LostEdges:
+    """Raises ValueError for other types or shapes."""
+    if "edges" not in arrays:
+        return NO_EDGES
+    edges = arrays["edges"]
+    if edges.dtype != np.float32 or edges.shape != (edges.size // 4, 4) or not np.isfinite(edges).all():
+        raise ValueError(f"edges: expected finite float32 (K, 4), got {edges.dtype} {edges.shape}")
+    return LostEdges(centers=edges[:, :3], radii=edges[:, 3])
+
+
+def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Mapping[str, Any]) -> NDArray[Any]:
+    """An array of one value a voxel. Raises ValueError for one of another type or shape than the header's."""
+    wanted = (np.dtype(kind), tuple(header["shape"]))
+    if (values.dtype, values.shape) != wanted or len(values.shape) != 3:
+        raise ValueError(f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}")
+    return values
+
+
+def known_space(grid: OccupancyGrid, thresholds: OccupancyConfig) -> dict[str, object]:
+    """The size of a grid [m], the share of its voxels in each `VoxelState`, and how many the robot and people are in.
+
+    Names are those of the states, in lower case, as the other commands and files have them.
+    """
+    states = grid.states(thresholds.free_below, thresholds.occupied_above)
+    counts = np.bincount(states.ravel(), minlength=len(VoxelState))
+    return {
+        "extent_m": [round(grid.voxel * count, 6) for count in states.shape],
+        "free_below": thresholds.free_below,
+        "occupied_above": thresholds.occupied_above,
+        "share": {state.name.lower(): round(float(counts[state] / states.size), 6) for state in VoxelState},
+        "robot_voxels": int(np.count_nonzero(grid.entity & Label.ROBOT)),
+        "human_voxels": int(np.count_nonzero(grid.entity & Label.HUMAN)),
+    }

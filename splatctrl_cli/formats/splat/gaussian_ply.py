@@ -1,0 +1,227 @@
+"""Sets of anisotropic Gaussians as 3D-GS PLY files: the reference implementation's 62 properties.
+
+Layout: ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``, all float. ``scale_*`` is log(sigma),
+``rot_*`` a quaternion w x y z, ``opacity`` a logit; ``f_dc_*`` and ``f_rest_*`` are the harmonics' coefficients of
+red, green and blue: f_rest has all of red first, then green, then blue. A ``label`` (uchar) follows only where some
+Gaussian is not an object, so that readers of a fixed stride can read every other file. Where ``scale_0`` stands
+alone it is of all three axes.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from splatctrl_cli.formats.ply import PlyFile, check_properties, read_table, write_table
+from splatctrl_cli.formats.splat.splat_format import (
+    SplatFormat,
+    check_finite,
+    logit,
+    refuse,
+    sigma_of_log,
+    sigmoid,
+    unit_quaternions,
+    without_labels,
+)
+
+from splatctrl_cli.config.fixed import CENTER_LENGTH, CENTER_SHARE, SPARSEST, SPARSEST_SAMPLE
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Float32, Float64, GaussianSet, Label, UInt8
+
+REST = tuple(f"f_rest_{index}" for index in range(45))
+NAMES = (
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *REST, "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+VALUES = (*(name for name in NAMES if name not in {"nx", "ny", "nz"}), "label")  # what a Gaussian says
+SCALES = ("scale_0", "scale_1", "scale_2")
+REQUIRED = tuple(name for name in NAMES if name not in {"nx", "ny", "nz", "scale_1", "scale_2", *REST})
+REST_PER_DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}  # number of f_rest_* -> degree of the harmonics
+HEADER_COMMENTS = {
+    "frame": "world",
+    "units": "metre",
+    "splat": "anisotropic Gaussian; exp(scale_*) are its sigmas [m]; rot is w x y z; opacity is a logit",
+}
+
+
+def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
+    """Write `gaussians`; frame, units, what the scales mean and `comments` go in the header. Same input, same bytes.
+
+    Harmonics above the set's degree are zeros; opacities of exactly 0 and 1 read back as that.
+    Raises InputError for a value the format cannot hold, naming its index; UsageError for a comment of several lines.
+    """
+    check_gaussians("Gaussians to write", gaussians)
+    has_labels = bool((gaussians.labels != Label.OBJECT).any())
+    dtype = np.dtype([*((name, "<f4") for name in NAMES), *([("label", "u1")] if has_labels else [])])
+    write_table(path, rows_of(gaussians, dtype), {**HEADER_COMMENTS, **comments})
+
+
+def rows_of(gaussians: GaussianSet, dtype: "np.dtype[Any]") -> NDArray[Any]:
+    """The Gaussians (N,) as rows of the properties of `dtype`, 0 where a property is none of theirs."""
+    g = gaussians
+    rest = np.zeros((len(g), 3, 15), dtype=np.float32)
+    rest[:, :, : g.harmonics.shape[1] - 1] = g.harmonics[:, 1:].transpose(0, 2, 1)
+    colors = [*g.harmonics[:, 0].T, *rest.reshape(len(g), 45).T]
+    shapes = [logit(g.opacities), *np.log(g.scales.astype(np.float64)).T, *g.quats_wxyz.T]
+    rows = np.zeros(len(g), dtype=dtype)
+    for name, column in zip(VALUES, [*g.centers.T, *colors, *shapes, g.labels], strict=True):
+        if name in (dtype.names or ()):
+            rows[name] = column
+    return rows
+
+
+def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
+    """The Gaussians of a 3D-GS PLY file (binary or ASCII, properties in any order) and its ``key: value`` comments.
+
+    Harmonics have the degree of ``f_rest_*`` (0, 9, 24 or 45 of them), less degrees that are zero throughout.
+    Quaternions are scaled to length one; a missing label is 0 (object); other properties are ignored.
+    Raises InputError for a file that is not whole, lacks a property or holds a value that no Gaussian can have.
+    """
+    ply = read_table(path, "vertex", REQUIRED)
+    return gaussians_of(ply), ply.pairs()
+
+
+def gaussians_of(ply: PlyFile) -> GaussianSet:
+    """The Gaussians that a table of a PLY file holds. Raises InputError as `read_gaussian_ply` does."""
+    path = ply.path
+    check_properties(path, ply.names, REQUIRED)
+    logs = log_sigmas(ply)
+    scales = np.column_stack([sigma_of_log(str(path), f"scale_{axis}", logs[:, axis]) for axis in range(3)])
+    gaussians = GaussianSet(
+        centers=centers_of(ply, scales),
+        scales=scales,
+        quats_wxyz=unit_quaternions(str(path), np.column_stack([ply.column(f"rot_{index}") for index in range(4)])),
+        opacities=sigmoid(ply.column("opacity")),
+        harmonics=without_zero_degrees(_harmonics(ply)),
+        labels=labels_of(ply),
+    )
+    check_gaussians(str(path), gaussians)
+    return gaussians
+
+
+class RoundedError(InputError):
+    """Centres that float32 would move."""
+
+
+def exact_centers(ply: PlyFile) -> Float64:
+    """(N, 3) float64 [m], as the file has them."""
+    return np.column_stack([ply.column(name) for name in "xyz"])
+
+
+def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
+    """(N, 3) float32 [m]. Raises InputError where float32 would move the splats, or moved them before, against their
+    `sigmas` (N,) or (N, 3) [m] and the length of their box.
+    """
+    exact = exact_centers(ply)
+    centers = exact.astype(np.float32)
+    if not len(ply):
+        return centers
+    size = max(float(np.median(sigmas)), CENTER_LENGTH * float(np.ptp(exact, axis=0).max()))
+    largest, moved = float(np.abs(exact).max()), float(np.abs(exact - centers).max())
+    step = float(np.spacing(np.float32(largest)))
+    places = f"{ply.path}: centres up to {largest:.0f} m"
+    if moved > CENTER_SHARE * size:
+        raise RoundedError(
+            f"{places}: float32, which splats are kept in, has steps of {step:g} m there and would move them by"
+            f" {moved:.3g} m",
+            remedy=f"'splatctrl export {ply.path} -o OUT.ply' takes an origin off and names it; give OUT.ply",
+        )
+    if step > size:
+        raise InputError(
+            f"{places}: were rounded to float32, whose steps of {step:g} m there are larger than the splats"
+            f" (sigma {float(np.median(sigmas)):.3g} m)",
+            remedy="write x, y and z again, as double or less an origin",
+        )
+    return centers
+
+
+def log_sigmas(ply: PlyFile) -> Float64:
+    """(N, 3) log(sigma [m]). Raises InputError for splats of two scales, and for scales that are no logarithms: all
+    above 0, which makes every splat SPARSEST times as large as their spacing.
+    """
+    found = [name for name in SCALES if name in ply]
+    if len(found) == 2:
+        raise InputError(
+            f"{ply.path}: expected scale_0 alone or scale_0 to scale_2, got {' and '.join(found)}: the flat splats of"
+            " 2D-GS have no third sigma",
+            remedy="write the log of a thickness [m] as scale_2",
+        )
+    logs = np.column_stack([ply.column(name if len(found) == 3 else "scale_0") for name in SCALES])
+    if len(ply) < 2 or logs.min() < 0:
+        return logs
+    centers = exact_centers(ply)
+    some = centers[:: -(-len(centers) // SPARSEST_SAMPLE)]
+    spacing = float(np.median(np.asarray(cKDTree(centers).query(some, k=2)[0])[:, 1]))
+    if spacing > 0 and np.percentile(logs.mean(axis=1), 5) > np.log(SPARSEST * spacing):
+        raise InputError(
+            f"{ply.path}: scale_*: expected log(sigma [m]), got {logs.min():.3g} to {logs.max():.3g}: splats of"
+            f" {np.exp(min(float(np.median(logs)), 700.0)):.3g} m, {spacing:.3g} m apart",
+            remedy="the scales look like sigmas: write their logarithms"
+            if np.median(logs) < SPARSEST * spacing
+            else "write scales and centres in one unit",
+        )
+    return logs
+
+
+def labels_of(ply: PlyFile) -> UInt8:
+    """(N,) labels; all 0 (object) where the file has none. Raises InputError for other values."""
+    if "label" not in ply:
+        return np.zeros(len(ply), dtype=np.uint8)
+    values = ply.column("label")
+    is_bad = (values < 0) | (values > 255) | (values != np.floor(values))
+    refuse(str(ply.path), "label", values, is_bad, "a whole number 0 to 255")
+    return values.astype(np.uint8)
+
+
+def without_zero_degrees(harmonics: Float32) -> Float32:
+    """`harmonics` (N, K, 3) up to the last degree that has a coefficient other than zero: the same colours."""
+    degree = 3
+    while degree and not harmonics[:, degree * degree :].any():
+        degree -= 1
+    return np.ascontiguousarray(harmonics[:, : (degree + 1) ** 2])
+
+
+def check_gaussians(where: str, gaussians: GaussianSet) -> None:
+    """Raise InputError at the first Gaussian that has no place in the world, naming its index."""
+    g = gaussians
+    groups: dict[str, NDArray[np.generic]] = {"center": g.centers, "sigma": g.scales, "rotation": g.quats_wxyz}
+    groups |= {"opacity": g.opacities, "harmonics": g.harmonics}
+    check_finite(where, len(g), groups)
+    if g.harmonics.shape[1] not in (1, 4, 9, 16):
+        raise InputError(f"{where}: harmonics: expected 1, 4, 9 or 16 coefficients, got {g.harmonics.shape[1]}")
+    refuse(where, "sigma", g.scales, np.asarray((g.scales <= 0).any(axis=1)), "more than 0 m")
+    refuse(where, "opacity", g.opacities, (g.opacities < 0) | (g.opacities > 1), "0 to 1")
+    lengths = np.linalg.norm(g.quats_wxyz.astype(np.float64), axis=1)
+    refuse(where, "rotation", g.quats_wxyz, np.abs(lengths - 1) > 1e-3, "a unit quaternion w x y z")
+
+
+def _harmonics(ply: PlyFile) -> Float32:
+    """(N, K, 3) coefficients; f_rest has all of a channel's in a row."""
+    num_rest = sum(name.startswith("f_rest_") for name in ply.names)
+    names = [f"f_rest_{index}" for index in range(num_rest)]
+    if num_rest not in REST_PER_DEGREE or not all(name in ply for name in names):
+        expected = ", ".join(map(str, REST_PER_DEGREE))
+        raise InputError(f"{ply.path}: f_rest_*: expected {expected} of them in a row from 0, got {num_rest}")
+    channels = [[f"f_dc_{channel}", *names[channel * num_rest // 3 :][: num_rest // 3]] for channel in range(3)]
+    values = [[ply.column(name).astype(np.float32) for name in channel] for channel in channels]
+    return np.ascontiguousarray(np.array(values).transpose(2, 1, 0))
+
+
+def _write_reference_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
+    write_gaussian_ply(path, without_labels(gaussians), comments)
+
+
+_DOCS = """
+`.ply`, short | 3D-GS PLY with `label` and `density`, for isotropic splats | float32 | view-dependent colour
+
+`.ply`, full | 3D-GS PLY, the reference's 62 properties | float32 | density; labels (kept as a 63rd property
+    unless `--layout full`)
+"""
+_PLY = SplatFormat(
+    name="3D-GS PLY", order=0, suffix=".ply", write=write_gaussian_ply, read=read_gaussian_ply, docs=_DOCS
+)
+REFERENCE_PLY = replace(_PLY, name="3D-GS PLY, 62 properties", write=_write_reference_ply, held=without_labels)
+ENTRIES = (_PLY,)

@@ -1,0 +1,348 @@
+"""Splats in packed bytes: ``.splat`` and ``.spz``.
+
+``.splat`` files, as the WebGL viewers read them: 32 bytes per Gaussian, no header.
+
+Three float32 of the centre, three float32 of the sigmas, then bytes: red, green, blue, opacity (255 is 1), and a
+quaternion w x y z as 128 q + 128. Colour by side, labels and comments have no place in it; the axes are world's.
+
+``.spz`` files (Niantic's compressed Gaussians): version 3 is written, 2 to 4 are read.
+
+A gzip stream: a header of 16 bytes, then by attribute the centres (24-bit fixed point), opacities, colours, log
+sigmas and rotations in bytes, and the harmonics above degree 0. Version 4 has the same bytes: its header is plain, 32
+bytes long, and says where a table of two numbers (64 bits, bytes packed and unpacked) for each attribute begins; a
+zstd stream for each follows. That of no harmonics may be left out. The format names its axes right, up, back; centres
+and rotations are written in the axes of world as they are, so that they read back in world: a viewer that takes y for
+up shows a world whose z is up lying on its back.
+"""
+
+import gzip
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import replace
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
+from splatctrl_cli.formats.splat.splat_format import (
+    SH_C0,
+    Differences,
+    SplatFormat,
+    check_finite,
+    unit_quaternions,
+    without_labels,
+)
+from splatctrl_cli.formats.unpacking import FREE_BYTES, BadBlockError, read_bytes, unpacked
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Float32, Float64, GaussianSet, UInt8
+
+ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
+
+
+def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
+    """Write `gaussians`, what of them the format can hold; `comments` are left out. Same input, same bytes.
+
+    Of the two quaternions of a rotation the one whose largest component is negative: -1 has a byte, +1 has none.
+    Raises InputError for a value that no Gaussian can have, naming its index.
+    """
+    check_gaussians("Gaussians to write", gaussians)
+    rows = np.zeros(len(gaussians), dtype=ROW)
+    held = held_by_splat(gaussians)
+    rows["center"], rows["sigma"] = held.centers, held.scales
+    rows["rgba"][:, :3] = np.rint(255.0 * (0.5 + SH_C0 * held.harmonics[:, 0].astype(np.float64)))
+    rows["rgba"][:, 3] = np.rint(255.0 * held.opacities.astype(np.float64))
+    quats = held.quats_wxyz.astype(np.float64)
+    largest = np.take_along_axis(quats, np.abs(quats).argmax(axis=1)[:, None], axis=1)
+    rows["quat_wxyz"] = np.rint(128.0 - 128.0 * np.copysign(quats, quats * largest))
+    path.write_bytes(rows.tobytes())
+
+
+def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
+    """The Gaussians of a ``.splat`` file and no comments. Raises InputError for a file not whole, or no Gaussian."""
+    content = read_bytes(path)
+    if len(content) % ROW.itemsize:
+        raise InputError(f"{path}: expected a multiple of 32 bytes, one row per splat, got {len(content)}")
+    rows = np.frombuffer(content, dtype=ROW)
+    check_finite(str(path), len(rows), {"center": rows["center"], "sigma": rows["sigma"]})
+    quats = (rows["quat_wxyz"].astype(np.float64) - 128.0) / 128.0
+    colors = rows["rgba"][:, :3].astype(np.float64) / 255.0
+    gaussians = GaussianSet(
+        centers=rows["center"].copy(),
+        scales=rows["sigma"].copy(),
+        quats_wxyz=unit_quaternions(str(path), quats),
+        opacities=(rows["rgba"][:, 3] / 255.0).astype(np.float32),
+        harmonics=((colors - 0.5) / SH_C0).astype(np.float32)[:, None, :],
+        labels=np.zeros(len(rows), dtype=np.uint8),
+    )
+    check_gaussians(str(path), gaussians)
+    return gaussians, {}
+
+
+def held_by_splat(gaussians: GaussianSet) -> GaussianSet:
+    """`gaussians` with colours of degree 0 alone, inside 0 to 1, and no labels: what a byte can be rounded from."""
+    limit = 0.5 / SH_C0
+    return replace(without_labels(gaussians), harmonics=np.clip(gaussians.harmonics[:, :1], -limit, limit))
+
+
+def splat_bound(gaussians: GaussianSet) -> Differences:
+    """Half a step of each byte: 1/510 of colour and opacity, 1/256 of each component of a quaternion.
+
+    Four components of 1/256 move a unit quaternion by at most 2/256, which turns by twice that angle: 0.9 degrees.
+    """
+    return Differences(center=0.0, sigma=0.0, rotation=0.9, color=0.5001 / 255, opacity=0.5001 / 255, harmonics=0.0)
+
+
+_SPLAT_DOCS = """
+`.splat` | 32 bytes per Gaussian, no header | colour, opacity 1/510; rotation 0.9 degrees | labels, density,
+    comments, view-dependent colour, colours outside 0 to 1
+"""
+
+
+MAGIC = 0x5053474E  # NGSP
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, number, degree, fraction bits, flags, reserved
+GZIP, PLAIN = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # a file of versions 2 and 3 begins so, one of version 4
+PLAIN_HEADER = 32  # bytes
+WAS_ANTIALIASED = 0x1  # of the flags: how it was trained, which changes no value
+SPZ_RATIO = 100  # times the file's size, that splats unpack to beside FREE_BYTES: measured 2 to 9
+FRACTION_BITS = 12  # steps of 0.24 mm up to 2 km, what other writers use; fewer for what is farther
+COLOR_SCALE = 0.15 * 255.0  # steps per unit of an f_dc coefficient
+LOG_SIGMAS = (-10.0, 255.0 / 16.0 - 10.0)  # of a byte / 16 - 10: 0.045 mm to 377 m
+HARMONICS = (-1.0, 127.0 / 128.0)  # of (byte - 128) / 128
+SQRT_HALF = float(np.sqrt(0.5))  # no component but the largest exceeds it
+
+
+def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
+    """Write `gaussians`, what of them the format can hold; `comments` are left out. Same input, same bytes.
+
+    Raises InputError for a value that no Gaussian can have, naming its index.
+    """
+    check_gaussians("Gaussians to write", gaussians)
+    held, bits = held_by_spz(gaussians), _fraction_bits(gaussians.centers)
+    degree = {1: 0, 4: 1, 9: 2, 16: 3}[held.harmonics.shape[1]]
+    fixed = np.rint(np.ldexp(held.centers.astype(np.float64), bits)).astype("<i4")
+    parts = [
+        HEADER.pack(MAGIC, 3, len(held), degree, bits, 0, 0),
+        fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
+        np.rint(255.0 * held.opacities.astype(np.float64)).astype(np.uint8).tobytes(),
+        np.rint(held.harmonics[:, 0] * COLOR_SCALE + 127.5).astype(np.uint8).tobytes(),
+        np.rint(16.0 * (np.log(held.scales.astype(np.float64)) + 10.0)).astype(np.uint8).tobytes(),
+        _packed_quaternions(held.quats_wxyz).tobytes(),
+        np.rint(128.0 * held.harmonics[:, 1:] + 128.0).astype(np.uint8).tobytes(),
+    ]
+    path.write_bytes(gzip.compress(b"".join(parts), compresslevel=6, mtime=0))
+
+
+def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
+    """The Gaussians of an ``.spz`` file of version 2 to 4, in the file's axes, and no comments.
+
+    Raises InputError for a file that is not whole, of another version, or that holds what no Gaussian is.
+    """
+    content = read_bytes(path)
+    bits, (centers, opacities, colors, sigmas, quats, rest) = _columns(path, content)
+    gaussians = GaussianSet(
+        centers=_centers(centers, bits),
+        scales=np.exp(sigmas / 16.0 - 10.0).astype(np.float32),
+        quats_wxyz=_quaternions(quats),
+        opacities=(opacities[:, 0] / 255.0).astype(np.float32),
+        harmonics=_harmonics(colors, rest),
+        labels=np.zeros(len(centers), dtype=np.uint8),
+    )
+    check_gaussians(str(path), gaussians)
+    return gaussians, {}
+
+
+def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
+    """`gaussians` inside the ranges of the format's bytes, without labels: what a byte can be rounded from."""
+    harmonics = np.clip(gaussians.harmonics, *HARMONICS)
+    harmonics[:, 0] = np.clip(gaussians.harmonics[:, 0], -127.5 / COLOR_SCALE, 127.5 / COLOR_SCALE)
+    scales = np.clip(gaussians.scales, *np.exp(LOG_SIGMAS)).astype(np.float32)
+    return replace(without_labels(gaussians), harmonics=harmonics, scales=scales)
+
+
+def spz_bound(gaussians: GaussianSet) -> Differences:
+    """Half a step of each value, and a little for float32.
+
+    Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511, 1.2e-3 together; the fourth
+    follows and is at least 1/2, which at most doubles it; a rotation turns by twice that angle: 0.28 degrees.
+    """
+    step = 2.0 ** -_fraction_bits(gaussians.centers)
+    return Differences(
+        center=0.5001 * step,
+        sigma=float(np.expm1(1 / 32)) + 1e-5,
+        rotation=0.28,
+        color=0.5001 * SH_C0 / COLOR_SCALE,
+        opacity=0.5001 / 255,
+        harmonics=0.5001 / 128,
+    )
+
+
+def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
+    """The fraction bits, and the bytes of each attribute, a row per Gaussian, of a file of no more and no fewer."""
+    start = content[:4]
+    if start == PLAIN:
+        num, bits, widths = _parsed(path, content, (4,), len(content))
+        parts = _streams(path, content, [num * width for width in widths])
+    elif start[:2] == GZIP:
+        num, bits, widths, body = _unzipped(path, content)
+        ends = np.cumsum([0, *widths]) * num
+        parts = [body[i:j] for i, j in pairwise(ends)]
+    else:
+        raise InputError(f"{path}: no .spz file: expected it to start as gzip or with NGSP, got {start.hex()}")
+    tables = [np.frombuffer(part, np.uint8).reshape(num, w) for part, w in zip(parts, widths, strict=True)]
+    return bits, tables
+
+
+def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
+    """The number of Gaussians, the fraction bits and the bytes of each attribute; size: of the file."""
+    if len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC:
+        raise InputError(f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}")
+    _, version, num, degree, bits, flags, _ = HEADER.unpack_from(head)
+    if version not in versions:
+        known = "2 or 3 in gzip and 4 in plain"
+        raise InputError(f"{path}: .spz version: expected {known}, got {version}", remedy="write it as version 3")
+    if degree > 3 or bits > 23:
+        raise InputError(f"{path}: expected degree 0 to 3 and 0 to 23 fraction bits, got {degree} and {bits}")
+    if flags & ~WAS_ANTIALIASED:
+        raise InputError(
+            f"{path}: has vendor extensions (flags {flags:#x}), expected none", remedy="write it without them"
+        )
+    widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1))
+    if num * sum(widths) > FREE_BYTES + SPZ_RATIO * size:
+        raise InputError(f"{path}: announces {num} splats, more than a file of {size} bytes holds")
+    return num, bits, widths
+
+
+def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], bytes]:
+    """What `_parsed` gives, and all attributes, of a gzip stream: no more is unpacked than its header says."""
+    try:
+        with gzip.GzipFile(fileobj=BytesIO(content)) as stream:
+            num, bits, widths = _parsed(path, stream.read(HEADER.size), (2, 3), len(content))
+            expected = num * sum(widths)
+            body = stream.read(expected + 1)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise InputError(f"{path}: no whole .spz file: {error}", remedy="copy or write the file again") from None
+    if len(body) != expected:
+        got = "more" if len(body) > expected else len(body)
+        raise InputError(f"{path}: expected {expected} bytes for {num} splats, got {got}")
+    return num, bits, widths, body
+
+
+def _streams(path: Path, content: bytes, sizes: list[int]) -> list[bytes]:
+    """The attributes of version 4, of these sizes."""
+    num_streams, place = content[HEADER.size - 1], int.from_bytes(content[HEADER.size : HEADER.size + 4], "little")
+    start = place + 16 * num_streams
+    if num_streams not in (len(sizes), 5 if sizes[5] == 0 else 6) or not PLAIN_HEADER <= place <= len(content) - 16:
+        raise InputError(f"{path}: .spz version 4: expected 6 streams after {PLAIN_HEADER} bytes, got {num_streams}")
+    table = np.frombuffer(content[place:start].ljust(16 * num_streams, b"\0"), "<u8").reshape(-1, 2).tolist()
+    if (expected := start + sum(packed for packed, _ in table)) != len(content):
+        raise InputError(
+            f"{path}: expected {expected} bytes, got {len(content)}", remedy="copy or write the file again"
+        )
+    parts = [b""] * len(sizes)
+    for index, (packed, size) in enumerate(table):
+        if size != sizes[index]:
+            raise InputError(f"{path}: stream {index}: expected {sizes[index]} bytes unpacked, got {size}")
+        try:
+            parts[index] = unpacked(content[start : start + packed], "zstd", size, size)
+        except BadBlockError as error:
+            raise InputError(f"{path}: stream {index}: {error}", remedy="copy or write the file again") from None
+        start += packed
+    return parts
+
+
+def _fraction_bits(centers: Float32) -> int:
+    """The most fraction bits, up to 12, with which every coordinate fits 24 bits."""
+    largest = float(np.abs(centers).max(initial=0.0))
+    bits = FRACTION_BITS
+    while largest * 2.0**bits > 2**23 - 1:
+        bits -= 1
+    if bits < 0:
+        raise InputError(f".spz: expected coordinates up to 8388 km, got {largest:g} m")
+    return bits
+
+
+def _centers(table: UInt8, bits: int) -> Float32:
+    wide = np.zeros((len(table), 3, 4), dtype=np.uint8)
+    wide[:, :, 1:] = table.reshape(-1, 3, 3)  # in the upper bytes: the shift back keeps the sign
+    return np.ldexp((wide.view("<i4")[:, :, 0] >> 8).astype(np.float64), -bits).astype(np.float32)
+
+
+def _harmonics(colors: UInt8, rest: UInt8) -> Float32:
+    constant = ((colors / 255.0 - 0.5) / 0.15)[:, None]
+    further = (rest / 128.0 - 1.0).reshape(len(rest), rest.shape[1] // 3, 3)
+    return np.concatenate([constant, further], axis=1).astype(np.float32)
+
+
+def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
+    """(N,) little-endian words: 2 bits say which of x y z w is largest, then 10 bits (sign, size) for each other."""
+    quats = np.roll(quats_wxyz.astype(np.float64), -1, axis=1)
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    largest = np.abs(quats).argmax(axis=1)
+    quats *= np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, -1.0, 1.0)
+    others = quats[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    sizes = np.rint(511.0 * np.minimum(np.abs(others) / SQRT_HALF, 1.0)).astype(np.uint32)
+    words = largest.astype(np.uint32)
+    for index in range(3):
+        sign = (others[:, index] < 0).astype(np.uint32)
+        words = (words << np.uint32(10)) | (sign << np.uint32(9)) | sizes[:, index]
+    return np.asarray(words, dtype="<u4")
+
+
+def _quaternions(table: UInt8) -> Float32:
+    """(N, 4) unit quaternions w x y z of three bytes (version 2) or of four (version 3)."""
+    is_version_2 = table.shape[1] == 3
+    quats = _of_three_bytes(table) if is_version_2 else _of_words(np.ascontiguousarray(table).view("<u4")[:, 0])
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    return np.roll(quats, 1, axis=1).astype(np.float32)
+
+
+def _of_three_bytes(table: UInt8) -> Float64:
+    xyz = table / 127.5 - 1.0
+    w = np.sqrt(np.maximum(0.0, 1.0 - (xyz**2).sum(axis=1)))
+    return np.column_stack([xyz, w])
+
+
+def _of_words(words: NDArray[np.uint32]) -> Float64:
+    largest = (words >> np.uint32(30)).astype(np.intp)
+    fields = np.stack([(words >> np.uint32(shift)) & np.uint32(0x3FF) for shift in (20, 10, 0)], axis=1)
+    others = SQRT_HALF * (fields & np.uint32(0x1FF)) / 511.0 * np.where(fields >> np.uint32(9), -1.0, 1.0)
+    quats = np.zeros((len(words), 4))
+    quats[np.arange(4) != largest[:, None]] = others.ravel()
+    np.put_along_axis(
+        quats, largest[:, None], np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(axis=1)))[:, None], axis=1
+    )
+    return quats
+
+
+_SPZ_DOCS = """
+`.spz` | version 3 (gzip); 2 to 4 are read | centre 0.12 mm (within 2 km), sigma 3.2 %, colour 0.0037, opacity 1/510,
+    rotation 0.28 degrees, harmonics 1/256 | labels, density, comments; sigmas below 0.045 mm, colours outside -0.44
+    to 1.44, harmonics outside -1 to 1
+"""
+
+ENTRIES = (
+    SplatFormat(
+        name=".splat, 32 bytes each",
+        order=1,
+        suffix=".splat",
+        write=write_splat,
+        read=read_splat,
+        held=held_by_splat,
+        bound=splat_bound,
+        docs=_SPLAT_DOCS,
+    ),
+    SplatFormat(
+        name=".spz",
+        order=2,
+        suffix=".spz",
+        write=write_spz,
+        read=read_spz,
+        held=held_by_spz,
+        bound=spz_bound,
+        docs=_SPZ_DOCS,
+    ),
+)

@@ -1,0 +1,318 @@
+"""Splats in files: isotropic ones as 3D-GS PLY, as Gaussians and back; any format by suffix.
+
+Layout: the reference implementation's names and order without ``f_rest_*`` (degree-0 colour): ``x y z nx ny nz
+f_dc_0..2 opacity scale_0..2 rot_0..3``, then ``label`` (uchar) and ``density`` (float). The normals are zeros:
+readers that go by the header skip them, readers that go by the reference's order need them. ``scale_*`` are three
+equal log(radius), ``rot`` is 1 0 0 0, ``opacity`` is a logit and ``f_dc`` is ``(colour - 0.5) / C0``.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.formats.ply import PlyFile, read_table, write_table
+from splatctrl_cli.formats.splat.gaussian_ply import (
+    RoundedError,
+    centers_of,
+    exact_centers,
+    gaussians_of,
+    labels_of,
+    log_sigmas,
+    rows_of,
+)
+from splatctrl_cli.formats.splat.splat_format import (
+    SH_C0,
+    Comments,
+    SplatFormat,
+    check_finite,
+    refuse,
+    sigma_of_log,
+    sigmoid,
+)
+from splatctrl_cli.formats.summary import Summary
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.libraries import entries_of
+from splatctrl_cli.records import Bool, Float32, Float64, GaussianSet, Label, SplatSet
+
+MAX_SCALE_SPREAD = 1e-5  # largest difference of log scales that still reads as isotropic
+NAMES = (
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+DTYPE = np.dtype([*((name, "<f4") for name in NAMES), ("label", "u1"), ("density", "<f4")])
+REQUIRED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0")
+METRES = ("m", "metre", "metres", "meter", "meters")
+ORIGIN = "origin"  # [m] that was taken off every centre
+SHELL = {"shell": "beyond the robot's reach, rendered only: no surface that distances are kept to"}
+HEADER_COMMENTS = {
+    "frame": "world",
+    "units": "metre",
+    "splat": "isotropic Gaussian; exp(scale_*) is its sigma [m]; opacity is a logit; f_dc (colour - 0.5) / 0.28209",
+    "label": "0 object, 1 robot, 2 human; density is the kernel row sum, 0 where not computed",
+}
+
+
+def as_gaussians(splats: SplatSet) -> GaussianSet:
+    """`splats` as Gaussians of one sigma and one colour; the density has no place there."""
+    coefficients = (splats.colors.astype(np.float64) - 0.5) / SH_C0
+    return GaussianSet(
+        centers=splats.centers,
+        scales=np.repeat(splats.radii[:, None], 3, axis=1),
+        quats_wxyz=np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (len(splats), 1)),
+        opacities=splats.opacities,
+        harmonics=coefficients.astype(np.float32)[:, None, :],
+        labels=splats.labels,
+    )
+
+
+def is_isotropic(gaussians: GaussianSet) -> bool:
+    """True where every Gaussian is round and looks the same from every side."""
+    return not (_is_stretched(gaussians).any() or gaussians.harmonics[:, 1:].any())
+
+
+def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
+    """Gaussians that are round, as splats. Raises InputError with how many are not, or change colour by side."""
+    num_stretched = int(np.count_nonzero(_is_stretched(gaussians)))
+    num_coloured = int(np.count_nonzero(gaussians.harmonics[:, 1:].any(axis=(1, 2))))
+    if num_stretched or num_coloured:
+        raise InputError(
+            f"{where}: expected isotropic splats, got {num_stretched} of {len(gaussians)} whose scales differ and "
+            f"{num_coloured} whose colour depends on the view",
+            remedy="'splatctrl export --isotropic' writes the nearest isotropic set",
+        )
+    return _round_splats(gaussians, gaussians.scales[:, 0])
+
+
+def nearest_splats(gaussians: GaussianSet) -> SplatSet:
+    """Splats of the Gaussians' volume (radius: geometric mean of sigmas), opacity, and mean colour over all sides.
+
+    What is lost: orientation, flatness (a flat Gaussian becomes thicker and narrower), colour by side.
+    """
+    return _round_splats(
+        gaussians, np.exp(np.log(gaussians.scales.astype(np.float64)).mean(axis=1)).astype(np.float32)
+    )
+
+
+def _round_splats(gaussians: GaussianSet, radii: Float32) -> SplatSet:
+    return SplatSet(
+        centers=gaussians.centers,
+        radii=np.ascontiguousarray(radii),
+        colors=(0.5 + SH_C0 * gaussians.harmonics[:, 0].astype(np.float64)).astype(np.float32),
+        opacities=gaussians.opacities,
+        labels=gaussians.labels,
+        density=np.zeros(len(gaussians), dtype=np.float32),
+    )
+
+
+def _is_stretched(gaussians: GaussianSet) -> Bool:
+    logs = np.log(gaussians.scales.astype(np.float64))
+    return np.asarray(logs.max(axis=1) - logs.min(axis=1) > MAX_SCALE_SPREAD)
+
+
+def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None:
+    """Write `splats`; frame, units, what the scales mean and `comments` go in the header. Same input, same bytes.
+
+    Opacities of exactly 0 and 1 are written as finite logits that read back as exactly 0 and 1.
+    Raises InputError for a value the format cannot hold, naming its index; UsageError for a comment of several lines.
+    """
+    check_splats("splats to write", splats)
+    rows = rows_of(as_gaussians(splats), DTYPE)
+    rows["density"] = splats.density
+    write_table(path, rows, {**HEADER_COMMENTS, **comments})
+
+
+def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
+    """The splat set of a 3D-GS PLY file (binary or ASCII, properties in any order) and its ``key: value`` comments.
+
+    A comment without a colon is a key with an empty value. Other properties (normals, higher harmonics, rotation) are
+    ignored; a missing label is 0 (object), a missing density 0 (not computed).
+    Raises InputError for a file that is not whole, lacks a property, is anisotropic or holds no valid splat.
+    """
+    ply = read_table(path, "vertex", REQUIRED)
+    return splats_of(ply), ply.pairs()
+
+
+def read_world_splats(path: Path) -> SplatSet:
+    """The splats of a PLY file whose distances mean metres in the world. Raises as `read_ply`, and InputError for a
+    file whose comments name other units or another frame; one that names none is taken at its word.
+    """
+    splats, comments = read_ply(path)
+    check_world(path, comments)
+    return splats
+
+
+def check_world(path: Path, comments: Mapping[str, str]) -> None:
+    """Raise InputError for comments that name other units than metres or another frame than the world, or that tell
+    of splats that have no distances: those of a shell.
+    """
+    check_no_shell(path, comments)
+    for key, known in (("units", METRES), ("frame", ("world",))):
+        said = comments.get(key)
+        if said is not None and said.lower() not in known:
+            raise InputError(
+                f"{path}: comment '{key}: {said}': expected {known[0]}",
+                remedy="distances are in metres in the world: transform the splats, and correct the comment",
+            )
+
+
+def check_no_shell(path: Path, comments: Mapping[str, str]) -> None:
+    """Raise InputError where the comments tell that the splats are rendered only."""
+    if SHELL.keys() & comments.keys():
+        raise InputError(
+            f"{path}: the shell beyond the robot's reach, which is rendered only and has no distances",
+            remedy="give the scene's folder, or its splats.ply",
+        )
+
+
+def read_shell(path: Path) -> SplatSet:
+    """The splats of a shell. Raises as `read_ply`, and InputError for splats that are none."""
+    splats, comments = read_ply(path)
+    if not SHELL.keys() <= comments.keys():
+        raise InputError(f"{path}: expected a shell, got other splats", remedy="reconstruct the scene again")
+    return splats
+
+
+def splats_of(ply: PlyFile) -> SplatSet:
+    """The splats that a table of a PLY file holds. Raises InputError as `read_ply` does."""
+    path = ply.path
+    if num := num_stretched(ply):
+        raise InputError(
+            f"{path}: expected isotropic splats (three equal scale_*), got {num} of {len(ply)} whose scales differ",
+            remedy="distances are defined on spheres: 'splatctrl export --isotropic' writes the nearest such set;"
+            " score renders them as they are",
+        )
+    radii = sigma_of_log(str(path), "scale_0", log_sigmas(ply)[:, 0])
+    splats = SplatSet(
+        centers=centers_of(ply, radii),
+        radii=radii,
+        colors=np.column_stack([0.5 + SH_C0 * ply.column(f"f_dc_{axis}") for axis in range(3)]).astype(np.float32),
+        opacities=sigmoid(ply.column("opacity")),
+        labels=labels_of(ply),
+        density=(ply.column("density") if "density" in ply else np.zeros(len(ply))).astype(np.float32),
+    )
+    check_splats(str(path), splats)
+    return splats
+
+
+def num_stretched(ply: PlyFile) -> int:
+    """How many rows of a table have scales that differ."""
+    scales = log_sigmas(ply)
+    spread = scales.max(axis=1, initial=-np.inf) - scales.min(axis=1, initial=np.inf)
+    return int(np.count_nonzero(spread > MAX_SCALE_SPREAD))
+
+
+def check_splats(where: str, splats: SplatSet) -> None:
+    """Raise InputError at the first splat that has no place in the world: NaN, no radius, opacity outside [0, 1]."""
+    groups = {
+        "center": splats.centers,
+        "radius": splats.radii,
+        "colour": splats.colors,
+        "opacity": splats.opacities,
+        "density": splats.density,
+    }
+    check_finite(where, len(splats), groups)
+    refuse(where, "radius", splats.radii, splats.radii <= 0, "more than 0 m")
+    refuse(where, "opacity", splats.opacities, (splats.opacities < 0) | (splats.opacities > 1), "0 to 1")
+
+
+FORMATS: Mapping[str, SplatFormat] = {kind.suffix: kind for kind in entries_of(__package__, SplatFormat)}
+
+
+def format_of(path: Path) -> SplatFormat:
+    """The format that the suffix of `path` names, PLY without one. Raises UsageError for an unknown one."""
+    found = FORMATS.get(path.suffix.lower() or ".ply")
+    if found is None:
+        raise UsageError(f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}")
+    return found
+
+
+def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
+    """What a file of splats holds, and its comments: a SplatSet where all are round and of one colour by side.
+
+    Raises InputError for a file that is missing, not whole, of an unknown kind, or holds what is no splat.
+    """
+    kind = _known_format(path)
+    if kind is not FORMATS[".ply"]:
+        gaussians, comments = kind.read(path)
+        return (as_splats(gaussians, str(path)) if is_isotropic(gaussians) else gaussians), comments
+    ply = read_table(path, "vertex", REQUIRED)
+    return _splats_or_gaussians(ply), ply.pairs()
+
+
+def read_source(path: Path) -> tuple[SplatSet | GaussianSet, Comments, Float64]:
+    """As `read_splats`, and the centres (N, 3) float64 [m] in the file's precision.
+
+    Where float32 would move the centres, an origin is taken off, which the comment `ORIGIN` names. Raises InputError
+    as `read_splats`.
+    """
+    if _known_format(path) is not FORMATS[".ply"]:
+        splats, comments = read_splats(path)
+        return splats, comments, splats.centers.astype(np.float64)
+    ply = read_table(path, "vertex", REQUIRED)
+    comments, exact = ply.pairs(), exact_centers(ply)
+    try:
+        return _splats_or_gaussians(ply), comments, exact
+    except RoundedError:
+        if ORIGIN in comments:
+            raise
+        origin = np.round((exact.min(axis=0) + exact.max(axis=0)) / 2, -2)
+        fields = [(name, "<f8" if name in "xyz" else ply.rows.dtype[name]) for name in ply.names]
+        moved = replace(ply, rows=ply.rows.astype(np.dtype(fields)))
+        for name, column in zip("xyz", (exact - origin).T, strict=True):
+            moved.rows[name] = column
+        named = " ".join(f"{value:.0f}" for value in origin)
+        return _splats_or_gaussians(moved), {**comments, ORIGIN: named}, exact - origin
+
+
+def _known_format(path: Path) -> SplatFormat:
+    try:
+        return format_of(path)
+    except UsageError as error:
+        raise InputError(error.message) from None
+
+
+def _splats_or_gaussians(ply: PlyFile) -> SplatSet | GaussianSet:
+    has_rest = any(name.startswith("f_rest_") and ply.column(name).any() for name in ply.names)
+    return splats_of(ply) if num_stretched(ply) == 0 and not has_rest else gaussians_of(ply)
+
+
+def read_spheres(path: Path) -> SplatSet:
+    """The splats of a file of any format as spheres in the world, which have distances; harmonics above the constant
+    one are only colour and are left out. Raises InputError as `read_splats`, and for splats that are not
+    round, in another unit or another frame.
+    """
+    if (path.suffix.lower() or ".ply") == ".ply":
+        return read_world_splats(path)
+    found, comments = read_splats(path)
+    check_world(path, comments)
+    if isinstance(found, SplatSet):
+        return found
+    return as_splats(replace(found, harmonics=found.harmonics[:, :1]), str(path))
+
+
+def describe_splats(path: Path, _head: bytes) -> Summary:
+    """Number, shape, box and ranges of the splats of a file. Raises InputError for a file of another kind."""
+    found, comments = read_splats(path)
+    gaussians = as_gaussians(found) if isinstance(found, SplatSet) else found
+    facts: dict[str, object] = {
+        "format": format_of(path).name,
+        "splats": len(gaussians),
+        "shape": "isotropic" if isinstance(found, SplatSet) else "anisotropic",
+        "degree_of_harmonics": int(np.sqrt(gaussians.harmonics.shape[1])) - 1,
+    }
+    if (gaussians.labels != Label.OBJECT).any():
+        facts["labels"] = {label.name.lower(): int(np.count_nonzero(gaussians.labels == label)) for label in Label}
+    if len(gaussians):
+        facts["lower_m"] = _rounded(gaussians.centers.min(axis=0))
+        facts["upper_m"] = _rounded(gaussians.centers.max(axis=0))
+        facts["sigma_m"] = _rounded(np.percentile(gaussians.scales, [0, 50, 100]))
+        facts["opacity"] = _rounded(np.percentile(gaussians.opacities, [0, 50, 100]))
+    facts["comments"] = comments
+    return Summary(path=str(path), kind="splats", facts=facts)
+
+
+def _rounded(values: NDArray[np.floating]) -> list[float]:
+    return [float(f"{value:.4g}") for value in values]

@@ -1,0 +1,165 @@
+"""Gaussians as an OpenUSD particle field (UsdVol ParticleField3DGaussianSplat, OpenUSD 26.3 and later), in world.
+
+Sigmas and opacities are linear there; the harmonics' coefficients lie by Gaussian, then by coefficient. The stage
+says that z is up and that a unit is a metre. Needs the library usd-core, which is an extra of its own.
+"""
+
+import errno
+import os
+import tempfile
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
+from splatctrl_cli.formats.splat.splat_format import SplatFormat, unit_quaternions
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.records import Float32, GaussianSet, Label
+
+PRIM_TYPE = "ParticleField3DGaussianSplat"
+HARMONICS = "radiance:sphericalHarmonicsCoefficients"
+DEGREE = "radiance:sphericalHarmonicsDegree"
+NAME = "field"  # of the file while the library has it: it goes by the suffix
+
+
+def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *, suffix: str) -> None:
+    """Write `gaussians` as `suffix`, ``.usda`` (text) or ``.usdc`` (binary); `comments` become custom data.
+
+    Labels are the primvar ``label``, where some Gaussian is not an object.
+    Raises InputError for a value that no Gaussian can have, naming its index; UsageError without the library.
+    """
+    check_gaussians("Gaussians to write", gaussians)
+    usd, geometry, volume, arrays = _library()
+    stage = usd.Stage.CreateInMemory(suffix)
+    geometry.SetStageUpAxis(stage, geometry.Tokens.z)
+    geometry.SetStageMetersPerUnit(stage, 1.0)
+    field = volume.ParticleField3DGaussianSplat.Define(stage, "/Splats")
+    stage.SetDefaultPrim(field.GetPrim())
+    g, to_float3 = gaussians, arrays.Vec3fArray.FromNumpy
+    field.CreatePositionsAttr(to_float3(g.centers))
+    field.CreateOrientationsAttr(arrays.QuatfArray.FromNumpy(np.roll(g.quats_wxyz, -1, axis=1)))
+    field.CreateScalesAttr(to_float3(g.scales))
+    field.CreateOpacitiesAttr(arrays.FloatArray.FromNumpy(g.opacities))
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(int(np.sqrt(g.harmonics.shape[1])) - 1)
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(to_float3(g.harmonics.reshape(-1, 3)))
+    field.CreateExtentAttr(to_float3(_extent(g)))
+    if (g.labels != Label.OBJECT).any():
+        primvar = geometry.PrimvarsAPI(field).CreatePrimvar("label", _int_array_type(), geometry.Tokens.vertex)
+        primvar.Set(arrays.IntArray.FromNumpy(g.labels.astype(np.int32)))
+    layer = stage.GetRootLayer()
+    layer.customLayerData = {"frame": "world", **comments}
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+        named = Path(folder) / f"{NAME}{suffix}"
+        try:
+            layer.Export(str(named))
+        except Exception as error:  # of the library's own type; it repeats itself for every block
+            code = errno.ENOSPC if os.strerror(errno.ENOSPC) in str(error) else errno.EIO
+            raise OSError(code, os.strerror(code), str(path)) from None
+        named.replace(path)
+
+
+def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
+    """The Gaussians of a USD file's one particle field, in its own axes (transforms are not applied), and its data.
+
+    Raises InputError for a file that cannot be opened or does not have exactly one such field; UsageError without
+    the library.
+    """
+    usd, geometry, _, _ = _library()
+    if not path.is_file():
+        raise InputError(f"{path}: cannot be read: no such file")
+    with tempfile.TemporaryDirectory() as folder:
+        named = Path(folder) / f"{NAME}{suffix}"
+        named.symlink_to(path.resolve())
+        try:
+            stage = usd.Stage.Open(str(named))
+        except Exception:  # of the library's own type; it names lines of its source
+            raise InputError(f"{path}: no USD file that the library can open") from None
+        prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == PRIM_TYPE]
+        if len(prims) != 1:
+            raise InputError(f"{path}: expected one {PRIM_TYPE}, got {len(prims)}")
+        gaussians = _gaussians(path, prims[0], geometry)
+        comments = {key: str(value) for key, value in stage.GetRootLayer().customLayerData.items()}
+    check_gaussians(str(path), gaussians)
+    return gaussians, comments
+
+
+def _library() -> tuple[Any, Any, Any, Any]:
+    """The modules Usd, UsdGeom, UsdVol and Vt. Raises UsageError where they are missing or older than the schema."""
+    try:
+        from pxr import Usd, UsdGeom, UsdVol, Vt
+    except ImportError:
+        raise UsageError(
+            "USD: the library usd-core is not installed", remedy="pip install 'splatctrl-cli[usd]'"
+        ) from None
+    if getattr(UsdVol, PRIM_TYPE, None) is None:
+        raise UsageError(
+            f"USD: expected usd-core 26.3 or later, which knows {PRIM_TYPE}, got {Usd.GetVersion()}",
+            remedy="pip install 'splatctrl-cli[usd]'",
+        )
+    return Usd, UsdGeom, UsdVol, Vt
+
+
+def _int_array_type() -> Any:
+    from pxr import Sdf
+
+    return Sdf.ValueTypeNames.IntArray
+
+
+def _extent(gaussians: GaussianSet) -> Float32:
+    """(2, 3) corners of a box that holds three sigmas of every Gaussian, however turned."""
+    reach = 3.0 * gaussians.scales.max(axis=1, keepdims=True)
+    lower, upper = (gaussians.centers - reach).min(axis=0), (gaussians.centers + reach).max(axis=0)
+    return np.stack([lower, upper]).astype(np.float32)
+
+
+def _gaussians(path: Path, prim: Any, geometry: Any) -> GaussianSet:
+    centers = _array(path, prim, "positions", 3)
+    num = len(centers)
+    degree = int(prim.GetAttribute(DEGREE).Get())
+    harmonics = _array(path, prim, HARMONICS, 3)
+    if len(harmonics) != num * (degree + 1) ** 2:
+        raise InputError(
+            f"{path}: {HARMONICS}: expected {(degree + 1) ** 2} for each of {num} Gaussians, got {len(harmonics)}"
+        )
+    primvars = geometry.PrimvarsAPI(prim)
+    labels = primvars.GetPrimvar("label").Get() if primvars.HasPrimvar("label") else np.zeros(num)
+    return GaussianSet(
+        centers=centers,
+        scales=_array(path, prim, "scales", 3),
+        quats_wxyz=unit_quaternions(str(path), np.roll(_array(path, prim, "orientations", 4), 1, axis=1)),
+        opacities=_array(path, prim, "opacities", 1)[:, 0],
+        harmonics=harmonics.reshape(num, -1, 3),
+        labels=np.asarray(labels).astype(np.uint8),
+    )
+
+
+def _array(path: Path, prim: Any, name: str, width: int) -> Float32:
+    """(N, width) float32 values of an attribute, or of its half-precision twin, whose name ends in h."""
+    for candidate in (name, f"{name}h"):
+        values = prim.GetAttribute(candidate).Get()
+        if values is not None and len(values):
+            table: NDArray[Any] = np.asarray(values).reshape(len(values), -1)
+            if table.shape[1] == width:
+                return table.astype(np.float32)
+    raise InputError(f"{path}: its {PRIM_TYPE} has no {name}")
+
+
+_DOCS = """
+`.usda`, `.usdc` | OpenUSD, one `ParticleField3DGaussianSplat` | float32 | density
+"""
+ENTRIES = tuple(
+    SplatFormat(
+        name="OpenUSD particle field",
+        order=order,
+        suffix=suffix,
+        write=partial(write_usd, suffix=suffix),
+        read=partial(read_usd, suffix=suffix),
+        check=_library,
+        docs=docs,
+    )
+    for order, suffix, docs in ((4, ".usda", _DOCS), (5, ".usdc", ""))
+)

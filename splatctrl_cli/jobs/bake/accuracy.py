@@ -1,0 +1,164 @@
+"""A baked field beside a truth, a mesh, and the depth of cameras that did not train the scene."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.jobs.bake.request import BakeRequest, BakeSource
+
+from splatctrl_cli.config.fixed import COMPARED_CELLS
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.evaluate.field_accuracy import (
+    MeshComparison,
+    TrueCells,
+    TruthComparison,
+    compare_with_mesh,
+    compare_with_truth,
+    median_radius,
+)
+from splatctrl_cli.evaluate.held_out_depth import HeldOutComparison, compare_with_held_out_depth, counted_pixels
+from splatctrl_cli.field.clustered_splats import Spheres
+from splatctrl_cli.field.grid_field import exact_channel
+from splatctrl_cli.field.probability import probabilities
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.records import DistanceGrid, Float64, JointState, RecordSource, RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.truth import load_truth
+
+POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
+
+
+@dataclass(frozen=True, kw_only=True)
+class Accuracy:
+    """How far a field is from what it was compared with; None for what nobody asked for."""
+
+    truth: TruthComparison | None = None
+    reference_mesh: MeshComparison | None = None
+    held_out_depth: HeldOutComparison | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as written to ``field.json``."""
+        return {name: compared.as_dict() for name, compared in vars(self).items() if compared is not None}
+
+
+def accuracy_of(grid: DistanceGrid, spheres: Spheres, source: BakeSource, request: BakeRequest) -> Accuracy:
+    """The field of `spheres` beside all that the request names. Raises NotEvaluableError where nothing is near."""
+    mesh, held_out = request.reference_mesh, request.held_out
+    return Accuracy(
+        truth=None if request.truth is None else _beside_truth(grid, spheres, source, request),
+        reference_mesh=None if mesh is None else compare_with_mesh(grid, mesh, seed=request.seed),
+        held_out_depth=None if held_out is None else _beside_held_out(grid, source, held_out, request),
+    )
+
+
+def check_references(request: BakeRequest, source: BakeSource) -> None:
+    """Raise for what cannot be compared with, before a bake that may take long."""
+    for path in (request.truth, request.seen_by, request.reference_mesh):
+        if path is not None and not path.exists():
+            raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    if request.held_out is not None:
+        _held_out_cameras(open_source(request.held_out), request, source.cameras)
+
+
+def _beside_truth(grid: DistanceGrid, spheres: Spheres, source: BakeSource, request: BakeRequest) -> TruthComparison:
+    """The comparison at drawn cells; the robot is in neither the field nor the truth."""
+    assert request.truth is not None and request.seen_by is not None
+    truth = load_truth(request.truth)
+    stamp_ns = int(truth.stamps[-1]) if source.stamp_ns is None else source.stamp_ns
+    shape = grid.channels["sdf"].shape
+    num_cells = int(np.prod(shape))
+    count = min(num_cells, COMPARED_CELLS)
+    drawn = np.sort(np.random.default_rng(request.seed).choice(num_cells, count, replace=False))
+    points = grid.origin + grid.voxel * np.stack(np.unravel_index(drawn, shape), axis=1)
+    chunks = np.array_split(points, -(-len(points) // POINTS_PER_CHUNK))
+    distances, surfaces = zip(*(truth.closest(chunk, stamp_ns) for chunk in chunks), strict=True)
+    forms = probabilities(spheres, request.config.field, threads=request.threads)
+    return compare_with_truth(
+        TrueCells(
+            points=points,
+            fields=_fields(grid, drawn),
+            distance=np.concatenate(distances),
+            surface=np.concatenate(surfaces),
+        ),
+        _frames(request.seen_by, source.cameras, stamp_ns),
+        name=str(request.truth),
+        workspace=source.workspace,
+        median_radius=median_radius(grid),
+        probabilities={name: form.at for name, form in forms.items()},
+    )
+
+
+def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
+    """What the grid holds at drawn cells, whole channels of which may not fit the memory: hard, sdf."""
+    channels: dict[str, NDArray[np.generic]] = {
+        name: grid.channels[name].reshape(-1)[drawn].astype(np.float32)
+        for name in ("sdf", "hard", "bound")
+        if name in grid.channels
+    }
+    exact = exact_channel(DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header=grid.header))
+    return {"hard": exact.astype(np.float64), "sdf": channels["sdf"].astype(np.float64)}
+
+
+def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator[RgbdFrame]:
+    """Frames of the scene's training cameras (of every camera for a bare splat set), up to its stamp."""
+    for record in open_source(log).records():
+        if record.stamp_ns > until_ns:
+            return
+        if isinstance(record, RgbdFrame) and (cameras is None or record.camera in cameras):
+            yield record
+
+
+def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request: BakeRequest) -> HeldOutComparison:
+    """The field beside the newest depth, not later than the scene's stamp, of each camera that was held out.
+
+    Pixels do not count that show what is outside the box of the scene, or, where a URDF says where it is, the robot:
+    neither is in the field.
+    """
+    recording = open_source(log)
+    cameras = _held_out_cameras(recording, request, source.cameras)
+    newest: dict[str, tuple[RgbdFrame, JointState | None]] = {}
+    state: JointState | None = None
+    for record in recording.records():
+        if source.stamp_ns is not None and record.stamp_ns > source.stamp_ns:
+            break
+        if isinstance(record, JointState):
+            state = record
+        elif record.camera in cameras:
+            newest[record.camera] = record, state
+    if not newest:
+        raise NotEvaluableError(f"{log}: no frame of {', '.join(cameras)} up to the time of the scene")
+    robot = None
+    if request.urdf is not None:
+        robot = RobotModel.from_urdf(request.urdf, request.spheres).moved_by(recording.joint_names)
+    counted = []
+    for frame, at in newest.values():
+        spheres = None
+        if robot is not None and at is not None:
+            centers = robot.sphere_centers(robot.positions_of(recording.joint_names, at.position))
+            spheres = centers, robot.sphere_set.radii
+        counted.append(counted_pixels(frame, source.workspace, spheres))
+    frames = [frame for frame, _ in newest.values()]
+    return compare_with_held_out_depth(grid, frames, seed=request.seed, counted=counted)
+
+
+def _held_out_cameras(
+    recording: RecordSource, request: BakeRequest, trained: Sequence[str] | None
+) -> tuple[str, ...]:
+    """Those named, or every one that did not train the scene (as far as that is known).
+
+    Raises UsageError for a camera that trained or is not there, or where none is left.
+    """
+    log, names, known = request.held_out, request.held_out_cameras, recording.cameras
+    wrong = [name for name in names if name not in known]
+    if wrong:
+        raise UsageError(f"--held-out: {log} has no camera {wrong[0]}", remedy=f"it has: {', '.join(known)}")
+    also = [name for name in names if trained is not None and name in trained]
+    if also:
+        raise UsageError(f"--held-out: camera {also[0]} trained the scene", remedy="name one that did not")
+    chosen = names or tuple(name for name in known if trained is None or name not in trained)
+    if not chosen:
+        raise UsageError(f"--held-out: every camera of {log} trained the scene", remedy="give another log")
+    return chosen

@@ -1,0 +1,251 @@
+"""What a bake is asked for, and what it reads: the scene, and for an update the field baked before."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder, Snapshot, open_scene
+from splatctrl_cli.formats.splat.splats import read_spheres
+from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, chosen
+from splatctrl_cli.jobs.running.progress import Progress
+
+from splatctrl_cli import __version__
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.config.fixed import CARD_LEAST_BAKE, CARD_SPLATS
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.field.distance import KERNEL_OF
+from splatctrl_cli.field.grid_cells import GridLayout, bounding_box, check_room
+from splatctrl_cli.field.obstacles import DEFAULT_LABELS, field_splats
+from splatctrl_cli.files.output import Parts, sha256
+from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.voxels import Balls, OccupancyGrid
+
+NOT_COMPARED = ("voxel", "padding", "max_loss")  # voxel is compared with the grid's; the others change no cell
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeRequest(RunOptions):
+    """One bake of `scene`, a folder that reconstruct wrote or a file of splats, into the folder `out`.
+
+    at: the scene as known that long after its start [s], None for its end. labels: of the splats in the field. The
+    grid covers `box`, or the reach of the robot of `urdf` and `spheres`, or the splats. channels: beside sdf, None
+    for the usual ones, or those of `update`; with_probability adds that one. The field is compared with `truth` where
+    the cameras of `seen_by` looked, with `reference_mesh`, and with the depth in the log `held_out` of the cameras
+    `held_out_cameras`, none for all that did not train. update: a field baked from `previous_scene` (None: `scene`),
+    of which only what changed is baked anew. resume: go on with what an interrupted bake left. require: gates.
+    device: where to compute, as of --device.
+    """
+
+    scene: Path
+    out: Path
+    at: float | None = None
+    labels: frozenset[Label] = DEFAULT_LABELS
+    box: Box | None = None
+    urdf: Path | None = None
+    spheres: Path | None = None
+    channels: tuple[str, ...] | None = None
+    with_probability: bool = False
+    formats: tuple[str, ...] = ("npz", "vti")
+    truth: Path | None = None
+    seen_by: Path | None = None
+    reference_mesh: Path | None = None
+    held_out: Path | None = None
+    held_out_cameras: tuple[str, ...] = ()
+    no_report: bool = False
+    update: Path | None = None
+    previous_scene: Path | None = None
+    resume: bool = False
+    require: tuple[str, ...] = ()
+    seed: int = 0
+
+    @property
+    def label_names(self) -> list[str]:
+        """As a field's header has them."""
+        return sorted(label.name.lower() for label in self.labels)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeSource:
+    """Splats, and the occupancy of the same moment where there is one.
+
+    unrepresented: the occupied voxels without a splat; stamp_ns: when the splats were so; workspace: the box outside
+    which the scene keeps no splats; cameras: those that made it; made_from: the scene's.
+    Each None (empty) where it is not known (a bare splat file).
+    """
+
+    splats: SplatSet
+    digests: dict[str, str]
+    occupancy: OccupancyGrid | None = None
+    unrepresented: Balls | None = None
+    stamp_ns: int | None = None
+    workspace: Box | None = None
+    cameras: tuple[str, ...] | None = None
+    made_from: Mapping[str, Any] = field(default_factory=dict)
+
+
+def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
+    """The splats at `path`, as known `at_seconds` after the scene's first snapshot (None: at its end).
+
+    Raises InputError for what is not there or not a scene, UsageError for a time in a bare file, NotEvaluableError
+    for a time before the first snapshot.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder", remedy="give what reconstruct wrote, or a splats.ply")
+    if path.is_dir():
+        return _read_folder(path, at_seconds)
+    if at_seconds is not None:
+        raise UsageError(f"--at {at_seconds:g}: {path} is one splat set", remedy="give the scene's folder")
+    return BakeSource(splats=read_spheres(path), digests={path.name: sha256(path)})
+
+
+def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
+    scene = open_scene(path)
+    final = scene.occupancy()
+    then: SceneFolder | Snapshot = scene
+    wanted_ns, files = None, [path / "splats.ply", path / "occupancy.npz"]
+    if at_seconds is not None:
+        if not scene.snapshots:
+            raise NotEvaluableError(f"{path}: has no snapshots", remedy="bake without --at")
+        wanted_ns = scene.snapshots[0].stamp_ns + round(at_seconds * 1e9)
+        then = scene.snapshot_at(wanted_ns)
+        files = [then.path, then.occupancy_path]
+    occupancy = final if wanted_ns is None else then.occupancy()
+    return BakeSource(
+        splats=then.splats(),
+        occupancy=occupancy,
+        unrepresented=scene.unrepresented_at(wanted_ns),
+        stamp_ns=then.stamp_ns,
+        workspace=_workspace(final),
+        cameras=scene.cameras,
+        made_from=scene.made_from,
+        digests={file.name: sha256(file) for file in (files if occupancy is not None else files[:1])},
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Previous:
+    """A baked field, the configuration it was baked with (`run`: the folder's run.json), and its splats' source."""
+
+    path: Path
+    grid: DistanceGrid
+    run: dict[str, Any]
+    source: BakeSource
+    digests: dict[str, str]
+
+    @property
+    def box(self) -> Box:
+        """The box of the cell centres: a grid over it, with the same voxel, has the same cells."""
+        x, y, z = self.grid.channels["sdf"].shape
+        return GridLayout(origin=self.grid.origin, voxel=self.grid.voxel, shape=(x, y, z)).box
+
+
+def read_previous(path: Path, scene: Path) -> Previous:
+    """The field in folder `path`, with the splats of `scene` that it was baked from.
+
+    Raises InputError for a field that is not there, damaged or foreign, UsageError where the scene is not its own or
+    another version baked it.
+    """
+    if not path.is_dir():
+        raise InputError(f"--update {path}: no such folder", remedy="give a folder that sdf-bake wrote")
+    file = path / "field.npz"
+    if file.is_file():
+        check_room(f"--update: {file}", file.stat().st_size, "bake without --update, which needs less")
+    run = _run_of(path)
+    grid = read_npz(Parts.of_run(path, run).checked(file))
+    is_ours = run.get("command") == "sdf-bake" and run.get("splatctrl") == __version__
+    if not is_ours or "unrepresented_voxels" not in grid.header:
+        raise UsageError(
+            f"--update {path}: expected a field that sdf-bake of splatctrl {__version__} wrote, got one of "
+            f"{run.get('command')} of {run.get('splatctrl')}",
+            remedy="bake it once without --update",
+        )
+    source = source_of_grid(f"--update {path}", grid, scene)
+    return Previous(path=path, grid=grid, run=run, source=source, digests={str(file): sha256(file)})
+
+
+def check_same(
+    previous: Previous, layout: GridLayout, config: FieldConfig, channels: tuple[str, ...], labels: list[str]
+) -> None:
+    """Raise UsageError naming what differs between the bake before and this one."""
+    grid = previous.grid
+    used = previous.run.get("config", {}).get("field", {})
+    settings = {name: value for name, value in vars(config).items() if name not in NOT_COMPARED}
+    then_and_now: dict[str, tuple[object, object]] = {
+        "field.voxel": (grid.voxel, layout.voxel),
+        "cells": (" x ".join(map(str, grid.channels["sdf"].shape)), " x ".join(map(str, layout.shape))),
+        "first cell": (grid.origin.tolist(), layout.origin.tolist()),
+        "channels": (",".join(sorted(grid.channels)), ",".join(sorted(channels))),
+        "labels": (grid.header.get("labels"), labels),
+        **{f"field.{name}": (used.get(name), value) for name, value in settings.items()},
+    }
+    differing = [f"{name} was {then}, is {now}" for name, (then, now) in then_and_now.items() if then != now]
+    if differing:
+        more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+        raise UsageError(
+            f"--update {previous.path}: that field was baked with other settings: {', '.join(differing[:3])}{more}",
+            remedy="give the same settings, or bake without --update",
+        )
+
+
+def _run_of(folder: Path) -> dict[str, Any]:
+    try:
+        run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        run = None
+    if not isinstance(run, dict):
+        raise InputError(f"--update {folder}: has no readable run.json", remedy="bake it once without --update")
+    return run
+
+
+def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
+    """The splats of `scene` at the grid's time. Raises UsageError, beginning with `where`, where they are not those
+    that it was baked from.
+    """
+    digests, stamp_ns = grid.header.get("digests"), grid.header.get("stamp_ns")
+    wanted = next(iter(digests.values()), None) if isinstance(digests, dict) else None
+    source = read_bake_source(scene, None)
+    if next(iter(source.digests.values())) != wanted and scene.is_dir() and isinstance(stamp_ns, int):
+        snapshots = open_scene(scene).snapshots
+        if snapshots and stamp_ns >= snapshots[0].stamp_ns:
+            source = read_bake_source(scene, (stamp_ns - snapshots[0].stamp_ns) * 1e-9)
+    if next(iter(source.digests.values())) != wanted:
+        option = "--previous-scene" if where.startswith("--update") else "--scene"
+        raise UsageError(
+            f"{where}: was not baked from the splats of {scene}",
+            remedy=f"give the scene that it was baked from as {option}",
+        )
+    return source
+
+
+def _workspace(occupancy: OccupancyGrid) -> Box:
+    """The box of the occupancy grid, less a voxel at every border (a surface there may have splats beyond it)."""
+    num_voxels = np.array(occupancy.log_odds.shape)
+    lower = occupancy.origin + 0.5 * occupancy.voxel
+    return Box(lower=lower, upper=lower + occupancy.voxel * (num_voxels - 2))
+
+
+def covered(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:
+    """What the grid covers: the box, the reach of the robot, the field before, or the splats and a margin."""
+    if request.box is not None:
+        return request.box
+    if request.urdf is not None:
+        return RobotModel.from_urdf(request.urdf, request.spheres).reach_box
+    if previous is not None:
+        return previous.box
+    return bounding_box(field_splats(source.splats, request.labels), request.config.field.padding)
+
+
+def device_for(request: BakeRequest, layout: GridLayout, num_splats: int, progress: Progress) -> Device:
+    """Where to bake; an update always on the processor. Raises UsageError for a card that cannot be used."""
+    if request.update is not None:
+        if request.device.startswith(CUDA):
+            raise UsageError(f"--device {request.device}: --update bakes on the processor", remedy=TO_CPU)
+        return Device()
+    is_matern = KERNEL_OF[request.config.field.distance] == "gpdf"
+    is_enough = layout.num_cells * (num_splats if is_matern else CARD_SPLATS) >= CARD_LEAST_BAKE
+    return chosen(request.device, is_enough, progress)

@@ -1,0 +1,275 @@
+"""A batch from its request to its verdict: read the suite, run its graph, write batch.json."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.jobs.batch.graph import COMMANDS, CommandLine, Node, nodes_of, of_shard
+from splatctrl_cli.jobs.batch.ledger import Ledger, Run, keys_of
+from splatctrl_cli.jobs.batch.run import (
+    DONE,
+    ERROR,
+    FAILED,
+    SKIPPED,
+    TO_DO,
+    UNRUN,
+    Scheduler,
+    local_executor,
+    not_run,
+    told,
+    verdict_in,
+)
+from splatctrl_cli.jobs.batch.suite import Suite as Asked
+from splatctrl_cli.jobs.batch.suite import read_suite
+from splatctrl_cli.jobs.batch.task import last_lines
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+
+from splatctrl_cli import __version__
+from splatctrl_cli.errors import DAMAGED, InputError, UsageError
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, damage_mark, verdict_of
+from splatctrl_cli.files.output import MARKERS, write_durably, write_json
+from splatctrl_cli.libraries import distributed
+from splatctrl_cli.report.suites import Case, Kind, Suite, cases_of, damage_case, error_case, skipped_case
+
+CONNECT_S = 10.0  # to a scheduler
+FORMAT, VERSION = "splatctrl-batch", 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchRequest:
+    """Run a suite's file. out: its folder (default: what the suite says); workers: processes at once; shard: (i, n),
+    every n-th recording from the i-th on; dask: the address of a Dask scheduler that runs the nodes instead; again:
+    also what is done.
+    """
+
+    suite: Path
+    out: Path | None = None
+    workers: int = 1
+    shard: tuple[int, int] = (1, 1)
+    dask: str | None = None
+    again: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchResult:
+    """The run of every node, in the order of the graph; num_kept of them stood from before. jobs: the suite's."""
+
+    out: Path
+    suite: str
+    jobs: Sequence[str]
+    runs: Sequence[Run]
+    num_kept: int
+    verdict: Verdict
+
+
+def batch(request: BatchRequest, command_line: CommandLine, progress: Progress = SILENT) -> BatchResult:
+    """Run what is not done. Raises UsageError for a suite that makes no graph, InputError for files that lack."""
+    suite, every, out = planned(request, command_line)
+    nodes = of_shard(every, request.shard)
+    with (
+        Ledger(out) as ledger,
+        scheduling(
+            ledger, command_line.entry, progress, workers=request.workers, dask=request.dask, again=request.again
+        ) as scheduler,
+    ):
+        progress.log(f"batch: {counted(len(nodes), 'node')} into {out}")
+        try:
+            runs = list(scheduler.run(nodes).values())
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("interrupted; run the same again to go on") from None
+        finally:
+            if scheduler.keys:  # it knows what each node is to be
+                write_batch(out, suite, every, ledger.latest(), scheduler.keys)
+    return BatchResult(
+        out=out,
+        suite=suite.name,
+        jobs=[job.name for job in suite.jobs],
+        runs=runs,
+        num_kept=scheduler.num_kept,
+        verdict=verdict_of_runs(runs),
+    )
+
+
+def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, list[Node], Path]:
+    """The suite, its nodes of every shard after those they need, and where they write. Raises UsageError for a shard
+    without a recording.
+    """
+    suite = read_suite(request.suite, COMMANDS)
+    out = (request.out or suite.out).absolute()
+    nodes = nodes_of(suite, out, command_line)
+    if not of_shard(nodes, request.shard):
+        index, count = request.shard
+        raise UsageError(
+            f"--shard {index}/{count}: has none of the {len(suite.recordings)} recordings", remedy="give fewer shards"
+        )
+    return suite, nodes, out
+
+
+def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node, str]]:
+    """Every node and whether it would run; nothing is written but a ledger's digests."""
+    _, every, out = planned(request, command_line)
+    nodes = of_shard(every, request.shard)
+    with Ledger(out) as ledger:
+        keys, latest = keys_of(nodes, ledger, command_line.entry), ledger.latest()
+    is_kept = {
+        node.name: not request.again
+        and (run := latest.get(node.name)) is not None
+        and run.key == keys[node.name]
+        and run.state in {DONE, "failed"}
+        for node in nodes
+    }
+    return [(node, "done" if is_kept[node.name] else "to do") for node in nodes]
+
+
+def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
+    """A reason for each node: passed where it ended as expected."""
+    num = len({run.recording for run in runs})
+    damaged = dict.fromkeys(run.recording for run in runs if _is_damaged(run))
+    return verdict_of(
+        "batch",
+        [_reason(run) for run in runs],
+        scope=f"{counted(len(runs), 'node')} of {counted(num, 'recording')}",
+        passed="as expected",
+        notes=[f"damaged: {', '.join(damaged)}"] if damaged else [],
+        is_damaged=bool(damaged),
+    )
+
+
+def _is_damaged(run: Run) -> bool:
+    """Whether damage is to be said of a run: it ended as expected, and damage was not what was expected."""
+    return run.state == DONE and run.expect != f"exit {DAMAGED}" and bool(damage_mark(run.sentence, run.exit_code))
+
+
+def _reason(run: Run) -> Reason:
+    lacks = run.state == SKIPPED or (run.state != ERROR and run.outcome == Outcome.NOT_EVALUABLE)
+    outcome = Outcome.PASSED if run.state == DONE else Outcome.NOT_EVALUABLE if lacks else Outcome.FAILED
+    return Reason(
+        criterion=run.node,
+        outcome=outcome,
+        sentence=told(run) + (f": {run.sentence}" if run.sentence and run.state != DONE else ""),
+        label="error" if run.state == ERROR else "not as expected",
+        remedy="" if run.state in (DONE, SKIPPED) else f"see {run.log}",
+        count=1,
+    )
+
+
+def suites_of(result: BatchResult) -> list[Suite]:
+    """What CI systems are told: a suite for each recording, with the cases of its nodes."""
+    suites = list[Suite]()
+    for recording in dict.fromkeys(run.recording for run in result.runs):
+        runs = [run for run in result.runs if run.recording == recording]
+        began = datetime.fromtimestamp(min(run.started for run in runs), UTC).isoformat(timespec="seconds")
+        cases = [
+            replace(case, seconds=0.0 if number else run.seconds)  # the first case of a node has its time
+            for run in runs
+            for number, case in enumerate(_cases_of(run, result.out))
+        ]
+        properties = {} if suites else {"splatctrl": __version__, "batch": result.suite}  # once: readers join suites
+        seconds = sum(run.seconds for run in runs)
+        suites.append(Suite(name=recording, cases=cases, properties=properties, started=began, seconds=seconds))
+    return suites
+
+
+def _cases_of(run: Run, out: Path) -> list[Case]:
+    if run.state == SKIPPED:
+        return [skipped_case(run.node, run.cause)]
+    if run.state == ERROR:
+        said = run.cause or run.sentence or run.label
+        return [error_case(run.node, said, exit_code=run.exit_code, lines=last_lines(out / run.log))]
+    verdict = verdict_in(out / run.result)
+    if run.state == FAILED:
+        wrong = Case(name="expected", group=run.node, kind=Kind.FAILED, sentence=told(run), text=str(_reason(run)))
+        return [wrong, *(cases_of(verdict, run.node) if verdict and run.outcome != Outcome.PASSED else [])]
+    if verdict:
+        return cases_of({**verdict, "is_damaged": _is_damaged(run)}, run.node, expected=run.outcome)
+    passed = Case(name=run.command, group=run.node, kind=Kind.PASSED, text="" if run.outcome else told(run))
+    return [passed, *([damage_case(run.node)] if _is_damaged(run) else [])]
+
+
+def write_batch(
+    out: Path, suite: Asked, nodes: Sequence[Node], latest: Mapping[str, Run], keys: Mapping[str, str]
+) -> None:
+    """batch.json: the state of every node that has a key, and the last of each other (of another shard) that has run.
+
+    A node that was not come to is to do.
+    """
+    found = list[Run]()
+    for node in nodes:
+        run = latest.get(node.name)
+        if node.name in keys and (run is None or run.key != keys[node.name]):
+            run = not_run(node, "", out, state=TO_DO, cause=UNRUN)
+        found += [] if run is None else [run]
+    document = {
+        "format": FORMAT,
+        "version": VERSION,
+        "suite": suite.name,
+        "jobs": [job.name for job in suite.jobs],
+        "nodes": [node_document(run) for run in found],
+    }
+    write_durably(out / "batch.json", lambda path: write_json(path, document))
+
+
+def node_document(run: Run) -> dict[str, Any]:
+    """A run as JSON has it."""
+    plain: dict[str, Any] = asdict(run)
+    for name in ("variant", "words", "needs"):
+        plain[name] = json.loads(plain[name])
+    return {"id": plain.pop("node"), **plain, "outcome": run.outcome or None}
+
+
+def check_same_asked(out: Path, name: str, asked: Mapping[str, Any], *, what: str) -> None:
+    """Raise UsageError where a folder is of a sweep or study (`what`) that was asked for something else, or of
+    something else altogether; its file `name` has what it was asked for. InputError where that cannot be read.
+    """
+    file = out / name
+    if not file.is_file():
+        if any((out / other).exists() for other in (*MARKERS, "batch.json")):
+            raise UsageError(f"{out}: is no {what}, but something else", remedy="give another --out")
+        return
+    try:
+        before = json.loads(file.read_text(encoding="utf-8"))["asked"]
+        differs = [key for key in asked if before.get(key) != asked[key]]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{file}: is not what a {what} writes", remedy="give another --out") from None
+    if differs:
+        raise UsageError(
+            f"{out}: was begun with other settings: {', '.join(differs)}", remedy="give them again, or another --out"
+        )
+
+
+@contextmanager
+def scheduling(
+    ledger: Ledger, entry: str, progress: Progress, *, workers: int, dask: str | None, again: bool = False
+) -> Iterator[Scheduler]:
+    """What runs nodes: processes of this machine, or a Dask cluster. Raises UsageError where none answers."""
+    with _executor(workers, dask) as (executor, slots, hint):
+        yield Scheduler(
+            ledger=ledger, entry=entry, executor=executor, slots=slots, progress=progress, again=again, hint=hint
+        )
+
+
+@contextmanager
+def _executor(workers: int, dask: str | None) -> Iterator[tuple[Executor, int, Callable[[], str]]]:
+    """What runs nodes, how many at once, and why a wait may be in vain."""
+    if dask is None:
+        with local_executor(workers) as executor:
+            yield executor, workers, lambda: ""
+        return
+    try:
+        client = distributed.Client(dask, timeout=CONNECT_S)
+    except ImportError:
+        raise UsageError("--dask: dask is not installed", remedy="pip install 'splatctrl[dask]'") from None
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--dask {dask}: no scheduler answers: {error}", remedy="check the address") from None
+    with client:
+        slots = max(sum(client.nthreads().values()), 1)
+        yield (
+            client.get_executor(pure=False, retries=2),
+            2 * slots,
+            lambda: "" if client.nthreads() else ": the cluster has no worker",
+        )

@@ -1,0 +1,302 @@
+"""The graph of a suite: a node for each recording, job and variant, with the words that run it."""
+
+import itertools
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+from typing import Any, Protocol
+
+from splatctrl_cli.jobs.batch.suite import Job, Limits, Recording, Suite, Table, jobs_for
+
+from splatctrl_cli.errors import UsageError
+
+RECORDING, NAME = "recording", "name"  # what {…} in an option may stand for, beside the jobs
+ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name
+WITHOUT_OUTPUT = ("check", "info")
+CAPTURE, SCENE = "ingest", "reconstruct"
+ROLES: Mapping[str, Mapping[str, str]] = {  # what an option is where the suite does not say: of a command's only job
+    "simulate": {},
+    "ingest": {"source": RECORDING},
+    "check": {"source": RECORDING},
+    "info": {"path": RECORDING},
+    "reconstruct": {"source": CAPTURE},
+    "export": {"scene": SCENE},
+    "sdf-bake": {"scene": SCENE},
+    "score": {"scene": SCENE, "reference": CAPTURE},
+    "replay": {"log": CAPTURE, "scene": SCENE},
+}
+COMMANDS = tuple(ROLES)
+TABLES = ("set", "perturb")  # options of which a matrix varies one entry: set.SECTION.KEY, perturb.NAME
+_PLACE = re.compile(r"\{([\w.+-]+)\}")
+_LONGEST = 120  # characters of a node's name
+
+Variant = Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parsed:
+    """Words of the command line that say what options say, and the files among them that are read."""
+
+    words: tuple[str, ...]
+    inputs: tuple[Path, ...]
+
+
+class CommandLine(Protocol):
+    """What a batch knows of the command line that runs its nodes; `entry` is MODULE:FUNCTION, words to exit code."""
+
+    entry: str
+
+    def parsed(self, command: str, options: Table, folder: Path) -> Parsed:
+        """Words for options, paths of which count from `folder`. Raises UsageError for what is not an option."""
+        ...
+
+    def options_of(self, words: Sequence[str]) -> dict[str, Any]:
+        """The options that a command's words say, as `parsed` takes them, but those that a batch gives itself."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Node:
+    """One command on one recording. name: RECORDING/JOB; variant: by JOB.OPTION what a matrix chose here or before.
+
+    words: its command line; inputs: the files in it that decide what comes out; needs: names of nodes before it; out:
+    what it writes, None for a command that only prints.
+    """
+
+    name: str
+    recording: str
+    job: str
+    command: str
+    words: tuple[str, ...]
+    variant: Variant = field(default_factory=dict)
+    inputs: tuple[Path, ...] = ()
+    needs: tuple[str, ...] = ()
+    out: Path | None = None
+    expect: str = "passed"
+    limits: Limits = field(default_factory=Limits)
+
+
+def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
+    """Every node, by recording in the order of the suite's jobs as far as each comes after those it needs.
+
+    Raises UsageError for jobs that need each other, placeholders without a job, and options that a command lacks.
+    """
+    nodes: list[Node] = []
+    for recording in sorted(suite.recordings, key=lambda each: each.name):
+        jobs = jobs_for(recording, suite.jobs, COMMANDS)
+        kept = {job.name: _with_roles(job, jobs, recording) for job in jobs}
+        nodes += _nodes_of(recording, _in_order(kept, recording), suite.folder, out, command_line)
+    return nodes
+
+
+def of_shard(nodes: Sequence[Node], shard: tuple[int, int]) -> list[Node]:
+    """Those of every n-th recording from the i-th on."""
+    index, count = shard
+    chosen = set(list(dict.fromkeys(node.recording for node in nodes))[index - 1 :: count])
+    return [node for node in nodes if node.recording in chosen]
+
+
+def columns_of(columns: Iterable[tuple[str, str]], jobs: Sequence[str]) -> list[str]:
+    """Of a table of nodes, from the job and the name of each: once each, by job, then as they come."""
+    job_of = {name: job for job, name in columns}
+    return sorted(job_of, key=lambda name: jobs.index(job_of[name]) if job_of[name] in jobs else len(jobs))
+
+
+def _with_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
+    """With the options that follow from the other jobs, where the suite does not give them."""
+    given = {*job.options, *job.matrix}
+    given |= {"field", "lockstep"} & given and {"scene"}  # either stands for its scene
+    roles = {option: role for option, role in ROLES[job.command].items() if option not in given}
+    if job.command in {"reconstruct", "score"} and "dtu" in given:
+        roles = {option: role for option, role in roles.items() if option == "scene"}
+    filled = {option: _filled(job, role, jobs, recording) for option, role in roles.items()}
+    return replace(job, options={**filled, **job.options})
+
+
+def _filled(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> str:
+    where = f"[jobs.{job.name}] of {recording.name}"
+    makers = [other.name for other in jobs if other.command == role and other.name != job.name]
+    if len(makers) > 1:
+        example = " or ".join(f"'{{{name}}}'" for name in makers)
+        raise UsageError(f"{where}: {len(makers)} jobs of {role} come before it", remedy=f"say {example}")
+    if not makers and role == SCENE:
+        raise UsageError(f"{where}: expected a job of {SCENE} before it", remedy="or give scene = PATH")
+    return f"{{{makers[0] if makers else RECORDING}}}"
+
+
+def _in_order(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, tuple[str, ...]]]:
+    """Jobs with the names of those that they need, which come first."""
+    needs = {name: _needs(job, jobs, recording) for name, job in jobs.items()}
+    try:
+        TopologicalSorter(needs).prepare()
+    except CycleError as error:
+        raise UsageError(f"[jobs]: {' needs '.join(error.args[1][::-1])}", remedy="break the circle") from None
+    ordered: dict[str, None] = {}
+
+    def add(name: str) -> None:
+        for need in needs[name]:
+            add(need)
+        ordered.setdefault(name)
+
+    for name in jobs:
+        add(name)
+    return [(jobs[name], needs[name]) for name in ordered]
+
+
+def _needs(job: Job, jobs: Mapping[str, Job], recording: Recording) -> tuple[str, ...]:
+    found = dict.fromkeys(place for text in _texts((job.options, job.matrix)) for place in _PLACE.findall(text))
+    for place in found:
+        if place not in {RECORDING, NAME, *jobs}:
+            known = ", ".join((RECORDING, NAME, *jobs))
+            where = f"[jobs.{job.name}] of {recording.name}"
+            raise UsageError(f"{where}: {{{place}}} is no job", remedy=f"known here: {known}")
+    return tuple(place for place in found if place in jobs)
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        for each in value.values():
+            yield from _texts(each)
+    elif isinstance(value, list | tuple):
+        for each in value:
+            yield from _texts(each)
+
+
+def _nodes_of(
+    recording: Recording,
+    jobs: Sequence[tuple[Job, tuple[str, ...]]],
+    folder: Path,
+    out: Path,
+    command_line: CommandLine,
+) -> list[Node]:
+    made: dict[str, list[Node]] = {}
+    for job, needs in jobs:
+        made[job.name] = []
+        for before in itertools.product(*(made[name] for name in needs)):
+            inherited = _joined([node.variant for node in before])
+            if inherited is None:
+                continue
+            for picked in itertools.product(*job.matrix.values()):
+                chosen = dict(zip(job.matrix, picked, strict=True))
+                variant = {**inherited, **{f"{job.name}.{option}": value for option, value in chosen.items()}}
+                node = _node(recording, job, variant, _suffix(variant, (each for each, _ in jobs)), before, out)
+                values: dict[str, Any] = {each.job: str(each.out) for each in before}
+                values |= {RECORDING: [str(path) for path in recording.paths], NAME: recording.name}
+                options = _placed(_merged(job.options, chosen), values.__getitem__)
+                options |= {} if node.out is None else {"out": str(node.out), "force": True, "resume": True}
+                try:
+                    parsed = command_line.parsed(job.command, options, folder)
+                except UsageError as error:
+                    where = f"[jobs.{job.name}] of {recording.name}"
+                    raise UsageError(f"{where}: {error.message}", remedy=error.remedy) from None
+                outs = [each.out for each in before if each.out is not None]
+                inputs = (path for path in parsed.inputs if not any(out in (path, *path.parents) for out in outs))
+                made[job.name].append(replace(node, words=parsed.words, inputs=tuple(inputs)))
+    nodes = [node for each in made.values() for node in each]
+    _check_names(nodes)
+    return nodes
+
+
+def _short(values: Sequence[Any]) -> list[str]:
+    """The values of a matrix in names: of paths only what is not the same in all."""
+    parts = [_text(value).strip("/").split("/") for value in values]
+    least = min(map(len, parts)) - 1
+    first = min(_num_alike(parts), least)
+    last = min(_num_alike([each[::-1] for each in parts]), least - first)
+    return ["/".join(each[first : len(each) - last]) for each in parts]
+
+
+def _num_alike(lists: Sequence[Sequence[str]]) -> int:
+    """How many of their first elements all lists share."""
+    return sum(1 for _ in itertools.takewhile(lambda each: len(set(each)) == 1, zip(*lists, strict=False)))
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return ",".join(map(_text, value))
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
+    """What matrices chose, in a name: each option, with its job where two jobs have it."""
+    chosen = {
+        f"{job.name}.{option}": (option.removeprefix("set."), values)
+        for job in jobs
+        for option, values in job.matrix.items()
+        if f"{job.name}.{option}" in variant
+    }
+    count = Counter(option for option, _ in chosen.values())
+    found = ""
+    for key, value in variant.items():
+        option, values = chosen[key]
+        text = next(text for each, text in zip(values, _short(values), strict=True) if each is value)
+        found += f"+{option if count[option] == 1 else key}={text}"
+    return found
+
+
+def _node(recording: Recording, job: Job, variant: Variant, suffix: str, before: Sequence[Node], out: Path) -> Node:
+    place = re.sub(r"[^\w.+=-]", "_", job.name + suffix)[:_LONGEST]
+    ending = ENDINGS.get(job.command, "")
+    return Node(
+        name=f"{recording.name}/{place}",
+        recording=recording.name,
+        job=job.name,
+        command=job.command,
+        words=(),
+        variant=variant,
+        needs=tuple(node.name for node in before),
+        out=None if job.command in WITHOUT_OUTPUT else out / recording.name / f"{place}{ending}",
+        expect=job.expect,
+        limits=job.limits,
+    )
+
+
+def _joined(variants: Sequence[Variant]) -> Variant | None:
+    """All of them as one; None where two chose differently."""
+    joined: dict[str, Any] = {}
+    for variant in variants:
+        if any(joined.setdefault(key, value) != value for key, value in variant.items()):
+            return None
+    return joined
+
+
+def _merged(options: Table, chosen: Variant) -> dict[str, Any]:
+    """Options with what a matrix chose; its key ``set.SECTION.KEY`` adds to the settings, and so of `TABLES`."""
+    merged = dict(options)
+    for key, value in chosen.items():
+        table, dot, entry = key.partition(".")
+        if dot and table in TABLES:
+            before = merged.get(table, {})
+            merged[table] = {**(before if isinstance(before, Mapping) else {}), entry: value}
+        else:
+            merged[key] = value
+    return merged
+
+
+def _placed(value: Any, filled: Callable[[str], Any]) -> Any:
+    """With each {place} filled; a text that is one place alone becomes what stands for it, a list too."""
+    if isinstance(value, str):
+        alone = _PLACE.fullmatch(value)
+        if alone:
+            return filled(alone[1])
+        return _PLACE.sub(lambda match: _one(filled(match[1])), value)
+    if isinstance(value, Mapping):
+        return {key: _placed(each, filled) for key, each in value.items()}
+    return [_placed(each, filled) for each in value] if isinstance(value, list) else value
+
+
+def _one(value: Any) -> str:
+    return value[0] if isinstance(value, list) else str(value)
+
+
+def _check_names(nodes: Sequence[Node]) -> None:
+    by_name: dict[str, Node] = {}
+    for node in nodes:
+        other = by_name.setdefault(node.name.lower(), node)
+        if other is not node:
+            raise UsageError(f"two outputs are called {node.name}", remedy="rename a job, or a value of its matrix")

@@ -1,0 +1,330 @@
+"""What ran in a folder, by node and key, in one SQLite file; who runs what now; digests of inputs; and what a node's
+result depends on, as one key: its words, the content of its inputs, and the code.
+"""
+
+import csv
+import fcntl
+import hashlib
+import json
+import os
+import re
+import socket
+import sqlite3
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import asdict, dataclass, fields
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TextIO
+from uuid import uuid4
+
+from splatctrl_cli.jobs.batch.graph import Node
+
+import splatctrl_cli
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.files.output import PACKAGES, sha256, write_durably
+
+NAME, OWNERS = "ledger.sqlite", ".owners"
+VERSION = 1  # of the tables
+BUSY_S, WAIT_S = 30.0, 0.02  # to wait for another process that writes, and before it is asked again
+_COMPARISON = re.compile(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)")
+WITHOUT_EFFECT = ("--force", "--resume", "--quiet", "-q", "--json")
+THREADS = "--threads"  # changes no byte
+_CODE = {".py", ".so", ".toml", ".json"}
+_MESH = re.compile(r'filename\s*=\s*"([^"]+)"')
+_PATTERN = {"=": "GLOB", "==": "GLOB", "!=": "NOT GLOB"}  # of texts with a *
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """One run of a node, as it ended; `state` is done (as expected), failed (not so), error or skipped."""
+
+    node: str
+    recording: str
+    job: str
+    command: str
+    key: str
+    state: str
+    expect: str
+    outcome: str = ""
+    label: str = ""
+    sentence: str = ""
+    exit_code: int | None = None
+    cause: str = ""
+    started: float = 0.0
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+    variant: str = "{}"
+    words: str = "[]"
+    needs: str = "[]"
+    out: str = ""
+    result: str = ""
+    log: str = ""
+    stamp: str = ""
+    version: str = ""
+    host: str = ""
+
+
+COLUMNS = tuple(column.name for column in fields(Run))
+_NUMBERS = ("exit_code", "started", "seconds", "peak_mb")
+_TABLES = f"""
+CREATE TABLE IF NOT EXISTS runs (id INTEGER PRIMARY KEY, {
+    ", ".join(f"{name} {'REAL' if name in _NUMBERS else 'TEXT'}" for name in COLUMNS)
+});
+CREATE INDEX IF NOT EXISTS runs_by_node ON runs (node, id);
+CREATE TABLE IF NOT EXISTS claims (node TEXT PRIMARY KEY, owner TEXT);
+CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, stamp TEXT, digest TEXT);
+"""
+
+
+class Ledger(AbstractContextManager["Ledger"]):
+    """The ledger of the batches that write into one folder; several processes may have it open."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises InputError for a file that is no ledger, or a newer one."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder, self.path = folder, folder / NAME
+        self._owner = f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
+        self._lock: TextIO | None = None
+        try:
+            self._base = self._opened()
+        except sqlite3.DatabaseError as error:
+            raise InputError(f"{self.path}: is no ledger: {error}", remedy="move it away; outputs stay") from None
+
+    def _opened(self) -> sqlite3.Connection:
+        base = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
+        base.row_factory = sqlite3.Row
+        version = int(base.execute("PRAGMA user_version").fetchone()[0])
+        if version > VERSION:
+            raise InputError(
+                f"{self.path}: is of version {version}, expected {VERSION}", remedy="use a newer splatctrl"
+            )
+        until = time.monotonic() + BUSY_S
+        while base.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
+            try:
+                base.execute("PRAGMA journal_mode = WAL")
+            except sqlite3.OperationalError:  # for which sqlite waits for no other, as it does for all else
+                if time.monotonic() > until:
+                    raise
+                time.sleep(WAIT_S)
+        base.execute("PRAGMA synchronous = NORMAL")
+        base.executescript(_TABLES)
+        base.execute(f"PRAGMA user_version = {VERSION}")
+        return base
+
+    def __exit__(self, *_: object) -> None:
+        """Give up what is claimed."""
+        if self._lock is not None:
+            with suppress(sqlite3.Error):
+                self._base.execute("DELETE FROM claims WHERE owner = ?", (self._owner,))
+            Path(self._lock.name).unlink(missing_ok=True)
+            self._lock.close()
+        self._base.close()
+
+    def claim(self, node: str) -> bool:
+        """Whether this process may run a node: nobody alive does."""
+        with self._transaction():
+            row = self._base.execute("SELECT owner FROM claims WHERE node = ?", (node,)).fetchone()
+            if row is not None and row["owner"] != self._owner and self._is_alive(row["owner"]):
+                return False
+            self._hold()
+            self._base.execute("INSERT OR REPLACE INTO claims VALUES (?, ?)", (node, self._owner))
+        return True
+
+    def record(self, run: Run) -> None:
+        """A run that ended; its node is free again."""
+        places = ", ".join("?" * len(COLUMNS))
+        with self._transaction():
+            self._base.execute(
+                f"INSERT INTO runs ({', '.join(COLUMNS)}) VALUES ({places})", tuple(asdict(run).values())
+            )
+            self._base.execute("DELETE FROM claims WHERE node = ?", (run.node,))
+
+    def release(self, node: str) -> None:
+        """A node that was claimed and need not be run."""
+        self._base.execute("DELETE FROM claims WHERE node = ? AND owner = ?", (node, self._owner))
+
+    def last(self, node: str) -> Run | None:
+        """The last run of a node."""
+        row = self._base.execute("SELECT * FROM runs WHERE node = ? ORDER BY id DESC LIMIT 1", (node,)).fetchone()
+        return None if row is None else _run_of(row)
+
+    def latest(self) -> dict[str, Run]:
+        """The last run of each node."""
+        rows = self._base.execute(
+            "SELECT * FROM runs WHERE id IN (SELECT max(id) FROM runs GROUP BY node) ORDER BY node"
+        )
+        return {row["node"]: _run_of(row) for row in rows}
+
+    def mean_seconds(self) -> dict[str, float]:
+        """Of runs that ended by themselves, by job."""
+        rows = self._base.execute("SELECT job, avg(seconds) AS mean FROM runs WHERE cause = '' GROUP BY job")
+        return {row["job"]: float(row["mean"]) for row in rows}
+
+    def runs(self, conditions: Sequence[str] = (), *, only_last: bool = True) -> Iterator[Run]:
+        """Runs for which conditions hold, such as "job=audit", "node=a/*" or "seconds>10". Raises UsageError for what
+        is none.
+        """
+        clauses, values = ["id IN (SELECT max(id) FROM runs GROUP BY node)"] if only_last else [], []
+        for condition in conditions:
+            match = _COMPARISON.fullmatch(condition.strip())
+            if match is None or match[1] not in COLUMNS:
+                known = ", ".join(COLUMNS)
+                raise UsageError(f"--where {condition}: expected COLUMN=VALUE", remedy=f"columns: {known}")
+            means = _PATTERN.get(match[2], match[2]) if "*" in match[3] else match[2]
+            clauses.append(f"{match[1]} {means} ?")
+            values.append(_value_of(match[1], match[3], condition))
+        where = f" WHERE {' AND '.join(clauses)}" if clauses else ""
+        for row in self._base.execute(f"SELECT * FROM runs{where} ORDER BY id", values):
+            yield _run_of(row)
+
+    def digest(self, path: Path) -> str:
+        """sha256 of a file, or of a folder's names and files; read again only where sizes or times changed."""
+        stamp = _stamp_of(path)
+        key = str(path.resolve())
+        row = self._base.execute("SELECT stamp, digest FROM digests WHERE path = ?", (key,)).fetchone()
+        if row is not None and row["stamp"] == stamp:
+            return str(row["digest"])
+        listing = "\n".join(f"{place.relative_to(path)} {sha256(place)}" for place in _files(path))
+        digest = hashlib.sha256(listing.encode()).hexdigest() if path.is_dir() else sha256(path)
+        self._base.execute("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", (key, stamp, digest))
+        return digest
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self._base.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+        except BaseException:
+            self._base.execute("ROLLBACK")
+            raise
+        self._base.execute("COMMIT")
+
+    def _hold(self) -> None:
+        """A lock on a file of this process, which ends with it."""
+        if self._lock is None:
+            place = self.folder / OWNERS / self._owner
+            place.parent.mkdir(exist_ok=True)
+            self._lock = place.open("w")
+            fcntl.flock(self._lock, fcntl.LOCK_EX)
+
+    def _is_alive(self, owner: str) -> bool:
+        place = self.folder / OWNERS / owner
+        try:
+            with place.open() as stream:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        place.unlink(missing_ok=True)
+        return False
+
+
+def write_csv(path: Path, runs: Iterable[Run]) -> None:
+    """Runs as a table with a header."""
+
+    def write(place: Path) -> None:
+        with place.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(COLUMNS)
+            writer.writerows(asdict(run).values() for run in runs)
+
+    write_durably(path, write)
+
+
+def _run_of(row: sqlite3.Row) -> Run:
+    plain = {name: row[name] for name in COLUMNS}
+    code = plain["exit_code"]
+    return Run(**plain | {"exit_code": None if code is None else int(code)})
+
+
+def _value_of(column: str, text: str, condition: str) -> Any:
+    if column not in _NUMBERS:
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"--where {condition}: {column} is a number, got {text!r}") from None
+
+
+def _stamp_of(path: Path) -> str:
+    found = path.stat()
+    if not path.is_dir():
+        return f"{found.st_size} {found.st_mtime_ns} {found.st_ino}"
+    lines = [f"{place.relative_to(path)} {(s := place.stat()).st_size} {s.st_mtime_ns}" for place in _files(path)]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files below a folder; of a file there are none."""
+    return sorted(place for place in folder.rglob("*") if place.is_file())
+
+
+def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]:
+    """A key for each node, of nodes after those that they need. Raises InputError for an input that is not there."""
+    code, digests = code_version(), dict[Path, str]()
+    keys: dict[str, str] = {}
+    outs = {node.name: str(node.out) for node in nodes}
+    for node in nodes:
+        digests |= {path: _digest(path, ledger) for path in node.inputs if path not in digests}
+        named = {str(path): digests[path] for path in node.inputs}
+        named |= {outs[need]: keys[need] for need in node.needs} | {str(node.out): "out"}
+        inputs = [digests[path] for path in node.inputs] + [keys[need] for need in node.needs]
+        said = [entry, code, node.command, *inputs, *_said(node.words, named)]
+        keys[node.name] = hashlib.sha256(json.dumps(said).encode()).hexdigest()
+    return keys
+
+
+@cache
+def code_version() -> str:
+    """A digest of the package's files, and the versions of the libraries that decide figures."""
+    folder, found = Path(splatctrl_cli.__file__).parent, hashlib.sha256()
+    for place in sorted(place for place in folder.rglob("*") if place.suffix in _CODE):
+        found.update(f"{place.relative_to(folder)}\0".encode() + place.read_bytes())
+    for name in PACKAGES:
+        found.update(f"{name} {metadata.version(name)}\0".encode())
+    return found.hexdigest()
+
+
+def _said(words: Sequence[str], named: Mapping[str, str]) -> Iterator[str]:
+    """Words without those that change no result, paths replaced by what they hold."""
+    longest_first = sorted(named, key=len, reverse=True)
+    skip = False
+    for word in words:
+        if skip or word in WITHOUT_EFFECT:
+            skip = False
+            continue
+        if word.startswith(THREADS):
+            skip = word == THREADS
+            continue
+        said = word
+        for path in longest_first:
+            said = said.replace(path, f"<{named[path]}>")
+        yield said
+
+
+def _digest(path: Path, ledger: Ledger) -> str:
+    """Of an input and what it names: the folder of an image folder's description, the meshes of a URDF."""
+    try:
+        digest = ledger.digest(path.parent if path.suffix == ".toml" and path.parent != Path() else path)
+        if path.suffix != ".urdf":
+            return digest
+        meshes = [place for place in _meshes(path) if place.is_file()]
+        return " ".join([digest, *(ledger.digest(place) for place in meshes)])
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="check the suite's paths") from None
+
+
+def _meshes(urdf: Path) -> Iterator[Path]:
+    """Where the meshes that a URDF names may be: beside it, or below one of the folders above."""
+    for name in dict.fromkeys(_MESH.findall(urdf.read_text(encoding="utf-8", errors="replace"))):
+        if "://" not in name:
+            yield urdf.parent / name
+            continue
+        parts = Path(name.split("://", 1)[1]).parts
+        for folder in urdf.absolute().parents:
+            yield folder.joinpath(*parts)
+            yield folder.joinpath(*parts[1:])

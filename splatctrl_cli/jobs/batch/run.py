@@ -1,0 +1,279 @@
+"""Nodes through processes, in the order of their graph: what is done is kept, what changed is run again."""
+
+import json
+import os
+import signal
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.jobs.batch.graph import Node
+from splatctrl_cli.jobs.batch.ledger import Ledger, Run, keys_of
+from splatctrl_cli.jobs.batch.task import End, Task, last_lines, read_end, run_task, stamp_of, stop_runners
+from splatctrl_cli.jobs.running.progress import Progress, duration
+
+from splatctrl_cli import __version__
+from splatctrl_cli.evaluate.verdict import damage_mark
+
+DONE, FAILED, ERROR, SKIPPED, TO_DO = "done", "failed", "error", "skipped", "to do"
+NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes of a command that came to none
+AGAIN_S = 0.5  # between looks at what another batch runs
+STILL_S = 60.0  # without an end, after which it is said what is waited for
+MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes, when nothing here asked for it
+DISK_FULL = 6
+UNRUN = "has not run since the suite, its inputs or the program changed"
+PRINTED = "printed"  # stands for the stamp of an output that there is none of
+
+
+@dataclass(kw_only=True)
+class Scheduler:
+    """Runs nodes with an executor of `slots` places, and keeps the ledger. hint: why a wait may be in vain."""
+
+    ledger: Ledger
+    entry: str
+    executor: Executor
+    slots: int
+    progress: Progress
+    again: bool = False
+    hint: Callable[[], str] = lambda: ""
+    keys: dict[str, str] = field(default_factory=dict)
+    runs: dict[str, Run] = field(default_factory=dict)
+    num_kept: int = 0
+
+    def run(self, nodes: Sequence[Node]) -> dict[str, Run]:
+        """The run of each node, by its name: the one that stands from before, or a new one."""
+        keys, latest = keys_of(nodes, self.ledger, self.entry), self.ledger.latest()
+        self.keys = keys
+        waiting = {node.name: node for node in nodes}
+        futures: dict[Future[End], Node] = {}
+        tries: Counter[str] = Counter()
+        clock, last = Clock(nodes, self.ledger.mean_seconds(), self.slots), time.monotonic()
+        while waiting or futures:
+            is_busy = False
+            for node in list(waiting.values()):
+                if len(futures) >= self.slots:
+                    break
+                if any(need not in self.runs for need in node.needs):
+                    continue
+                run = self._without_running(node, keys[node.name], latest.get(node.name))
+                if run is not None:
+                    self._settle(waiting.pop(node.name), run, clock)
+                elif self.ledger.claim(node.name):
+                    run = self._without_running(node, keys[node.name], self.ledger.last(node.name))
+                    if run is not None:
+                        self.ledger.release(node.name)
+                        self._settle(waiting.pop(node.name), run, clock)
+                        continue
+                    del waiting[node.name]
+                    Path(self._place(node, ".end")).unlink(missing_ok=True)
+                    futures[self.executor.submit(run_task, self._task(node, keys[node.name]))] = node
+                else:
+                    is_busy = True
+            ended, _ = wait(futures, timeout=AGAIN_S if is_busy else STILL_S, return_when=FIRST_COMPLETED)
+            now = time.monotonic()
+            if not ended and now - last >= STILL_S:
+                self._tell_of([*futures.values()])
+            last = now if ended or now - last >= STILL_S else last
+            if is_busy and not futures:
+                time.sleep(AGAIN_S)
+            latest = self.ledger.latest() if is_busy else latest
+            for future in ended:
+                node, end = futures.pop(future), _end_of(future)
+                tries[node.name] += 1
+                may_pass = end.exit_code == DISK_FULL or end.cause.startswith(MAY_PASS)
+                if tries[node.name] <= node.limits.retries and may_pass:
+                    self.progress.log(f"batch: {node.name}: {end.cause or 'disk full'}, once more")
+                    waiting[node.name] = node
+                    continue
+                run = run_of(node, keys[node.name], end, self.ledger.folder)
+                self.ledger.record(run)
+                self._settle(node, run, clock)
+        return {node.name: self.runs[node.name] for node in nodes}
+
+    def _without_running(self, node: Node, key: str, before: Run | None) -> Run | None:
+        """The run that stands: that of before, one that ended unrecorded, or none, for want of what it needs."""
+        lacking = [need for need in node.needs if not self.runs[need].stamp]
+        if lacking:
+            cause = f"needs {lacking[0]}, which left nothing"
+            run = not_run(node, key, self.ledger.folder, state=SKIPPED, cause=cause)
+            if before is None or (before.state, before.key) != (SKIPPED, key):
+                self.ledger.record(run)
+            return run
+        if self.again:
+            return None
+        is_same = before is not None and before.key == key and before.state in (DONE, FAILED)
+        # neither stamp is there where an error was expected
+        if before is not None and is_same and (node.out is None or before.stamp == stamp_of(node.out)):
+            self.num_kept += 1
+            judged = _judged_again(before, node)
+            if judged != before:
+                self.ledger.record(judged)
+            return judged
+        end = read_end(Path(self._place(node, ".end")), key)
+        if end is None or end.exit_code is None or (before is not None and end.started <= before.started):
+            return None
+        if node.out is not None and end.stamp != stamp_of(node.out):
+            return None
+        run = run_of(node, key, end, self.ledger.folder)
+        self.ledger.record(run)
+        return run if run.state in (DONE, FAILED) else None
+
+    def _settle(self, node: Node, run: Run, clock: "Clock") -> None:
+        self.runs[node.name] = run
+        line = clock.passed(run)
+        if run.started >= clock.started or run.state == SKIPPED:
+            self.progress.log(f"{line} {node.name}: {told(run)}{clock.left()}")
+
+    def _tell_of(self, nodes: Sequence[Node]) -> None:
+        """What is waited for."""
+        names = [node.name for node in nodes] or ["what another batch runs"]
+        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        self.progress.log(f"batch: still waits for {names[0]}{more}{self.hint()}")
+
+    def _task(self, node: Node, key: str) -> Task:
+        return Task(
+            entry=self.entry,
+            words=[*node.words],
+            key=key,
+            out="" if node.out is None else str(node.out.absolute()),
+            result=self._place(node, ".json"),
+            log=self._place(node, ".log"),
+            end=self._place(node, ".end"),
+            timeout=node.limits.timeout,
+            memory=node.limits.memory,
+        )
+
+    def _place(self, node: Node, ending: str) -> str:
+        return str((self.ledger.folder / node.name).absolute()) + ending
+
+
+def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
+    """What a run came to, by how it ended and what it printed."""
+    place = folder / node.name
+    verdict = verdict_in(Path(f"{place}.json")) if end.exit_code is not None else {}
+    code, outcome, label = end.exit_code, verdict.get("outcome", ""), verdict.get("label", "")
+    if not verdict and code is not None:
+        outcome, label = ("passed", "done") if code in (0, 3) else ("", f"exit {code}")
+    last = last_lines(Path(f"{place}.log"), 1)
+    run = Run(
+        node=node.name,
+        recording=node.recording,
+        job=node.job,
+        command=node.command,
+        key=key,
+        state=ERROR,
+        expect=node.expect,
+        outcome=outcome,
+        label=label,
+        sentence=verdict.get("sentence", "") or (last[0].removeprefix("splatctrl: ") if last and code else ""),
+        exit_code=code,
+        cause=end.cause,
+        started=end.started,
+        seconds=round(end.seconds, 3),
+        peak_mb=round(end.peak_mb, 1),
+        variant=json.dumps(dict(node.variant)),
+        words=json.dumps(node.words),
+        needs=json.dumps(node.needs),
+        out="" if node.out is None else os.path.relpath(node.out, folder),
+        result=f"{node.name}.json",
+        log=f"{node.name}.log",
+        stamp=end.stamp if node.out is not None else PRINTED if end.exit_code is not None else "",
+        version=__version__,
+        host=socket.gethostname(),
+    )
+    return _judged_again(run, node)
+
+
+def _judged_again(run: Run, node: Node) -> Run:
+    """With the state that the node's expectation makes of it."""
+    if run.cause:
+        return replace(run, state=ERROR)
+    is_expected = node.expect in {run.label, run.outcome, f"exit {run.exit_code}"}
+    state = DONE if is_expected else ERROR if run.exit_code in NO_VERDICT else FAILED
+    return replace(run, state=state, expect=node.expect)
+
+
+def told(run: Run) -> str:
+    """A run in a few words."""
+    what = run.cause or (run.label.upper() if run.outcome else run.label)
+    what += damage_mark(run.sentence, run.exit_code)
+    if run.state == SKIPPED:
+        return f"skipped: {run.cause}"
+    odd = "" if run.state == DONE else f", expected {run.expect}" if run.state == FAILED else ", an error"
+    return f"{what}{odd} ({run.seconds:.1f} s)"
+
+
+@contextmanager
+def local_executor(workers: int) -> Iterator[Executor]:
+    """Processes on this machine; they end with the block, however it ends, and with this process."""
+    executor = ThreadPoolExecutor(workers, thread_name_prefix="node")
+    before = None
+    if threading.current_thread() is threading.main_thread():
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield executor
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        stop_runners()
+        raise
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+        stop_runners()
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)
+
+
+class Clock:
+    """How many nodes have passed, and about how long the others take, by how long their jobs took."""
+
+    def __init__(self, nodes: Sequence[Node], means: Mapping[str, float], slots: int) -> None:
+        self.started = time.time()
+        self._total, self._slots = len(nodes), slots
+        self._left = Counter(node.job for node in nodes)
+        self._means = dict(means)
+        self._seen: dict[str, list[float]] = {}
+
+    def passed(self, run: Run) -> str:
+        """How many have, with this one."""
+        self._left[run.job] -= 1
+        if run.started >= self.started and run.state != SKIPPED:
+            self._seen.setdefault(run.job, []).append(run.seconds)
+        return f"[{self._total - self._left.total()}/{self._total}]"
+
+    def left(self) -> str:
+        """At least so long where a job comes that has not run yet; nothing where none has run."""
+        means = self._means | {job: sum(each) / len(each) for job, each in self._seen.items()}
+        known = Counter({job: count for job, count in self._left.items() if count and job in means})
+        if not known:
+            return ""
+        seconds = sum(count * means[job] for job, count in known.items()) / min(self._slots, known.total())
+        return f", {'about' if len(known) == len(+self._left) else 'over'} {duration(seconds)} left"
+
+
+def _end_of(future: "Future[End]") -> End:
+    """How a task ended; one that never came back is lost."""
+    try:
+        return future.result()
+    except Exception as error:  # of the executor: a worker that died, a machine that is gone
+        return End.without_one("", f"lost: {type(error).__name__}: {error}"[:200])
+
+
+def verdict_in(result: Path) -> dict[str, Any]:
+    """The verdict in a command's JSON, empty where it has none."""
+    with suppress(OSError, ValueError):
+        document = json.loads(result.read_bytes())
+        verdict = document.get("verdict") if isinstance(document, dict) else None
+        return verdict if isinstance(verdict, dict) else {}
+    return {}
+
+
+def not_run(node: Node, key: str, folder: Path, *, state: str, cause: str) -> Run:
+    """Of a node that has not run, and why."""
+    return replace(run_of(node, key, End.without_one(key, cause), folder), state=state)

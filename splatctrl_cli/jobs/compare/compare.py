@@ -1,0 +1,395 @@
+"""A comparison from its request to its result: what got worse between two runs, two batches, or since a baseline."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.jobs.compare.judged_runs import (
+    Judged,
+    JudgedRun,
+    WorstState,
+    read_baseline,
+    read_judged,
+    scales,
+    worst_state,
+    write_baseline,
+)
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
+from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, failed, lacking, noted, verdict_of
+
+MOST_NAMES = 5  # in an error
+REGRESSION = "regression"
+ROUNDING = 1e-9  # relative: baselines have nine digits
+
+
+class Change(StrEnum):
+    """What became of a figure or a verdict."""
+
+    WORSE = "worse"
+    BETTER = "better"
+    SAME = "same"
+    OTHER = "other"  # neither better nor worse
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareRequest:
+    """Compare two folders, `runs`, the earlier first; or one with the stored baseline `against`.
+
+    update_baseline: a file to write the last of `runs` into, which may then be the only one.
+    """
+
+    runs: tuple[Path, ...]
+    against: Path | None = None
+    update_baseline: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FigureChange:
+    """One figure of one run; `after` is None where it has no value any more. allowed: its tolerance, in `unit`.
+
+    share: by how many tolerances it is worse, infinite without one; where: of a replay, the worst state by it.
+    """
+
+    run: str
+    recording: str
+    job: str
+    metric: str
+    before: float
+    after: float | None
+    unit: str
+    better: Better
+    allowed: float
+    change: Change
+    share: float
+    where: WorstState | None = None
+
+    @property
+    def sentence(self) -> str:
+        """Which recording went from what to what, and what was allowed."""
+        unit = f" {self.unit}" if self.unit else ""
+        if self.after is None:
+            return f"{self.recording} had {self.before:.6g}{unit} and has no value any more"
+        off = abs(self.after - self.before)
+        words = f"{self.recording} went from {self.before:.6g} to {self.after:.6g}{unit}"
+        return f"{words}, {off:.3g} {self.change}, allowed {self.allowed:.3g}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictChange:
+    """The verdict of a run before and after, by label."""
+
+    run: str
+    recording: str
+    before: str
+    after: str
+    change: Change
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobChange:
+    """One figure of a job over the recordings: the mean change for the worse, and the recording that lost most."""
+
+    job: str
+    metric: str
+    harm: MeanChange
+    change: Change
+    worst: FigureChange
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareResult:
+    """What changed. figures: of each run, those that got worse first; jobs: over recordings, where there are enough,
+    which then decide instead; differences: settings, versions and inputs by name, before and after; only_after: runs
+    that were not there before; only_before: runs that are not there now and are not compared. metrics: how
+    many of each.
+    """
+
+    __repr__ = brief
+
+    verdict: Verdict
+    verdicts: tuple[VerdictChange, ...]
+    figures: tuple[FigureChange, ...]
+    jobs: tuple[JobChange, ...]
+    differences: Mapping[str, tuple[str, str]]
+    only_after: tuple[str, ...]
+    only_before: tuple[str, ...] = ()
+    metrics: Mapping[str, int]
+    baseline: Path | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "metrics": dict(self.metrics),
+            "verdicts": [asdict(one) for one in self.verdicts],
+            "figures": [
+                asdict(one) | {"share": one.share if math.isfinite(one.share) else None} for one in self.figures
+            ],
+            "jobs": [
+                {
+                    "job": one.job,
+                    "metric": one.metric,
+                    "change": one.change,
+                    **asdict(one.harm),
+                    "worst": one.worst.run,
+                }
+                for one in self.jobs
+            ],
+            "differences": {name: list(values) for name, values in self.differences.items()},
+            "only_after": list(self.only_after),
+            "only_before": list(self.only_before),
+            "baseline": None if self.baseline is None else str(self.baseline),
+        }
+
+
+def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResult:
+    """Compare, and write the baseline that was asked for.
+
+    Raises UsageError for a request of another form, InputError for what cannot be read or was not run alike.
+    """
+    num_needed = 1 if request.against is not None else 2
+    is_alone = len(request.runs) == 1 and request.update_baseline is not None
+    if len(request.runs) != num_needed and not is_alone:
+        raise UsageError(f"compare: expected two runs, or one and --against, got {len(request.runs)}")
+    after = read_judged(request.runs[-1])
+    before = read_baseline(request.against) if request.against is not None else read_judged(request.runs[0])
+    _check_alike(before, after)
+    result = _compared(before, after)
+    if request.update_baseline is not None:
+        write_baseline(request.update_baseline, after)
+        progress.log(f"wrote {request.update_baseline}")
+    return replace(result, baseline=request.update_baseline)
+
+
+def _check_alike(before: Judged, after: Judged) -> None:
+    """Raise InputError for what was not run alike: a run and a batch, other commands, no recording in common."""
+    if before.kind != after.kind:
+        raise InputError(f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}")
+    if before.kind == "run" and before.runs.keys() != after.runs.keys():
+        expected, got = (", ".join(judged.runs) for judged in (before, after))
+        raise InputError(f"{after.path}: expected a run of {expected}, as {before.path} is, got one of {got}")
+    common = [name for name in before.runs if name in after.runs]
+    if not common:
+        expected, got = (_named([*judged.runs]) or "none" for judged in (before, after))
+        raise InputError(
+            f"{after.path}: expected some of the runs of {before.path} ({expected}), got {got}",
+            remedy="compare runs of the same recordings",
+        )
+    for name in common:
+        old, new = before.runs[name], after.runs[name]
+        if old.command != new.command:
+            raise InputError(f"{after.path}: {name}: expected a run of {old.command}, got one of {new.command}")
+        lost = sorted(old.metrics.keys() - new.metrics.keys())
+        if before.is_baseline and new.outcome and lost:
+            remedy = "run it with the options of then, or write the baseline anew with --update-baseline"
+            raise InputError(
+                f"{before.path}: {name}: has figures that this run has not: {_named(lost)}", remedy=remedy
+            )
+
+
+def _compared(before: Judged, after: Judged) -> CompareResult:
+    pairs = [(old, after.runs[name]) for name, old in before.runs.items() if name in after.runs]
+    only_before = tuple(sorted(before.runs.keys() - after.runs.keys()))
+    verdicts = [change for old, new in pairs if (change := _verdict_change(old, new)) is not None]
+    found = [change for old, new in pairs for change in _figure_changes(old, new)]
+    jobs = sorted(_job_changes(found), key=lambda one: -one.worst.share)
+    by_jobs = {(one.job, one.metric) for one in jobs}
+    worse = [one for one in found if one.change is Change.WORSE]
+    alone = [one for one in worse if (one.job, one.metric) not in by_jobs or one.after is None]
+    only_after = tuple(sorted(after.runs.keys() - before.runs.keys()))
+    num_verdicts = sum(bool(old.outcome and new.outcome) for old, new in pairs)
+    metrics = {
+        "num_runs": len(pairs),
+        "num_verdicts": num_verdicts,
+        "num_figures": sum(one.better is not Better.NEITHER for one in found),
+        "num_verdicts_worse": sum(one.change is Change.WORSE for one in verdicts),
+        "num_verdicts_better": sum(one.change is Change.BETTER for one in verdicts),
+        "num_worse": len(alone) + sum(one.change is Change.WORSE for one in jobs),
+        "num_better": sum(one.change is Change.BETTER for one in found),
+    }
+    weighed = [(-one.share, one.metric, _of_figure(one, after.kind)) for one in alone]
+    weighed += [(-one.worst.share, one.metric, _of_job(one)) for one in jobs if one.change is Change.WORSE]
+    ordered = sorted(weighed, key=lambda one: one[:2])
+    reasons = [*_of_verdicts(verdicts, after), *(reason for *_, reason in ordered), *_of_single(jobs)]
+    lone = ((before, only_before), (after, only_after))
+    reasons += [noted("runs", f"only in {side.path}: {_named(names)}") for side, names in lone if names]
+    return CompareResult(
+        verdict=verdict_of(
+            "compare",
+            [_overall(metrics), *reasons],
+            scope=f"{before.path} -> {after.path}",
+            passed="no regression",
+            notes=[f"not compared, only in {before.path}: {_named(only_before)}"] if only_before else [],
+            counts=metrics,
+        ),
+        verdicts=tuple(verdicts),
+        figures=tuple(sorted((one for one in found if one.change is not Change.SAME), key=_worst_first)),
+        jobs=tuple(jobs),
+        differences=_differences(pairs),
+        only_after=only_after,
+        only_before=only_before,
+        metrics=metrics,
+    )
+
+
+def _overall(metrics: Mapping[str, int]) -> Reason:
+    """Whether there was anything to compare."""
+    num_figures, num_verdicts = metrics["num_figures"], metrics["num_verdicts"]
+    if not num_figures and not num_verdicts:
+        return lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides")
+    words = f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}"
+    return noted("comparison", words)
+
+
+def _verdict_change(old: JudgedRun, new: JudgedRun) -> VerdictChange | None:
+    if old.is_green == new.is_green and (old.outcome, old.label) == (new.outcome, new.label):
+        return None
+    change = Change.OTHER
+    if old.is_green != new.is_green:
+        change = Change.WORSE if old.is_green else Change.BETTER
+    return VerdictChange(run=new.name, recording=new.recording, before=old.label, after=new.label, change=change)
+
+
+def _figure_changes(old: JudgedRun, new: JudgedRun) -> Iterator[FigureChange]:
+    """Of the figures that had a value and are still there, by name."""
+    for metric, before in old.metrics.items():
+        if before is None or metric not in new.metrics or not new.outcome:
+            continue
+        scale, after = scales()[new.command][metric], new.metrics[metric]
+        change, share = _judged(scale, before, after)
+        yield FigureChange(
+            run=new.name,
+            recording=new.recording,
+            job=new.job,
+            metric=metric,
+            before=before,
+            after=after,
+            unit=scale.unit,
+            better=scale.better,
+            allowed=scale.tolerance(before),
+            change=change,
+            share=share,
+            where=worst_state(new.folder, metric) if change is Change.WORSE and after is not None else None,
+        )
+
+
+def _judged(scale: Scale, before: float, after: float | None) -> tuple[Change, float]:
+    """What became of a figure, and by how many tolerances it is worse; one that is lost is worse, too."""
+    if after is None:
+        return (Change.OTHER, 0.0) if scale.better is Better.NEITHER else (Change.WORSE, math.inf)
+    harm, allowed = scale.harm(before, after), scale.tolerance(before)
+    if scale.better is Better.NEITHER:
+        return (Change.SAME if math.isclose(before, after, rel_tol=ROUNDING) else Change.OTHER), 0.0
+    if abs(harm) <= allowed + ROUNDING * abs(before):
+        return Change.SAME, harm / allowed if allowed else 0.0
+    return (Change.WORSE if harm > 0 else Change.BETTER), harm / allowed if allowed else math.copysign(math.inf, harm)
+
+
+def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
+    """Of the figures of a job that enough recordings have: worse, or better, where the whole interval is and the mean
+    is beyond the mean tolerance.
+    """
+    by_job: dict[tuple[str, str], list[FigureChange]] = {}
+    for one in found:
+        if one.better is not Better.NEITHER and one.after is not None:
+            by_job.setdefault((one.job, one.metric), []).append(one)
+    for (job, metric), changes in by_job.items():
+        sign = 1.0 if changes[0].better is Better.LOWER else -1.0
+        harm = mean_change([sign * (one.after - one.before) for one in changes if one.after is not None])
+        if harm is None:
+            continue
+        allowed = sum(one.allowed for one in changes) / len(changes)
+        change = Change.SAME
+        if harm.low > 0 and harm.mean > allowed:
+            change = Change.WORSE
+        elif harm.high < 0 and -harm.mean > allowed:
+            change = Change.BETTER
+        worst = max(changes, key=lambda one: one.share)
+        yield JobChange(job=job, metric=metric, harm=harm, change=change, worst=worst)
+
+
+def _of_verdicts(verdicts: Sequence[VerdictChange], after: Judged) -> Iterator[Reason]:
+    """A regression of each verdict that was right, with what decided it now; a note of each other change."""
+    for one in verdicts:
+        words = f"{one.run}: the verdict went from '{one.before}' to '{one.after}'"
+        if one.change is not Change.WORSE:
+            better = ", an improvement" if one.change is Change.BETTER else ""
+            yield noted(f"verdict of {one.run}", words + better)
+            continue
+        why = next((reason for reason in after.runs[one.run].reasons if reason["outcome"] != "passed"), None)
+        yield failed(
+            criterion=f"verdict of {one.run}",
+            sentence=words if why is None else f"{words}: {why['criterion']}: {why['sentence']}",
+            time_s=None if why is None else why["time_s"],
+            place=None if why is None or why["place"] is None else tuple(why["place"]),
+            who=one.recording,
+            cause="" if why is None else why["cause"],
+            remedy="" if why is None else why["remedy"],
+            label=REGRESSION,
+        )
+
+
+def _of_figure(one: FigureChange, kind: str) -> Reason:
+    return failed(
+        criterion=one.metric if kind == "run" else f"{one.metric} of {one.run}",
+        sentence=one.sentence,
+        value=one.after,
+        threshold=one.before + (one.allowed if one.better is Better.LOWER else -one.allowed),
+        unit=one.unit,
+        time_s=None if one.where is None else one.where.time_s,
+        who=one.recording,
+        cause="" if one.where is None else str(one.where),
+        label=REGRESSION,
+    )
+
+
+def _of_job(one: JobChange) -> Reason:
+    harm, worst, unit = one.harm, one.worst, f" {one.worst.unit}" if one.worst.unit else ""
+    words = f"{one.job}: {one.metric} is worse by {harm.mean:.3g}{unit} in the mean of {harm.num_pairs} recordings"
+    interval = f"{100 * CONFIDENCE:g} % interval {harm.low:.3g} to {harm.high:.3g}"
+    return failed(
+        criterion=f"{one.metric} of {one.job}",
+        sentence=f"{words} ({interval}); most in {worst.recording}, {worst.before:.6g} to {worst.after:.6g}{unit}",
+        value=harm.mean,
+        threshold=0.0,
+        unit=worst.unit,
+        time_s=None if worst.where is None else worst.where.time_s,
+        who=worst.recording,
+        cause="" if worst.where is None else str(worst.where),
+        count=harm.num_pairs,
+        label=REGRESSION,
+    )
+
+
+def _of_single(jobs: Sequence[JobChange]) -> Iterator[Reason]:
+    """A note where single recordings lost more than their tolerance, and the mean did not."""
+    single = [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]
+    if single:
+        first = single[0]
+        more = f"; and {len(single) - 1} more figures" if len(single) > 1 else ""
+        yield noted("single recordings", f"{first.metric} of {first.worst.run}: {first.worst.sentence}{more}")
+
+
+def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tuple[str, str]]:
+    """Settings, versions and inputs that differ, by name: before and after; of several runs, in the first."""
+    found: dict[str, tuple[str, str]] = {}
+    for old, new in pairs:
+        for name in [name for name in old.settings if name in new.settings]:
+            values = str(old.settings[name]), str(new.settings[name])
+            if values[0] != values[1]:
+                found.setdefault(name, values)
+    return found
+
+
+def _worst_first(one: FigureChange) -> tuple[bool, float, str, str]:
+    return one.change is not Change.WORSE, -one.share, one.metric, one.run
+
+
+def _named(names: Sequence[str]) -> str:
+    """The first few, and how many more."""
+    more = len(names) - MOST_NAMES
+    return ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,339 @@
+"""Runs that were judged, read back to be compared: a command's folder, a batch, or a stored baseline; the figures
+that each command declares, and the state of a replay that is worst by one.
+"""
+
+import csv
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.jobs.bake import bake
+from splatctrl_cli.jobs.reconstruct import verdict as reconstruct_verdict
+from splatctrl_cli.jobs.replay.metrics import metric_scales, shown_metrics
+from splatctrl_cli.jobs.replay.request import MODES
+from splatctrl_cli.jobs.robot.robot import robot
+
+from splatctrl_cli import __version__
+from splatctrl_cli.config.fixed import BANDS
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate import field_accuracy, score_report
+from splatctrl_cli.evaluate.field_accuracy import FIELDS
+from splatctrl_cli.evaluate.metrics import Better, Scale, Shown
+from splatctrl_cli.evaluate.verdict import damage_mark
+from splatctrl_cli.files.output import PARTIAL, output_path
+
+REPLAY_FIELDS = ("exact", "barrier", "certified")
+
+
+@cache
+def scales() -> Mapping[str, Mapping[str, Scale]]:
+    """How two runs are compared by each figure, by command and name."""
+    replay: dict[str, Scale] = {}
+    for mode in MODES:
+        replay |= metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True)
+    bands = [field_accuracy.band_name(lower, upper) for lower, upper in BANDS]
+    return {
+        "reconstruct": reconstruct_verdict.GATED,
+        "sdf-bake": bake.SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS, bands),
+        "score": score_report.SCALES,
+        "replay": replay,
+        "robot": robot.SCALES,
+    }
+
+
+@cache
+def shown() -> Mapping[str, Shown]:
+    """Where the ``steps.csv`` of a replay shows its figures, by name."""
+    return {name: where for mode in MODES for name, where in shown_metrics(mode, REPLAY_FIELDS).items()}
+
+
+BATCH, BASELINE, VERSION = "splatctrl-batch", "splatctrl-baseline", 1
+HEAD = "# Made by splatctrl compare --update-baseline: review what changed, then commit it.\n"
+ANEW = "write it anew with --update-baseline"
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgedRun:
+    """One run: what it came to, its figures by name, and where its output is.
+
+    name: tells it from the others of its batch; job: alike runs of other recordings have the same. outcome: of the
+    verdict, empty where it came to none; is_green: it ended as it should. settings: configuration, versions and
+    inputs, by name. reasons: of the verdict, as in ``run.json``.
+    """
+
+    name: str
+    recording: str
+    job: str
+    command: str
+    outcome: str
+    label: str
+    is_green: bool
+    metrics: Mapping[str, float | None]
+    settings: Mapping[str, object] = field(default_factory=dict)
+    reasons: tuple[Mapping[str, Any], ...] = ()
+    folder: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judged:
+    """What is compared: runs by name. kind: "run", of which there is one, or "batch"."""
+
+    path: Path
+    kind: str
+    runs: Mapping[str, JudgedRun]
+    is_baseline: bool = False
+
+
+def read_judged(path: Path) -> Judged:
+    """A folder that a command that judges or a batch wrote. Raises InputError for anything else."""
+    if path.name.endswith(PARTIAL):
+        raise InputError(f"{path}: is still being written, or was interrupted", remedy="wait for it, or run it again")
+    batch, run = path / "batch.json", path / "run.json"
+    if batch.is_file():
+        return Judged(path=path, kind="batch", runs={run.name: run for run in _nodes(path, _json(batch))})
+    if run.is_file():
+        one = _run_in(path, path.absolute().name)
+        return Judged(path=path, kind="run", runs={one.command: one})
+    if path.with_name(path.name + PARTIAL).exists():
+        raise InputError(f"{path}: is still being written, or was interrupted", remedy="wait for it, or run it again")
+    what = "no run.json and no batch.json in it" if path.is_dir() else "no such folder"
+    raise InputError(f"{path}: expected the output folder of a command or a batch, got {what}")
+
+
+def _run_in(folder: Path, recording: str) -> JudgedRun:
+    document = _json(folder / "run.json")
+    verdict, command = document.get("verdict"), str(document.get("command"))
+    if not isinstance(verdict, dict) or command not in (*scales(), "demo"):
+        raise InputError(
+            f"{folder}: a run of {command}, which judges nothing", remedy=f"give one of {', '.join(scales())}"
+        )
+    return _judged_run(command, recording, command, command, verdict, document.get("metrics"), document, folder)
+
+
+def _judged_run(
+    name: str,
+    recording: str,
+    job: str,
+    command: str,
+    verdict: Mapping[str, Any],
+    metrics: Any,
+    document: Mapping[str, Any],
+    folder: Path | None,
+) -> JudgedRun:
+    """From what a command wrote into ``run.json``, or printed with --json."""
+    return JudgedRun(
+        name=name,
+        recording=recording,
+        job=job,
+        command=command,
+        outcome=verdict["outcome"],
+        label=verdict["label"] + damage_mark(verdict.get("sentence"), verdict.get("exit_code")),
+        is_green=verdict["outcome"] == "passed",
+        metrics=_declared(command, metrics if isinstance(metrics, dict) else {}),
+        settings=dict(_settings(document)),
+        reasons=tuple(verdict["reasons"]),
+        folder=folder,
+    )
+
+
+def _nodes(path: Path, document: Mapping[str, Any]) -> Iterator[JudgedRun]:
+    if document.get("format") != BATCH or not isinstance(document.get("nodes"), list):
+        raise InputError(f"{path / 'batch.json'}: expected a batch, got another file")
+    _check_version(path / "batch.json", document, "a batch")
+    for node in document["nodes"]:
+        variant = ", ".join(f"{key}={value}" for key, value in sorted((node.get("variant") or {}).items()))
+        job = f"{node['job']} ({variant})" if variant else str(node["job"])
+        found = _node_output(path, node)
+        command = str(node["command"]).partition(" ")[0]
+        name, recording, is_green = str(node["id"]), str(node["recording"]), node["state"] == "done"
+        if found is None or node.get("outcome") is None:
+            label = str(node.get("cause") or node["state"])
+            yield JudgedRun(
+                name=name,
+                recording=recording,
+                job=job,
+                command=command,
+                outcome="",
+                label=label,
+                is_green=is_green,
+                metrics={},
+            )
+            continue
+        verdict, metrics, run, folder = found
+        judged = _judged_run(name, recording, job, command, verdict, metrics, run, folder)
+        yield replace(judged, is_green=is_green)
+
+
+def _node_output(
+    path: Path, node: Mapping[str, Any]
+) -> tuple[Mapping[str, Any], Any, Mapping[str, Any], Path | None] | None:
+    """Verdict, metrics, ``run.json`` and folder of a node; of one without that file, what it printed."""
+    folder = path / str(node["out"])
+    if (folder / "run.json").is_file():
+        run = _json(folder / "run.json")
+        return (run["verdict"], run.get("metrics"), run, folder) if isinstance(run.get("verdict"), dict) else None
+    printed = path / str(node["result"])
+    if not printed.is_file():
+        return None
+    document = _json(printed)
+    return (document["verdict"], document.get("metrics"), {}, None) if "verdict" in document else None
+
+
+def _declared(command: str, metrics: Mapping[str, Any]) -> dict[str, float | None]:
+    """The figures that are declared for the command: numbers that are finite, None for others."""
+    known = scales().get(command, {})
+    return {name: _number(value) for name, value in metrics.items() if name in known}
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
+
+
+def _settings(document: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
+    """Configuration, seed, versions and the start of the inputs' digests, by flat names."""
+    for section, values in (document.get("config") or {}).items():
+        if isinstance(values, dict):
+            yield from ((f"{section}.{key}", value) for key, value in values.items())
+        else:
+            yield section, values
+    for name in ("seed", "splatctrl", "python", "machine"):
+        if name in document:
+            yield name, document[name]
+    yield from (document.get("versions") or {}).items()
+    for name, digest in (document.get("inputs") or {}).items():
+        yield f"input {name}", str(digest)[:12]
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: expected an object, got {type(document).__name__}")
+    return document
+
+
+def _check_version(path: Path, document: Mapping[str, Any], what: str) -> None:
+    if document.get("version") != VERSION:
+        remedy = "update splatctrl" if document.get("version", 0) > VERSION else ANEW
+        found = document.get("version")
+        raise InputError(f"{path}: {what} of version {found}, this splatctrl reads {VERSION}", remedy=remedy)
+
+
+def read_baseline(path: Path) -> Judged:
+    """A stored baseline. Raises InputError for another file, a newer one, and figures that no command has now."""
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read: {error.strerror}", remedy="make one with --update-baseline"
+        ) from None
+    except ValueError as error:
+        raise InputError(f"{path}: expected a baseline in TOML: {error}", remedy=ANEW) from None
+    if document.get("format") != BASELINE:
+        raise InputError(
+            f"{path}: expected a baseline, got another TOML file", remedy="give one of --update-baseline"
+        )
+    _check_version(path, document, "a baseline")
+    version, runs = str(document.get("splatctrl", "")), {}
+    try:
+        kind = str(document["kind"])
+        for name, one in document["run"].items():
+            metrics = one.pop("metrics", {})
+            unknown = [metric for metric in metrics if metric not in scales().get(one["command"], {})]
+            if unknown:
+                what = f"{path}: {name}: no figures of {one['command']}: {', '.join(unknown[:5])}"
+                raise InputError(what, remedy=ANEW)
+            figures = {metric: float(value) for metric, value in metrics.items()}
+            runs[name] = JudgedRun(name=name, metrics=figures, settings={"splatctrl": version}, **one)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: damaged: {type(error).__name__}: {error}", remedy=ANEW) from None
+    return Judged(path=path, kind=kind, runs=runs, is_baseline=True)
+
+
+def write_baseline(path: Path, judged: Judged) -> None:
+    """Write the figures that have a direction, a line each, in order of their names. Raises UsageError where `path`
+    is another file, or a run came to no verdict.
+    """
+    if path.exists() and (not path.is_file() or BASELINE.encode() not in path.read_bytes()[:200]):
+        raise UsageError(f"{path}: exists, and is no baseline", remedy="give another --update-baseline")
+    head = {"format": BASELINE, "version": VERSION, "splatctrl": __version__, "kind": judged.kind}
+    lines = [HEAD, *(f"{name} = {_toml(value)}\n" for name, value in head.items())]
+    for name, run in sorted(judged.runs.items()):
+        lines.append(f"\n[run.{_key(name)}]\n")
+        facts = {key: getattr(run, key) for key in ("recording", "job", "command", "outcome", "label", "is_green")}
+        lines += [f"{key} = {_toml(value)}\n" for key, value in facts.items()]
+        lines.append(f"\n[run.{_key(name)}.metrics]\n")
+        for metric, value in sorted(run.metrics.items()):
+            if value is not None and scales()[run.command][metric].better is not Better.NEITHER:
+                lines.append(f"{_key(metric)} = {_toml(value)}\n")
+    with output_path(path, force=True, is_folder=False) as partial:
+        partial.write_text("".join(lines), encoding="utf-8")
+
+
+def _key(name: str) -> str:
+    return name if _BARE.fullmatch(name) else _toml(name)
+
+
+def _toml(value: object) -> str:
+    """Nine digits, as in ``steps.csv``."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return f"{value:.9g}"
+    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorstState:
+    """A state by its row, from 0, and its time [s] as in ``steps.csv``; the nearest sphere, and what it is near."""
+
+    state: int
+    time_s: float
+    sphere: str = ""
+    obstacle: str = ""
+
+    def __str__(self) -> str:
+        """As words of a report."""
+        near = f", {self.sphere}" if self.sphere else ""
+        return f"state {self.state}{near}" + (f" near {self.obstacle}" if self.obstacle else "")
+
+
+def worst_state(folder: Path | None, metric: str) -> WorstState | None:
+    """Where the replay in `folder` shows a metric; None where its states do not, or are not there."""
+    where = shown().get(metric)
+    if where is None or folder is None or not (folder / "steps.csv").is_file():
+        return None
+    with (folder / "steps.csv").open(encoding="utf-8", newline="") as stream:
+        rows = csv.DictReader(stream)
+        if where.column not in (rows.fieldnames or ()):
+            return None
+        found, least = None, math.inf
+        for index, row in enumerate(rows):
+            badness = _badness(where, row[where.column])
+            if badness < least:
+                found, least = (index, row), badness
+    if found is None:
+        return None
+    index, row = found
+    sphere = row.get(f"nearest_{where.column.removeprefix('clearance_')}") or ""
+    is_exact = where.column == "clearance_exact"
+    obstacle = (row.get("obstacle") or "") if is_exact else ""
+    return WorstState(state=index, time_s=float(row["time_s"]), sphere=sphere, obstacle=obstacle)
+
+
+def _badness(where: Shown, text: str) -> float:
+    """Smaller is worse; infinite where the cell does not count."""
+    if where.pick not in ("least", "largest"):
+        return 0.0 if text == where.pick else math.inf
+    if not text:
+        return math.inf
+    return float(text) if where.pick == "least" else -float(text)

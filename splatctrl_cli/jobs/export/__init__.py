@@ -1,0 +1,1 @@
+"""Splats and judged runs for other programs."""

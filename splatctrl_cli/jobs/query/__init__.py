@@ -1,0 +1,1 @@
+"""Distances at given points."""

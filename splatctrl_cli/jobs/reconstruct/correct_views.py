@@ -1,0 +1,190 @@
+"""``--refine-poses`` and ``--refine-exposure``: views of a still scene corrected by each other."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from splatctrl_cli.formats.scene.scene_folder import ViewCorrection
+from splatctrl_cli.jobs.running.progress import Progress
+
+from splatctrl_cli.calibration.gray_views import exposed, exposure_gains
+from splatctrl_cli.calibration.pose_refinement import (
+    FoundBends,
+    depth_bends,
+    freed,
+    largest_share,
+    refined_poses,
+    unbent,
+)
+from splatctrl_cli.config import fixed
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.recording.folder.folder_views import HOLDOUT
+from splatctrl_cli.records import Float64, RecordSource, RgbdFrame
+from splatctrl_cli.scene.scale import RecordedDepth
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corrections:
+    """What of the views of a still scene is corrected."""
+
+    poses: bool = False
+    exposure: bool = False
+
+    def __bool__(self) -> bool:
+        return self.poses or self.exposure
+
+    @property
+    def options(self) -> str:
+        """As they are given."""
+        return " ".join(
+            n for n, given in (("--refine-poses", self.poses), ("--refine-exposure", self.exposure)) if given
+        )
+
+    def check(self, source: RecordSource) -> None:
+        """Raise UsageError for a recording over time."""
+        if self and source.has_clock:
+            raise UsageError(
+                f"{self.options}: {source.name} is recorded over time; only views of a still scene are corrected",
+                remedy="leave it out; 'splatctrl calibrate' places the cameras of a log",
+            )
+
+    def of(
+        self, frames: Sequence[RgbdFrame], name: str, console: Progress, *, has_robot: bool = False
+    ) -> tuple[list[RgbdFrame], dict[str, Any]]:
+        """The corrected frames, and what ``run.json`` says of it. name: of the recording. has_robot: what is judged
+        by the map, so that depth stays as it was measured.
+
+        Raises InputError where there is no depth that could tell.
+        """
+        if not self:
+            return list(frames), {}
+        depth = RecordedDepth.of(frames)
+        if depth is None:
+            raise InputError(f"{name}: {self.options}: no view has depth, which alone says what views have in common")
+        scale, told = depth.median / fixed.SCALE_DEPTH, dict[str, Any]()
+        rows = [{"camera": frame.camera, "stamp_ns": frame.stamp_ns} for frame in frames]
+        moved = list(frames)
+        if self.poses:
+            moved, poses = _posed(moved, scale, has_robot, console)
+            told |= poses
+            rows = [
+                row | {"T_world_camera": f.T_world_camera.ravel().tolist()}
+                for row, f in zip(rows, moved, strict=True)
+            ]
+        if self.exposure:
+            gains = _gains(moved, scale, console)
+            told["exposure_spread"] = float(np.abs(np.log(gains)).max())
+            rows = [row | {"gain": gain.tolist()} for row, gain in zip(rows, gains, strict=True)]
+            moved = [exposed(frame, gain) for frame, gain in zip(moved, gains, strict=True)]
+        return moved, told | {"corrected_views": rows}
+
+
+def _posed(
+    recorded: list[RgbdFrame], scale: float, has_robot: bool, console: Progress
+) -> tuple[list[RgbdFrame], dict[str, Any]]:
+    found, frames = refined_poses(recorded, scale), recorded
+    recorded_apart, apart = found.before, found.after  # of the depths as recorded
+    bends = FoundBends() if has_robot else depth_bends(frames, found, scale)
+    if bends.grids:
+        frames = freed(recorded, bends.grids)
+        found = refined_poses(frames, scale)
+    before, after, median = (1e3 * value for value in (recorded_apart, found.after, float(np.median(found.moved))))
+    if found.is_better:
+        console.log(
+            f"poses: {len(frames)} views moved by {median:.1f} mm in the median, at most"
+            f" {1e3 * found.moved.max():.1f} mm and {found.turned.max():.2f} deg: surfaces of two views are"
+            f" {after:.2f} mm apart instead of {before:.2f}"
+        )
+    else:
+        console.log(
+            f"poses: stay as recorded: surfaces of two views are {after:.2f} mm apart, and no move betters it"
+        )
+    return [replace(f, T_world_camera=T) for f, T in zip(frames, found.T_world_camera, strict=True)], {
+        "pose_residual": found.after,
+        "poses": {
+            "residual_before": recorded_apart,
+            "moved_median": float(np.median(found.moved)),
+            "moved_max": float(found.moved.max()),
+            "turned_max": float(found.turned.max()),
+            "held": [f"{f.camera} at {f.stamp_ns}" for f, held in zip(frames, found.is_held, strict=True) if held],
+        },
+    } | ({} if has_robot else _told(bends, scale, apart, found.after, console))
+
+
+def _told(bends: FoundBends, scale: float, apart: float, after: float, console: Progress) -> dict[str, Any]:
+    """What is said of the bends; apart, after [m]: the views by poses alone, and with the bends."""
+    depth = scale * fixed.SCALE_DEPTH
+    rows = {
+        camera: {
+            "largest": largest_share(grid, depth),
+            "residual_before": apart,
+            "residual_after": after,
+            "gains": list(bends.gains),
+            "offsets": grid.tolist(),
+        }
+        for camera, grid in bends.grids.items()
+    }
+    for camera, row in rows.items():
+        console.log(
+            f"depth: {camera}: freed of a bend, the same in all its views, of at most {100 * row['largest']:.1f} % at"
+            f" {depth:.2f} m: surfaces of two views are {1e3 * after:.2f} mm apart, {1e3 * apart:.2f} by poses alone"
+        )
+    if not rows and (bends.gains or bends.unlike):
+        console.log("depth: stays as recorded: no bend that one half of the views tells holds for the other")
+    largest = max((row["largest"] for row in rows.values()), default=0.0)
+    return {"depth_bend": largest} | ({"depth_bends": rows} if rows else {})
+
+
+def _gains(frames: list[RgbdFrame], scale: float, console: Progress) -> Float64:
+    gains = exposure_gains(frames, scale)
+    least, most = float(gains.min()), float(gains.max())
+    if np.abs(np.log(gains)).max() < fixed.EXPOSURE_GAIN:
+        console.log(f"exposure: the same in all {len(frames)} views, within {100 * max(most - 1, 1 - least):.1f} %")
+        return np.ones_like(gains)
+    console.log(f"exposure: {len(frames)} views are divided by {least:.2f} to {most:.2f}, each colour by its own")
+    return gains
+
+
+def corrected(frame: RgbdFrame, corrections: Mapping[tuple[str, int], ViewCorrection]) -> RgbdFrame:
+    """The frame as a scene's training corrected it, where it did."""
+    row = corrections.get((frame.camera, frame.stamp_ns))
+    return frame if row is None else _applied(frame, row)
+
+
+def corrected_among(
+    frame: RgbdFrame, others: Sequence[RgbdFrame], corrections: Mapping[tuple[str, int], ViewCorrection]
+) -> RgbdFrame:
+    """The frame corrected in the same respects by other views, which are corrected and stay; its own correction where
+    it trained.
+    """
+    if (frame.camera, frame.stamp_ns) in corrections:
+        return corrected(frame, corrections)
+    depth = RecordedDepth.of(others)
+    if depth is None:
+        return frame
+    scale, free = depth.median / fixed.SCALE_DEPTH, np.arange(len(others) + 1) == 0
+    respects = next(iter(corrections.values()))
+    bend = _bend_of(frame, others, corrections)
+    frame = frame if bend is None else unbent(frame, bend)
+    if respects.T_world_camera is not None:
+        T = refined_poses([frame, *others], scale, free).T_world_camera[0]
+        frame = replace(frame, T_world_camera=T)
+    if respects.gain is not None:
+        frame = exposed(frame, exposure_gains([frame, *others], scale, free)[0])
+    return frame
+
+
+def _bend_of(
+    frame: RgbdFrame, others: Sequence[RgbdFrame], corrections: Mapping[tuple[str, int], ViewCorrection]
+) -> Float64 | None:
+    """That of the frame's own camera; of a view held out, that of the only camera with its intrinsics."""
+    cameras = {other.camera for other in others if other.intrinsics == frame.intrinsics}
+    camera = frame.camera if frame.camera != HOLDOUT or len(cameras) != 1 else cameras.pop()
+    return next((row.bend for (name, _), row in corrections.items() if name == camera), None)
+
+
+def _applied(frame: RgbdFrame, row: ViewCorrection) -> RgbdFrame:
+    frame = frame if row.bend is None else unbent(frame, row.bend)
+    frame = frame if row.T_world_camera is None else replace(frame, T_world_camera=row.T_world_camera)
+    return frame if row.gain is None else exposed(frame, row.gain)

@@ -1,0 +1,90 @@
+"""Which time steps leave a map: those that are due, and those that show something new.
+
+A thing that comes and goes between two maps would be in neither of them, and a replay would call safe what it hit.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from splatctrl_cli.formats.scene.scene_writer import SceneWriter
+from splatctrl_cli.formats.scene.voxel_file import read_states, read_unrepresented
+from splatctrl_cli.formats.splat.splats import read_ply
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import NEWS_LEAST, SAME_MOMENT_NS
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.field.distance import SphereField
+from splatctrl_cli.field.obstacles import obstacle_spheres
+from splatctrl_cli.records import SplatSet
+from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.voxels import Balls, OccupancyGrid
+
+
+class KeptMaps:
+    """Decides over the snapshots of a writer; of what was kept it knows no more than the files, so that a run that
+    was interrupted goes on as it would have.
+    """
+
+    def __init__(self, writer: SceneWriter, config: Config) -> None:
+        self._writer, self._config = writer, config
+        self._last: _Map | None = None
+
+    def is_due(self, index: int, stamp_ns: int) -> bool:
+        """Every `snapshot_every` time steps, and then only if a multiple of `snapshot_period` has passed since."""
+        scene, taken = self._config.scene, self._writer.snapshots
+        if index % scene.snapshot_every:
+            return False
+        period_ns = round(scene.snapshot_period * 1e9)
+        if not taken or period_ns == 0:
+            return True
+        first, last = taken[0].stamp_ns - SAME_MOMENT_NS, taken[-1].stamp_ns
+        return (stamp_ns - first) // period_ns > (last - first) // period_ns
+
+    def shows_news(self, fitter: SceneFitter) -> bool:
+        """Whether the map has at least `NEWS_LEAST` spheres that may be a new thing: they stand out of those of the
+        last map that was kept by more than half a voxel, in voxels that were free in it.
+        """
+        if not self._writer.snapshots:
+            return False
+        path = self._writer.snapshots[-1].path
+        if self._last is None or self._last.path != path:
+            self._writer.settle()
+            states = path.with_suffix(".npz")
+            self._last = _Map.of(path, _spheres(read_ply(path)[0], read_unrepresented(states)), read_states(states))
+        now = _spheres(fitter.splats(), fitter.unrepresented)
+        return now is not None and self._last.num_new(now) >= NEWS_LEAST
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Map:
+    """One that was kept; without a field where it holds no obstacle."""
+
+    path: Path
+    field: SphereField | None
+    states: OccupancyGrid
+
+    @classmethod
+    def of(cls, path: Path, spheres: SplatSet | None, states: OccupancyGrid) -> "_Map":
+        field = None if spheres is None else SphereField(spheres.centers, spheres.radii)
+        return cls(path=path, field=field, states=states)
+
+    def num_new(self, spheres: SplatSet) -> int:
+        """How many of later spheres are new to it."""
+        grid, centers = self.states, spheres.centers.astype(np.float64)
+        cells = np.floor((centers - grid.origin) / grid.voxel + 0.5).astype(np.int64)
+        is_inside = np.all((cells >= 0) & (cells < grid.log_odds.shape), axis=1)
+        is_free = np.zeros(len(cells), bool)
+        is_free[is_inside] = grid.log_odds[tuple(cells[is_inside].T)] < 0.0
+        if self.field is None:
+            return int(is_free.sum())
+        distance = self.field.query(centers[is_free])[0]
+        return int(np.count_nonzero(distance + spheres.radii[is_free] > 0.5 * grid.voxel))
+
+
+def _spheres(splats: SplatSet, balls: Balls | None) -> SplatSet | None:
+    """The obstacles of a map, None where it has none."""
+    try:
+        return obstacle_spheres(splats, balls).splats
+    except NotEvaluableError:
+        return None

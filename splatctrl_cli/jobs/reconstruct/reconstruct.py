@@ -1,0 +1,204 @@
+"""A reconstruction from its request to its result: a recording into splats, occupancy, audit and snapshots."""
+
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.formats.arrays import savez
+from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
+from splatctrl_cli.formats.scene.scene_writer import CHECKPOINT
+from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest, training_cameras
+from splatctrl_cli.jobs.reconstruct.self_model import learn_from
+from splatctrl_cli.jobs.reconstruct.verdict import GATED, Reconstructed, reconstruct_verdict
+from splatctrl_cli.jobs.recordings.open_recording import guessed_unit
+from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, other_frame, urdf_of, with_self_model
+from splatctrl_cli.jobs.running.device import FitDevice
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.jobs.running.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.gates import check_gate_names
+from splatctrl_cli.evaluate.verdict import Verdict, brief
+from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
+from splatctrl_cli.recording.calibrated import LOGGED
+from splatctrl_cli.records import RecordSource
+from splatctrl_cli.robot.declared_contact import Declarations, read_declarations
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.urdf import UrdfFile
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructResult:
+    """The scene folder `out`, its metrics and verdict as in ``run.json``, splats removed by reason, and wall time by
+    stage [s].
+    """
+
+    __repr__ = brief
+
+    out: Path
+    metrics: Mapping[str, Any]
+    verdict: Verdict
+    removed: Mapping[str, int]
+    seconds: Mapping[str, float]
+
+
+def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> ReconstructResult:
+    """Reconstruct into the output folder, or go on with what an interrupted run left of it.
+
+    Raises SplatCtrlError for a recording that cannot be reconstructed.
+    """
+    check_gate_names(request.require, GATED)
+    training_cameras(request.source)
+    device = FitDevice(request.device)
+    robot = _robot(request, progress)
+    declared = declarations_of(request.declare, robot)
+    stopwatch, checkpoint_file = Stopwatch(), partial_path(request.out) / CHECKPOINT
+    goes_on = _goes_on(request, checkpoint_file, progress)
+    with (
+        closing(device),
+        told_how_to_go_on(checkpoint_file),
+        output_path(
+            request.out, force=request.force, is_folder=True, checkpoint=CHECKPOINT, resume=request.resume
+        ) as partial,
+        device.told_how_to_go_on(checkpoint_file),
+    ):
+        inputs = request.source.digests()
+        run = _identity(request, inputs)
+        checkpoint = checkpoint_to_go_on_from(partial, run) if goes_on else None
+        with stopwatch.stage("learn"):
+            robot = _learned(robot, request, partial, progress, is_new=not goes_on)
+        fitted = Reconstruction(
+            request, robot, partial, identity=run, declared=declared, checkpoint=checkpoint, device=device
+        )
+        if goes_on:
+            progress.log(f"{partial}: continues after {fitted.num_read} time steps")
+        with closing(fitted.writer):
+            with stopwatch.stage("fit_since_resume" if goes_on else "fit"):
+                fitted.run(progress)
+            with stopwatch.stage("write"):
+                fitted.finish()
+        for table, index in declared.unused():
+            if table == "carried":
+                progress.log(
+                    f"warning: {request.declare}: [[carried]] {index + 1}: no pixel of any frame needed it; check its"
+                    " link and box, or leave it out"
+                )
+        learned = [] if robot is None or robot.self_model is None else robot.self_model.parts
+        made = Reconstructed(
+            metrics=fitted.metrics(),
+            rows=fitted.rows,
+            config=fitted.config,
+            loss=request.source.loss,
+            is_seeded=request.points is not None,
+            learned=[part.words(fitted.rows[0].stamp_ns) for part in learned],
+        )
+        verdict = reconstruct_verdict(made, request.require)
+        write_run(
+            partial,
+            command="reconstruct",
+            config=fitted.config.as_dict(),
+            inputs=inputs,
+            metrics=made.metrics,
+            stopwatch=stopwatch,
+            seed=request.seed,
+            verdict=verdict.as_dict(),
+        )
+    removed = {name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed}
+    return ReconstructResult(
+        out=request.out, metrics=made.metrics, verdict=verdict, removed=removed, seconds=stopwatch.seconds
+    )
+
+
+def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[str, Any]:
+    files = {name: getattr(request, name) for name in ("urdf", "spheres", "points", "declare")}
+    is_off = request.self_model == NO_SELF_MODEL
+    files["self-model"] = None if is_off else request.self_model
+    off = {"learn": False} if is_off else {}
+    return identity({"seed": request.seed, **request.options, **off}, files, request.config, inputs)
+
+
+def _learned(
+    robot: RobotModel | None, request: ReconstructRequest, folder: Path, progress: Progress, *, is_new: bool
+) -> RobotModel | None:
+    """The robot with its self-model, which is kept in the scene's folder: the one given, or that of the run that goes
+    on, or what the recording shows where the robot's links have meshes.
+    """
+    source = request.source
+    if robot is None or request.self_model == NO_SELF_MODEL:
+        return robot
+    if not is_new:
+        return robot if request.self_model else with_self_model(robot, None, folder)
+    if request.self_model is None and isinstance(source, LOGGED) and source.joint_names and robot.surface.trees:
+        try:
+            robot = robot.with_self_model(learn_from(robot, source, progress))
+        except InputError as error:
+            progress.log(f"nothing is learned of the robot's own parts: {error.message}")
+    if robot.self_model is not None:
+        savez(folder / SELF_MODEL, robot.self_model.arrays())
+    return robot
+
+
+def declarations_of(path: Path | None, robot: RobotModel | None) -> Declarations:
+    """What a file declares; nothing without one. Raises UsageError where there is no robot that it could be of."""
+    if path is None:
+        return Declarations()
+    if robot is None:
+        raise UsageError(f"--declare {path}: needs the robot", remedy="give --urdf as well")
+    return read_declarations(path, robot.frame_names)
+
+
+def _goes_on(request: ReconstructRequest, checkpoint_file: Path, progress: Progress) -> bool:
+    """Whether there is a checkpoint to go on from, and that was asked for."""
+    partial = partial_path(request.out)
+    if request.resume and not checkpoint_file.is_file():
+        progress.log(f"{partial}: has no checkpoint to continue from; starts at the beginning")
+    elif checkpoint_file.is_file() and not request.resume:
+        progress.log(f"warning: {partial}: an interrupted run is replaced; --resume would have continued it")
+    return request.resume and checkpoint_file.is_file()
+
+
+def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None:
+    """The request's robot, with what a person should know of it said."""
+    urdf = urdf_of(request.urdf, [request.recording] if request.recording else [], progress)
+    if urdf is None:
+        for option, path in (("spheres", request.spheres), ("self-model", request.self_model)):
+            if path not in (None, NO_SELF_MODEL):
+                raise UsageError(f"--{option} {path}: needs the robot", remedy="give --urdf as well")
+        return None
+    if guess := guessed_unit(request.source):
+        raise InputError(
+            f"{request.source.name}: {guess}; a robot needs lengths in metres that nobody guessed",
+            remedy="write poses and depth in metres, or leave the robot out",
+        )
+    try:
+        model = RobotModel.from_urdf(urdf, request.spheres)
+        if request.source.joint_names:
+            model = model.moved_by(request.source.joint_names)
+            model.joint_columns(request.source.joint_names)
+        model = with_self_model(model, request.self_model)
+        if request.urdf is None:
+            _check_fits(urdf, request.source)
+            progress.log(f"the robot is the log's own: {urdf.path}")
+        notes = model.surface.notes
+    except InputError as error:
+        if any((request.urdf, request.spheres, request.self_model)):
+            raise
+        progress.log(f"warning: the robot stays in the map: {error.message}; {error.remedy}")  # nobody asked for it
+        return None
+    for doubt in model.doubts:
+        progress.log(f"warning: {doubt}")
+    for note in notes:
+        progress.log(f"warning: {note}; correct the URDF")
+    return model
+
+
+def _check_fits(urdf: UrdfFile, source: RecordSource) -> None:
+    """Raise InputError where a robot that nobody named would stand elsewhere than it did, or would not move."""
+    if words := other_frame(urdf, source):
+        raise InputError(
+            f"{urdf.path}: {words}", remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one"
+        )
+    if not source.joint_names:
+        raise InputError(f"{source.name}: expected joint states, got none", remedy="record /joint_states")

@@ -1,0 +1,409 @@
+"""The fitter over a source's time steps, with what is written on the way and the checkpoints to go on from."""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.formats.ply import read_points
+from splatctrl_cli.formats.scene.scene_folder import FORMAT
+from splatctrl_cli.formats.scene.scene_writer import Checkpoint, SceneWriter
+from splatctrl_cli.jobs.reconstruct.correct_views import Corrections
+from splatctrl_cli.jobs.reconstruct.kept_maps import KeptMaps
+from splatctrl_cli.jobs.recordings.open_recording import CameraAgreement, guessed_unit
+from splatctrl_cli.jobs.recordings.same_recording import first_frame
+from splatctrl_cli.jobs.running.device import CPU, Device, FitDevice, RunOptions
+from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
+from tqdm import tqdm
+
+from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.config.fixed import MOST_GROWTH
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
+from splatctrl_cli.robot.declared_contact import Declarations
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter, workspace_of
+from splatctrl_cli.scene.contact import count_carried
+from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.posture import RobotPosture, posture_of
+from splatctrl_cli.scene.scale import RecordedDepth, fitted_to, in_words
+from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
+from splatctrl_cli.scene.time_steps import AuditRow, TimeStep, cloud_box, depth_box, time_steps
+
+LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
+
+KEPT = ("num_read", "is_refined", "first_frames", "corrected")  # attributes that a checkpoint keeps as they are
+
+
+def training_cameras(source: RecordSource) -> list[str]:
+    """The cameras that may train. Raises UsageError where there are none."""
+    cameras = [camera for camera in source.cameras if camera != "holdout"]
+    if not cameras:
+        raise UsageError(f"{source.name}: no camera is left to train on", remedy="camera 'holdout' is kept for score")
+    return cameras
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructRequest(RunOptions):
+    """One reconstruction of `source` into the folder `out`.
+
+    urdf, spheres: the robot, whose splats are told apart and whose reach is the workspace unless `box` is given;
+    without urdf the one that the log `recording` describes, where it does. points: a coloured cloud to start from,
+    instead of depth. declare: a TOML of what the robot carries. corrections: of the views of a still scene, by
+    each other. resume: go on with what an interrupted run left. device: where to compute, as of --device. require:
+    gates on its metrics. options: what else decides the bytes, by the names of the options: a run that is resumed
+    must have the same.
+    """
+
+    source: RecordSource
+    out: Path
+    recording: Path | None = None
+    urdf: Path | None = None
+    spheres: Path | None = None
+    self_model: Path | None = None
+    box: Box | None = None
+    points: Path | None = None
+    declare: Path | None = None
+    allow_disagreement: bool = False
+    corrections: Corrections = field(default_factory=Corrections)
+    resume: bool = False
+    seed: int = 0
+    device: str = CPU
+    require: Sequence[str] = ()
+    options: Mapping[str, object] = field(default_factory=dict)
+
+
+class Reconstruction:
+    """One run of a request into `folder`; with `checkpoint` it goes on where that was written.
+
+    declared: what the robot carries. identity: plain values that a run which goes on must have in common with this
+    one. device: the processor unless given. observe: is shown every frame of the source on its way into time steps.
+    """
+
+    def __init__(
+        self,
+        request: ReconstructRequest,
+        robot: RobotModel | None,
+        folder: Path,
+        *,
+        identity: Mapping[str, Any],
+        declared: Declarations | None = None,
+        checkpoint: Checkpoint | None = None,
+        device: FitDevice | None = None,
+        observe: Callable[[RgbdFrame], None] | None = None,
+    ) -> None:
+        self.observe, self.device, self.robot = observe, device or FitDevice(), robot
+        self.request, self.source, self.config = request, request.source, request.config
+        self.cloud = None if request.points is None else read_points(request.points)  # instead of depth
+        self.identity = identity
+        self.declared = declared or Declarations()
+        self._first_state_ns: int | None = None  # from which declared times count
+        self.cameras = training_cameras(self.source)
+        comments = {"format": FORMAT, "frame": "world", "units": "m", "source": self.source.name}
+        self.writer = SceneWriter(folder, comments, checkpoint)
+        self._kept = KeptMaps(self.writer, self.config)
+        self.fitter: SceneFitter | None = None
+        self.rows: list[AuditRow] = []
+        self.stamps: list[int] = []
+        self.repeats: Counter[str] = Counter()  # by camera, frames whose depth was that of the frame before
+        self.first_frames: dict[str, dict[str, Any]] = {}  # of each camera, what tells this recording from another
+        self.num_read = 0  # time steps of the source, those that were left out included
+        self.is_refined = False
+        self.corrected: dict[str, Any] = {}  # what was corrected of the views
+        self._early: TimeStep | None = None  # the first that said nothing of the workspace
+        self.depth: RecordedDepth | None = None  # by which the map's lengths were chosen
+        allowed, still, guess = request.allow_disagreement, not self.source.has_clock, guessed_unit(self.source)
+        self.agreement = CameraAgreement(self.source, is_allowed=allowed, is_still=still, guess=guess)
+        self._saved_at, self._save_time = -float("inf"), 0.0
+        request.corrections.check(request.source)
+        if checkpoint is not None:
+            self._restore(checkpoint)
+
+    def run(self, console: Progress) -> None:
+        """Step through what is left of the log."""
+        if self.fitter is not None:
+            self.device.give(self.fitter, [view.frame for view in self.fitter.window.newest], console)
+        self._step_through(console)
+        self.check_found()
+        if not self.source.has_clock and not self.is_refined:
+            assert self.fitter is not None
+            self._refine(self.fitter, console)
+
+    def check_found(self) -> None:
+        """Raise InputError where the time steps so far gave no splat."""
+        if self.fitter is None and self._early is not None:
+            self._workspace(self._early)  # says that there is no depth
+        if self.fitter is None:
+            raise InputError(
+                f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
+                remedy="'splatctrl info' says what the input lacks",
+            )
+        if not any(row.alive for row in self.rows):
+            raise InputError(
+                f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",
+                remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
+            )
+
+    def _step_through(self, console: Progress) -> None:
+        steps = tqdm(self.time_steps(), disable=True if console.is_quiet else None, unit=" steps")
+        for index, step in enumerate(steps):
+            if index < self.num_read:
+                continue
+            row = self.take(step, console)
+            if row is None:
+                continue
+            if index % 10 == 0 and not steps.disable:
+                steps.set_postfix(splats=row.alive, dB=row.psnr)
+            if steps.disable and index % 10 == 0:
+                quality = (
+                    "nothing of the workspace in view" if row.psnr is None else f"{row.psnr:.1f} dB on its own views"
+                )
+                console.log(f"time step {index}: {row.alive} splats, {quality}")
+            self._save_if_due()
+
+    def take(self, step: TimeStep, console: Progress) -> AuditRow | None:
+        """Take in the next time step, with its snapshot where one is due; None for one that does not say yet where
+        the workspace is.
+        """
+        index, self.num_read = self.num_read, self.num_read + 1
+        if self.fitter is None and not step.has_depth and self._needs_depth():
+            console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
+            self._early = self._early or step
+            return None
+        for frame in step.frames:
+            if frame.camera not in self.first_frames:
+                self.first_frames[frame.camera] = first_frame(frame).as_dict()
+        if self.fitter is None:
+            self._fit_to(RecordedDepth.of(step.frames), console)
+            frames, self.corrected = self.request.corrections.of(
+                step.frames, self.source.name, console, has_robot=self.robot is not None
+            )
+            step = replace(step, frames=tuple(frames))
+        self.agreement.check(step, self.config.occupancy, console)
+        if self.fitter is None:
+            self.fitter = self._begin(step, console)
+            if self.cloud is not None:
+                self.fitter.plant(self.cloud)
+        elif not self.source.has_clock and self.fitter.num_steps == 1:
+            console.log(
+                "warning: more views than fit in one time step: the last are refined on, the others only seed splats;"
+                " leave views out, or reconstruct them in parts"
+            )
+        if not self.source.has_clock and not self.fitter.num_steps:
+            what, scene = f"fits {len(step.frames)} views, seeds first", self.config.scene
+            self.fitter.descent.heard = Wait(console, what, "iterations", scene.first_iterations).announce().step
+        posture = self._posture(step)
+        row = self.fitter.step(step.frames, posture)
+        if self.fitter.num_steps == 1 and self._grow_budget(row, console):
+            self.fitter = self._begin(step, console)
+            row = self.fitter.step(step.frames, posture)
+        self._count_carried(step, posture)
+        self.stamps.extend(frame.stamp_ns for frame in step.frames)
+        self._record(row)
+        if self.fitter.num_steps == 1:
+            self._warn_of_small_budget(row, console)
+        if self.source.has_clock and (self._kept.is_due(index, step.stamp_ns) or self._kept.shows_news(self.fitter)):
+            self.snapshot(step.stamp_ns)
+        return row
+
+    def _begin(self, step: TimeStep, console: Progress) -> SceneFitter:
+        """A fitter whose first time step this is to be."""
+        fitter = self._new_fitter(self._workspace(step))
+        self.device.give(fitter, step.frames, console)
+        return fitter
+
+    def _grow_budget(self, row: AuditRow, console: Progress) -> bool:
+        """Beside a robot, give a budget left at its default what the first time step lacked, and a quarter more; says
+        whether it did. What has no splat there is taken for a whole voxel.
+        """
+        least = SceneConfig().max_splats
+        if self.robot is None or not row.unmet or self.config.scene.max_splats != least:
+            return False
+        wanted = 1.25 * (least + row.unmet + row.evicted)
+        budget = min(1000 * math.ceil(wanted / 1000), MOST_GROWTH * least)
+        self.config = self.config.derived(scene=self.config.scene.derived(max_splats=budget))
+        console.log(f"the first frames show more than {least} splats can stand for: takes {budget}")
+        return True
+
+    def _warn_of_small_budget(self, row: AuditRow, console: Progress) -> None:
+        if row.unmet:
+            budget = self.config.scene.max_splats
+            console.log(
+                f"warning: a budget of {budget} splats is too small for the first frames: {row.unmet} seeds found no"
+                f" slot; --max-splats {budget + row.unmet} would hold them"
+            )
+
+    def _refine(self, fitter: SceneFitter, console: Progress) -> None:
+        total = self.config.scene.refine_iterations
+        wait = Wait(console, "refines", "iterations", total).announce()
+        fitter.descent.heard = wait.step
+        self._record(fitter.refine(total, lambda _: self._save_if_due()))
+        self.snapshot(self.rows[-1].stamp_ns)
+        self.is_refined = True
+
+    def finish(self) -> None:
+        """Write what the end of the log left."""
+        assert self.fitter is not None
+        fitter, stamp_ns = self.fitter, self.rows[-1].stamp_ns
+        self.writer.finish(stamp_ns, fitter.splats(), fitter.known_voxels(), fitter.shell_splats())
+        self._save(is_last=True)
+
+    def metrics(self) -> dict[str, object]:
+        """For ``run.json`` and gates."""
+        assert self.fitter is not None
+        last = self.rows[-1]
+        return {
+            "cameras": self.cameras,
+            "devices": self.device.history,
+            "has_clock": self.source.has_clock,
+            "scale": self.config.scene.scale or 1.0,
+            "voxel": self.config.occupancy.voxel,
+            "stamp_ns": last.stamp_ns,
+            "training_stamps_ns": [] if self.source.has_clock else self.stamps,
+            "time_steps": self.fitter.num_steps,
+            "iterations": self.fitter.descent.num_iterations,
+            "splats": last.alive,
+            "robot_splats": last.robot,
+            "shell_splats": len(self.fitter.shell_splats() or ()),
+            "added": sum(row.added for row in self.rows),
+            "relocated": sum(row.relocated for row in self.rows),
+            "robot_joints": None if self.robot is None else list(self.robot.joint_names),
+            "robot_links": None if self.robot is None else self.robot.extents(),
+            "unmet": last.unmet,
+            "evicted": sum(row.evicted for row in self.rows),
+            "unrepresented_voxels": last.unrepresented,
+            "unrepresented_volume": self.fitter.unrepresented.volume,
+            "max_unrepresented_voxels": max(row.unrepresented for row in self.rows),
+            "loss": last.loss,
+            "psnr": last.psnr,
+            "background": list(self.fitter.descent.background or (0.0, 0.0, 0.0)),
+            "mounted_share": {camera: float(mask.mean()) for camera, mask in self.fitter.mounted.items()},
+            "repeated_frames": dict(sorted(self.repeats.items())),
+            "frames_without_depth": sum(row.without_depth for row in self.rows),
+            "disagreement": self.agreement.disagreement,
+            **dict.fromkeys(("pose_residual", "depth_bend", "exposure_spread")),
+            **self.corrected,
+            **self_mask_metrics(self.rows),
+            "carried": self.declared.carried_uses(),
+            "first_frames": list(self.first_frames.values()),
+            "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
+        }
+
+    def _record(self, row: AuditRow) -> None:
+        self.rows.append(row)
+        self.writer.audit(row)
+
+    def snapshot(self, stamp_ns: int) -> None:
+        """Write the map as it is."""
+        assert self.fitter is not None
+        known, thresholds = self.fitter.known_voxels(), self.config.occupancy
+        states = known.grid.states(thresholds.free_below, thresholds.occupied_above)
+        self.writer.snapshot(stamp_ns, self.fitter.splats(), known, states, self.fitter.shell_splats())
+
+    def _save_if_due(self) -> None:
+        period = self.config.scene.checkpoint_period
+        if period > 0 and time.monotonic() < self._saved_at + max(period, LONGEST_SHARE * self._save_time):
+            return
+        start = time.monotonic()
+        self._save()
+        self._saved_at = time.monotonic()
+        self._save_time = self._saved_at - start
+
+    def _save(self, *, is_last: bool = False) -> None:
+        assert self.fitter is not None
+        progress = {
+            "run": self.identity,
+            **{name: getattr(self, name) for name in KEPT},
+            "disagreement": self.agreement.disagreement,
+            "depth": None if self.depth is None else asdict(self.depth),
+            "devices": self.device.history,
+            "stamps": [] if self.source.has_clock else self.stamps,
+        }
+        self.writer.checkpoint(progress, fitter_state(self.fitter), is_last=is_last)
+
+    def _restore(self, checkpoint: Checkpoint) -> None:
+        tuples = ("cameras", "blind")
+        self.rows = [
+            AuditRow(**row | {name: tuple(row[name]) for name in tuples if name in row})
+            for row in self.writer.audited()
+        ]
+        progress = checkpoint.progress
+        for name in (*KEPT, "stamps"):
+            setattr(self, name, progress[name])
+        self.agreement.disagreement = progress["disagreement"]
+        self.device.history = progress.get("devices", [{**Device().as_dict(), "from_iteration": 0}])
+        depth = progress["depth"]
+        self._fit_to(None if depth is None else RecordedDepth(**depth))
+        budget = len(checkpoint.state["is_alive"])
+        self.config = self.config.derived(scene=self.config.scene.derived(max_splats=budget))
+        self.fitter = self._new_fitter(workspace_of(checkpoint.state))
+        restore_fitter(self.fitter, checkpoint.state)
+
+    def time_steps(self) -> Iterator[TimeStep]:
+        """Those of the source, from its beginning."""
+        records, has_clock = self.source.records(), self.source.has_clock
+        steps = time_steps(records, self.cameras, has_clock=has_clock, observe=self._see, repeats=self.repeats)
+        return steps if self.cloud is None else (step.without_depth() for step in steps)
+
+    def _see(self, record: Record) -> None:
+        if isinstance(record, RgbdFrame):
+            if self.observe is not None:
+                self.observe(record)
+        elif self._first_state_ns is None:
+            self._first_state_ns = record.stamp_ns
+
+    def _fit_to(self, depth: RecordedDepth | None, console: Progress = SILENT) -> None:
+        """Choose the map's lengths, or beside a robot its sensor's error, by the first frames that have depth."""
+        if depth is None:
+            return
+        self.depth, before = depth, self.config
+        self.config = fitted_to(before, depth, has_robot=self.robot is not None)
+        if self.config is not before:
+            console.log(in_words(self.config, depth))
+
+    def _new_fitter(self, workspace: Box) -> SceneFitter:
+        scene = self.config.scene if self.source.has_clock else self.config.scene.derived(fill=1.0)
+        human, seed, threads = self.config.human, self.request.seed, self.request.threads
+        has_shell = self.robot is not None and scene.shell > 0
+        return SceneFitter(
+            scene, self.config.occupancy, workspace, human=human, seed=seed, threads=threads, has_shell=has_shell
+        )
+
+    def _needs_depth(self) -> bool:
+        """Whether only depth can say where the workspace is."""
+        return self.request.box is None and self.robot is None and self.cloud is None
+
+    def _workspace(self, first: TimeStep) -> Box:
+        if self.request.box is not None:
+            return self.request.box
+        if self.robot is not None:
+            return self.robot.reach_box
+        if self.cloud is not None:
+            return cloud_box(self.cloud)
+        return depth_box(first.frames, self.config.occupancy.max_range, self.config.scene.scale or 1.0)
+
+    def _posture(self, step: TimeStep) -> RobotPosture | None:
+        if self.robot is None or step.position is None:
+            return None
+        robot, names = self.robot, self.source.joint_names
+        at_frames = {stamp_ns: robot.positions_of(names, q) for stamp_ns, q in step.positions.items()}
+        carried = self.declared.carried_at(self._seconds(step.stamp_ns)) if self.declared.carried else ()
+        return posture_of(robot, robot.positions_of(names, step.position), at_frames, carried)
+
+    def _seconds(self, stamp_ns: int) -> float:
+        """Since the first joint state, which time steps with a posture come after."""
+        assert self._first_state_ns is not None
+        return (stamp_ns - self._first_state_ns) * 1e-9
+
+    def _count_carried(self, step: TimeStep, posture: RobotPosture | None) -> None:
+        """Count which declared boxes the frames needed."""
+        if posture is None or not self.declared.carried or self.robot is None:
+            return
+        seconds = self._seconds(step.stamp_ns)
+        if self.declared.carried_at(seconds):
+            for frame in step.frames:
+                mask = self_mask(frame, posture, self.config.occupancy)
+                count_carried(self.declared, frame, mask, posture, self.robot.surface_at(step.stamp_ns), seconds)

@@ -1,0 +1,214 @@
+"""The verdict of a reconstruction: whether there is a map, and what speaks against it, with when and where."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import MASK_PIXELS
+from splatctrl_cli.evaluate.gates import gate_reasons
+from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, FAULTS, Better, Scale
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, note, noted, verdict_of
+from splatctrl_cli.records import LossReport
+from splatctrl_cli.robot.declared_contact import carried_words
+from splatctrl_cli.scene.time_steps import AuditRow
+
+UNREPRESENTED = Scale(better=Better.LOWER, absolute=8, relative=0.05)  # voxels; by six four seeds are apart
+GATED = {
+    **dict.fromkeys(("time_steps", "iterations", "splats", "robot_splats", "added", "relocated"), DESCRIBES),
+    **dict.fromkeys(("unmet", "evicted"), DESCRIBES),  # more iterations ask for more slots
+    "unrepresented_voxels": UNREPRESENTED,
+    "unrepresented_volume": Scale(unit="m3", better=Better.LOWER, absolute=1e-4, relative=0.05),
+    "max_unrepresented_voxels": UNREPRESENTED,
+    "self_mask_residual_mm": Scale(unit="mm", better=Better.LOWER, absolute=0.5, relative=0.02),
+    "inside_robot_points": FAULTS,
+    "pose_residual": Scale(unit="m", better=Better.LOWER, absolute=5e-4, relative=0.05),
+    "depth_bend": DESCRIBES,
+    "exposure_spread": DESCRIBES,
+    "loss": Scale(better=Better.LOWER, absolute=1e-3, relative=0.02),
+    "psnr": DECIBELS,
+}  # what --require can name, and how two runs are compared by it
+LONGEST_BLIND = ReplayRequest.max_map_age  # [s] as long as a replay takes what it knows for evidence
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstructed:
+    """What the criteria look at: the metrics of ``run.json``, the audit's rows, and what the input lost. is_seeded:
+    from points, so that nobody looked at depth.
+    """
+
+    metrics: Mapping[str, Any]
+    rows: Sequence[AuditRow]
+    config: Config
+    loss: LossReport
+    is_seeded: bool = False
+    learned: Sequence[str] = ()
+
+    def seconds(self, stamp_ns: int) -> float:
+        """From the first time step [s]."""
+        return (stamp_ns - self.rows[0].stamp_ns) * 1e-9
+
+
+def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
+    """The verdict on a reconstruction: every criterion, and each ``--require``."""
+    metrics, counts = made.metrics, counts_of(made)
+    reasons = [reason for criterion in (_map, _blind, _calibration, _inside) for reason in criterion(made)]
+    return verdict_of(
+        "reconstruct",
+        [
+            *reasons,
+            *_held(metrics),
+            *_unbent(metrics),
+            *_loss_notes(made.loss),
+            *gate_reasons(require, {name: metrics[name] for name in GATED}, counts),
+        ],
+        scope=f"{metrics['time_steps']} time steps of {', '.join(metrics['cameras'])}, {metrics['splats']} splats",
+        notes=[*made.learned, *(carried_words(entry) for entry in metrics["carried"])],
+        is_damaged=bool(made.loss.damaged),
+        counts=counts,
+    )
+
+
+def counts_of(made: Reconstructed) -> dict[str, int]:
+    """What each of `GATED` rests on: time steps, or pixels of the robot."""
+    seen = [row["num_pixels"] for row in made.metrics["self_mask"].values()]
+    return dict.fromkeys(GATED, len(made.rows)) | {
+        "robot_splats": sum(seen),
+        "inside_robot_points": sum(seen),
+        "self_mask_residual_mm": sum(num for num in seen if num >= MASK_PIXELS),
+        "loss": sum(row.loss is not None for row in made.rows),
+        "psnr": sum(row.psnr is not None for row in made.rows),
+    }
+
+
+def _held(metrics: Mapping[str, Any]) -> Iterator[Reason]:
+    """The views whose poses could not be put right, where that was asked for."""
+    held = metrics.get("poses", {}).get("held", [])
+    if held:
+        shown = ", ".join(held[:3]) + (f" and {len(held) - 3} more" if len(held) > 3 else "")
+        yield noted("poses", f"not put right, too far off or seen by no other view: {shown}")
+
+
+def _unbent(metrics: Mapping[str, Any]) -> Iterator[Reason]:
+    """The cameras whose depth is not what they measured, and by how much."""
+    for camera, bend in metrics.get("depth_bends", {}).items():
+        yield noted("depth", f"{camera}: freed of a bend of at most {100 * bend['largest']:.1f} % of the depth")
+
+
+def _loss_notes(loss: LossReport) -> Iterator[Reason]:
+    """What the input lost."""
+    if loss.invalid_depth:
+        yield noted("input", f"{loss.invalid_depth} pixels of depth NaN, infinite, negative or 65535: taken as none")
+    for text in loss.notes:
+        yield noted("input", text)
+
+
+def _map(made: Reconstructed) -> Iterator[Reason]:
+    """Whether there is anything that a distance could be taken to: splats, and occupied voxels without one."""
+    metrics, scene = made.metrics, made.config.scene
+    num = metrics["unrepresented_voxels"]
+    num_splats = metrics["splats"] - metrics["robot_splats"]
+    is_empty = num_splats + num == 0
+    yield Reason(
+        criterion="map",
+        outcome=Outcome.NOT_EVALUABLE if is_empty else Outcome.PASSED,
+        sentence="it is empty: no splat of an object is left" if is_empty else f"{num_splats} splats of objects",
+        value=float(num_splats),
+        threshold=1.0,
+        remedy="give a --box that holds what the cameras saw, and check the depth with 'splatctrl check'"
+        if is_empty
+        else "",
+        count=num_splats + num,
+    )
+    if num:
+        yield note(
+            criterion="represented space",
+            sentence=f"{num} voxels ({1e3 * metrics['unrepresented_volume']:.2f} l) are occupied and have no splat; "
+            "they are obstacles as they are",
+            value=float(num),
+            remedy=f"raise --max-splats above {scene.max_splats}",
+            count=metrics["splats"] + num,
+        )
+
+
+def _blind(made: Reconstructed) -> Iterator[Reason]:
+    """Cameras that repeated their depth, or returned none for longer than evidence lasts."""
+    for camera, num in made.metrics["repeated_frames"].items():
+        yield noted("depth", f"camera {camera}: {num} frames repeat the depth of the one before: left out")
+    without = made.metrics["frames_without_depth"]
+    if made.is_seeded or not without:
+        return
+    longest = longest_blind(made.rows) if made.metrics["has_clock"] else {}
+    long = {camera: span for camera, span in longest.items() if (span[1] - span[0]) * 1e-9 > LONGEST_BLIND}
+    for camera, (first_ns, last_ns) in long.items():
+        start, end = made.seconds(first_ns), made.seconds(last_ns)
+        yield note(
+            criterion="depth",
+            sentence=f"camera {camera} returned none from {start:.2f} to {end:.2f} s",
+            value=end - start,
+            threshold=LONGEST_BLIND,
+            unit="s",
+            time_s=start,
+            who=camera,
+            remedy="nothing it looked at is known then: check it with 'splatctrl check'",
+            count=without,
+        )
+    if not long:
+        frames = "1 frame has" if without == 1 else f"{without} frames have"
+        yield noted("depth", f"{frames} none, which seeds nothing")
+
+
+def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
+    """By camera, the first and last stamp [ns] of its longest stretch of time steps without any depth."""
+    since: dict[str, int] = {}
+    longest: dict[str, tuple[int, int]] = {}
+    for row in rows:
+        for camera in set(row.cameras) - set(row.blind):
+            since.pop(camera, None)
+        for camera in row.blind:
+            span = (since.setdefault(camera, row.stamp_ns), row.stamp_ns)
+            longest[camera] = max(longest.get(camera, span), span, key=lambda one: one[1] - one[0])
+    return longest
+
+
+def _calibration(made: Reconstructed) -> Iterator[Reason]:
+    """Measured against rendered depth of the robot."""
+    told = {
+        link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["num_pixels"] >= MASK_PIXELS
+    }
+    if not told:
+        return
+    link = max(told, key=lambda name: abs(told[name]))
+    median, allowed = told[link], 1e3 * made.config.occupancy.self_mask_tolerance
+    is_off = abs(median) > allowed
+    side = "behind" if median > 0 else "before"
+    yield Reason(
+        criterion="calibration",
+        outcome=Outcome.PASSED,
+        sentence=f"{link} is measured {abs(median):.1f} mm {side} where its joints put it (median; tolerance "
+        f"{allowed:g} mm)",
+        value=median,
+        threshold=allowed,
+        unit="mm",
+        who=link,
+        remedy="calibrate camera and robot again, or raise occupancy.self_mask_tolerance" if is_off else "",
+        count=int(made.metrics["self_mask"][link]["num_pixels"]),
+        is_note=is_off,
+    )
+
+
+def _inside(made: Reconstructed) -> Iterator[Reason]:
+    """Measured points inside the robot that its surface does not explain."""
+    num, link = made.metrics["inside_robot_points"], made.metrics["inside_robot_first_link"]
+    if num:
+        yield note(
+            criterion="points inside the robot",
+            sentence=f"{num} measured points lie inside it where its surface does not explain them, first in {link}",
+            value=float(num),
+            time_s=made.seconds(made.metrics["inside_robot_first_ns"]),
+            who=link,
+            remedy="contact, a carried object, or calibration: 'splatctrl check' measures the last",
+            count=num,
+        )

@@ -1,0 +1,219 @@
+"""Which recording a job trains on or compares with, how it is opened, and whether what its cameras saw agrees."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from pathlib import Path
+
+from splatctrl_cli.jobs.running.progress import Progress
+
+from splatctrl_cli.checks.check_views import are_far, check_views, rescaled
+from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.config.fixed import POSE_JUMP
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
+from splatctrl_cli.jobs.check import refuse_errors
+from splatctrl_cli.recording.calibrated import LOGGED
+from splatctrl_cli.recording.capture.capture_header import is_capture
+from splatctrl_cli.recording.folder.dtu_source import DtuSource, view_numbers
+from splatctrl_cli.recording.folder.image_folder import ImageFolderSource
+from splatctrl_cli.recording.folder.layouts import has_views
+from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import RecordSource
+from splatctrl_cli.scene.recording_consistency import CAUSES, agreements, largest_jump
+from splatctrl_cli.scene.time_steps import TimeStep
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingRequest:
+    """path: a log, a capture or an image folder, or a DTU data set, of whose scans it is `scan` (None: the only one).
+
+    options: how it is read; of a scan, its holdout alone. protocol: which views train and which are scored. masks,
+    depths: folders with what the layout of the scan lacks. downscale: by how much its images are made smaller (None:
+    down to the size of the protocol). beside: further logs of the same session, to score views of. Raises UsageError
+    for such beside an image folder.
+    """
+
+    path: Path
+    is_dtu: bool = False
+    options: SourceOptions = field(default_factory=SourceOptions)
+    scan: str | None = None
+    protocol: str | None = None
+    masks: Path | None = None
+    depths: Path | None = None
+    downscale: int | None = None
+    beside: tuple[Path, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.beside and is_folder_of_views(self.path):
+            raise UsageError(f"--reference {self.path}: expected a log beside others, got images in a folder")
+
+
+def open_to_train(
+    recording: RecordingRequest,
+    *,
+    max_pose_jump: float = POSE_JUMP,
+    needs_depth: bool = True,
+    allowed: Collection[str] = (),
+) -> RecordSource:
+    """The recording without the views that it holds out. Raises UsageError for options that do not belong to it, and
+    InputError for a scan without depth, for a camera that jumps farther than `max_pose_jump` [m], and for what
+    `check` calls an error, but for `allowed` codes.
+    """
+    if recording.is_dtu:
+        scan = open_dtu(recording)
+        if needs_depth and not scan.has_depth:
+            raise InputError(
+                f"{recording.path}: scan '{scan.name}' has no depth",
+                remedy="give --depths DIR, or --points FILE.ply instead",
+            )
+        return scan
+    refuse_scan_options(recording)
+    if recording.protocol is not None:
+        return open_held_out(recording, needs_depth=needs_depth)[0]
+    source = open_source(recording.path, recording.options, needs_depth=needs_depth)
+    check_pose_jumps(source, max_pose_jump)
+    if needs_depth:
+        jumps = () if max_pose_jump == POSE_JUMP else ("pose-jump",)
+        refuse_errors(recording.path, recording.options, "reconstruct", (*allowed, *jumps))
+    return source
+
+
+def open_dtu(recording: RecordingRequest) -> DtuSource:
+    """A scan of a DTU data set."""
+    return DtuSource(
+        recording.path,
+        recording.scan,
+        view_numbers(recording.options.holdout or ()),
+        protocol=None if recording.protocol is None else score_protocol(recording.protocol),
+        masks=recording.masks,
+        depths=recording.depths,
+        downscale=recording.downscale,
+    )
+
+
+def open_held_out(
+    recording: RecordingRequest, *, needs_depth: bool = False
+) -> tuple[FrameSource, ScoreProtocol, Split]:
+    """An image folder with the views held out that the protocol holdout:RULE names, by their places in it."""
+    name, path = recording.protocol or "", recording.path
+    protocol = score_protocol(name)
+    if not is_folder_of_views(path) or not name.startswith("holdout:"):
+        raise UsageError(
+            f"--protocol {name}: expected --dtu, or holdout:RULE and an image folder (its TOML, or that"
+            " of a dataset)",
+            remedy="leave --protocol out, or give --dtu ROOT",
+        )
+    if recording.options.holdout:
+        raise UsageError("--holdout: the protocol says what is held out", remedy="leave one of them out")
+    options = replace(recording.options, cameras=None)
+    num = sum(1 for _ in open_source(path, options, needs_depth=needs_depth).poses())
+    split = protocol.split(range(num), str(path))
+    options = replace(options, holdout=tuple(map(str, split.scored)))
+    return open_source(path, options, needs_depth=needs_depth), protocol, split
+
+
+def is_folder_of_views(path: Path) -> bool:
+    """Whether a recording is images in a folder, by a TOML or in a dataset's layout; not a log, not a capture."""
+    return path.suffix == ".toml" or (not is_capture(path) and has_views(path))
+
+
+def guessed_unit(source: RecordSource) -> str:
+    """In which unit other than metres a recording's lengths look to be, in words; empty for most."""
+    return source.guess if isinstance(source, ImageFolderSource) else ""
+
+
+def refuse_scan_options(recording: RecordingRequest) -> None:
+    """Raise UsageError for what belongs to a DTU scan where there is none."""
+    for name in ("scan", "depths", "downscale", "masks"):
+        if getattr(recording, name):
+            raise UsageError(f"--{name} {getattr(recording, name)}: only with --dtu", remedy="leave it out")
+
+
+def check_pose_jumps(source: FrameSource, limit: float) -> None:
+    """Raise InputError for a camera that is suddenly elsewhere; where nobody knows when, views may lie anywhere."""
+    if not limit > 0:
+        raise UsageError(f"--max-pose-jump: expected metres, got {limit}")
+    jump = largest_jump(source.poses()) if source.has_clock else None
+    if jump is not None and jump.distance > limit:
+        later = (jump.after_ns - jump.before_ns) * 1e-9
+        raise InputError(
+            f"{source.name}: camera {jump.camera} jumps by {jump.distance:.2f} m from stamp {jump.before_ns} to"
+            f" {jump.after_ns} ns, {later:.3g} s later (expected at most {limit:g} m)",
+            remedy=f"correct the poses, leave the camera out with --cameras, or give --max-pose-jump"
+            f" {jump.distance + 0.01:.2f}",
+        )
+
+
+class CameraAgreement:
+    """disagreement [m]: of each pair of cameras that see enough of the same, how far apart they see it.
+
+    source: the recording. is_allowed: what does not fit is said, not refused. is_still: the scene does not move, so
+    that all views of a time step show the same. guess: in words, that the unit of lengths was guessed.
+    """
+
+    def __init__(self, source: RecordSource, *, is_allowed: bool, is_still: bool, guess: str = "") -> None:
+        self.disagreement: dict[str, float] = {}
+        self._source, self._name = source, source.name
+        self._is_allowed, self._is_still, self._guess = is_allowed, is_still, guess
+
+    def check(self, step: TimeStep, limits: OccupancyConfig, console: Progress) -> None:
+        """Compare once each pair of cameras, and of a still scene whether another depth scale would fit the views.
+
+        Raises InputError where cameras place surfaces too far apart, or views fit at another scale of depth only.
+        """
+        if not self._has_new_pairs(step):
+            return
+        if self._is_still and not self.disagreement:
+            self._check_scale(step, console)
+        for pair in agreements(step.frames, limits.min_range, limits.max_range):
+            name = " and ".join(dict.fromkeys(pair.cameras))
+            if name in self.disagreement:
+                continue
+            self.disagreement[name] = round(pair.median, 5)
+            if pair.holds:
+                continue
+            line = (
+                f"{self._name}: camera {name}: depths disagree by {1e3 * pair.median:.0f} mm (median of"
+                f" {pair.num_pixels} pixels that two views see; expected at most {1e3 * pair.limit:.0f} mm)"
+            )
+            if not self._is_allowed:
+                others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
+                refine = " (--refine-poses)" if self._is_still else " (splatctrl calibrate)"
+                raise InputError(
+                    line, remedy=f"{CAUSES}: correct poses or depth{refine},{others} or give --allow-disagreement"
+                )
+            console.log(f"warning: {line}; {CAUSES}: correct poses or depth, or expect surfaces twice")
+
+    def _check_scale(self, step: TimeStep, console: Progress) -> None:
+        cameras = sorted({frame.camera for frame in step.frames})
+        if self._guess:
+            console.log(f"warning: {self._name}: {self._guess}; the map is in metres")
+        found = check_views(step.frames, dict.fromkeys(cameras), is_sure=not self._guess and not are_far(step.frames))
+        for finding in found.findings:
+            if finding.code == "views-scale" and not self._is_allowed:
+                raise InputError(
+                    f"{self._name}: {finding.what}",
+                    remedy=f"{rescaled(self._units(), finding.value or 1.0)}, or correct the poses' unit; if both are"
+                    " right, give --allow-disagreement",
+                )
+            if finding.code == "views-scale":
+                console.log(f"warning: {self._name}: {finding.what}")
+
+    def _units(self) -> set[float | None]:
+        """Metres per count of depth, of each camera; None for sources that do not tell."""
+        units = dict[str, float | None]()
+        for frame in self._source.stored() if isinstance(self._source, LOGGED | ImageFolderSource) else ():
+            if isinstance(frame, StoredFrame):
+                units.setdefault(frame.camera, frame.depth_unit)
+            if len(units) == len(self._source.cameras):
+                break
+        return {*units.values()} or {None}
+
+    def _has_new_pairs(self, step: TimeStep) -> bool:
+        """Whether two views of this time step are from cameras that have not been compared yet."""
+        names = sorted(frame.camera for frame in step.frames)
+        pairs = {" and ".join(dict.fromkeys(pair)) for pair in combinations(names, 2)}
+        return not pairs <= self.disagreement.keys()

@@ -1,0 +1,281 @@
+"""``--evidence``: depth that did not train the map, and how far the map misses the surface that it shows.
+
+The field's value at a surface point is how far the map misses it. Where a sphere's true clearance is d and p the
+true surface point nearest to it, the map's clearance is at most d plus the miss at p, because the exact distance is
+1-Lipschitz. So if no surface within `verdict.evidence_reach` of the motion is missed by more than b, the true
+clearance is at least the map's less b, or more than that reach.
+
+`evaluate.conformal` says how b follows from the misses, what it promises and what it cannot.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+from splatctrl_cli.formats.scene.scene_folder import open_scene
+from splatctrl_cli.jobs.reconstruct.reconstruction import training_cameras
+from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.state_store import StoredAudit
+
+from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
+from splatctrl_cli.config.motion import VerdictConfig
+from splatctrl_cli.control.audit import DistanceFunction
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.conformal import ConformalBound, conformal_bound
+from splatctrl_cli.evaluate.held_out_depth import depth_edges
+from splatctrl_cli.field.distance import SphereField
+from splatctrl_cli.files.spilled_rows import ranges
+from splatctrl_cli.geometry import back_project, transform_points
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.state.state_source import open_states
+from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame, Stamps
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.time_steps import TimeStep, time_steps
+
+EVERY = "held_out_every"  # the metric of a scene in lockstep that says which frame sets did not train it
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapError:
+    """What held-out frame sets say of the map: `bound` is None where they are too few.
+
+    source: which frames, in words; num_sets: those within the judged time, num_seen of them with points near the
+    motion, num_points in all; time_s, place (3,) [m]: when (since the first judged state) and where the map misses as
+    much as the bound says. A bound below 0, of a map that is fatter than what it shows everywhere, is given as 0.
+    """
+
+    source: str
+    num_sets: int
+    num_seen: int
+    num_points: int
+    bound: ConformalBound | None
+    time_s: float | None = None
+    place: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """Where held-out frame sets come from: all of `cameras`, or (every: k) the k-th, 2k-th, ... of them."""
+
+    source: RecordSource
+    cameras: tuple[str, ...]
+    name: str
+    every: int | None = None
+
+    def frame_sets(self) -> Iterator[TimeStep]:
+        """Those that did not train, by time."""
+        return held_out(time_steps(self.source.records(), self.cameras, has_clock=True), self.every)
+
+
+def held_out(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
+    """Of all frame sets those that are evidence: each `every`-th, None: all."""
+    return islice(iter(steps), None if every is None else every - 1, None, every or 1)
+
+
+def trained(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
+    """The others, None: all."""
+    return (step for number, step in enumerate(steps, start=1) if every is None or number % every)
+
+
+def every_of(evidence: str | None) -> int | None:
+    """k, where every k-th frame set is evidence. Raises UsageError for a k that leaves nothing to train on."""
+    try:
+        every = int(evidence or "")
+    except ValueError:
+        return None
+    if every < 2:
+        raise UsageError(
+            f"--evidence {evidence}: expected a camera or every how many frame sets, at least 2",
+            remedy="every 4th, say, is left out of the training with --evidence 4",
+        )
+    return every
+
+
+def check_evidence(request: ReplayRequest) -> None:
+    """Raise UsageError for evidence that trained the map, as far as the request and its scene say that."""
+    if request.evidence is None:
+        return
+    every, asked = every_of(request.evidence), f"--evidence {request.evidence}"
+    if request.field is not None:
+        raise UsageError(f"{asked}: a baked field does not say which cameras made it", remedy="give --scene")
+    if request.lockstep:
+        if every is None and request.evidence in (request.options.cameras or ()):
+            raise UsageError(f"{asked}: --cameras names it as a training camera", remedy="leave it out of --cameras")
+        return
+    assert request.scene is not None
+    scene = open_scene(request.scene)
+    if every is None and request.evidence in scene.cameras:
+        raise UsageError(
+            f"{asked}: the camera trained {request.scene}",
+            remedy=f"name one that did not: any but {', '.join(scene.cameras)}",
+        )
+    if every is not None and scene.run.get("metrics", {}).get(EVERY) != every:
+        raise UsageError(
+            f"{asked}: every frame set of {', '.join(scene.cameras)} trained {request.scene}",
+            remedy="name a camera that did not, or give --lockstep, which leaves these sets out",
+        )
+
+
+def training_options(request: ReplayRequest, cameras: tuple[str, ...]) -> SourceOptions:
+    """How a lockstep reads the log: of its cameras without the one that is evidence. Raises UsageError where that is
+    the only one.
+    """
+    others = tuple(camera for camera in cameras if camera != request.evidence)
+    if not others:
+        raise UsageError(
+            f"--evidence {request.evidence}: no other camera is left to train on",
+            remedy="leave out frame sets instead, such as every 4th with --evidence 4",
+        )
+    return replace(request.options, cameras=others)
+
+
+def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
+    """The log once more, with the held-out cameras alone; None where the request names none.
+
+    Raises InputError where the log has no such camera, or that has no depth.
+    """
+    if request.evidence is None:
+        return None
+    every = every_of(request.evidence)
+    chosen = request.options.cameras if every is not None else (request.evidence,)
+    if every is not None and request.scene is not None:
+        chosen = open_scene(request.scene).cameras
+    source = open_states(request.log, replace(request.options, cameras=chosen), model.joint_names)
+    name = f"camera {request.evidence}" if every is None else f"each frame set of {every}"
+    if not source.cameras:
+        raise InputError(f"{request.log}: --evidence: expected cameras, got joint states alone")
+    if not source.has_clock:
+        raise InputError(f"{request.log}: --evidence: expected frames with times, got views without")
+    cameras = source.cameras if every is None else tuple(training_cameras(source))
+    evidence = Evidence(source=source, cameras=cameras, name=name, every=every)
+    if not any(step.has_depth for step in evidence.frame_sets()):
+        raise InputError(
+            f"{request.log}: --evidence: {name} has no pixel with depth", remedy="name a camera with depth"
+        )
+    return evidence
+
+
+def map_error(evidence: Evidence, inputs: ReplayInputs, audit: StoredAudit, config: VerdictConfig) -> MapError:
+    """How far the map misses what the held-out frame sets within the judged time show near the judged motion."""
+    found = misses_of(evidence.frame_sets(), inputs, audit, config.evidence_reach)
+    bound = conformal_bound(found.distance, config.confidence)
+    error = MapError(
+        source=evidence.name,
+        num_sets=len(found.stamp_ns),
+        num_seen=int(np.isfinite(found.distance).sum()),
+        num_points=found.num_points,
+        bound=None,
+    )
+    if bound is None:
+        return error
+    x, y, z = (float(value) for value in found.place[bound.at])
+    return replace(
+        error,
+        bound=replace(bound, bound=max(bound.bound, 0.0)),
+        time_s=float(found.stamp_ns[bound.at] - audit.stamp_ns[0]) * 1e-9,
+        place=(x, y, z),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Misses:
+    """Of T frame sets: stamp_ns (T,), the largest miss distance (T,) [m], NaN where none of its points counts, and
+    its place (T, 3) [m]; num_points that count in all.
+    """
+
+    stamp_ns: Stamps
+    distance: Float64
+    place: Float64
+    num_points: int
+
+
+def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: StoredAudit, reach: float) -> Misses:
+    """The largest miss of the map on surface within `reach` [m] of the audited motion that is not the robot, for each
+    frame set within the audited time. One set is held at a time.
+
+    The map is the one that states just before the set were judged by: it is oldest then. One that has taken in what
+    other cameras saw at the same moment is better than any that a state is judged by until the next.
+    """
+    swept = Swept.of(inputs.model, audit, reach)
+    motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
+    stamps: list[int] = []
+    worst: list[Float64] = []
+    num_points = 0
+    for step in frame_sets:
+        if not first_ns <= step.stamp_ns <= last_ns:
+            continue
+        points = np.concatenate(
+            [
+                apart_from_robot(inputs.model, motion.at(frame.stamp_ns)[0], swept.near(surface_points(frame)))
+                for frame in step.frames
+            ]
+        )
+        stamps.append(step.stamp_ns)
+        known = inputs.scene.at(max(step.stamp_ns - SAME_MOMENT_NS, first_ns))
+        worst.append(largest_miss(points, known.distances["exact"]))
+        num_points += len(points)
+    rows = np.array(worst).reshape(-1, 4)
+    return Misses(
+        stamp_ns=np.array(stamps, dtype=np.int64), distance=rows[:, 0], place=rows[:, 1:], num_points=num_points
+    )
+
+
+def surface_points(frame: RgbdFrame) -> Float64:
+    """The points (Q, 3) [m], world, that a frame measured, those at edges of its depth left out: they may lie between
+    two surfaces, where there is nothing.
+    """
+    is_chosen = (frame.depth > 0) & ~depth_edges(frame.depth)
+    return transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[is_chosen])
+
+
+def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
+    """Those of points (Q, 3) [m] that cannot be the robot at q (J,): farther than ROBOT_MARGIN from its spheres and
+    what these leave of it uncovered.
+    """
+    if not len(points):
+        return points
+    deficit = np.maximum(np.nan_to_num(np.asarray(model.sphere_deficit, np.float64)), 0.0)
+    body = SphereField(model.sphere_centers(q), model.sphere_set.radii + deficit)
+    return points[body.query(points)[0] > ROBOT_MARGIN]
+
+
+def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
+    """(4,) the largest distance [m] of points (Q, 3) to the map, and the point; NaN without points."""
+    if not len(points):
+        return np.full(4, np.nan)
+    values = distance(points)
+    worst = int(np.argmax(values))
+    return np.array([values[worst], *points[worst]])
+
+
+class Swept:
+    """Places within `reach` [m] of where an arm's moving spheres were, or up to SPHERE_CELL beyond."""
+
+    def __init__(self, cells: Float64, radii: Float64, reach: float) -> None:
+        """cells (K, 3): whole numbers of SPHERE_CELL; radii (K,) [m]: of the largest sphere that was there."""
+        centers, self._reach = (cells + 0.5) * SPHERE_CELL, reach
+        enlarged = radii + 0.5 * SPHERE_CELL * 3**0.5
+        self._field = SphereField(centers, enlarged)
+        far = (enlarged + reach)[:, None]
+        self._box = Box(lower=(centers - far).min(axis=0), upper=(centers + far).max(axis=0))
+
+    @classmethod
+    def of(cls, model: RobotModel, audit: StoredAudit, reach: float) -> "Swept":
+        """Of every audited state; memory grows with the space that the arm passed, not with its states."""
+        moving = np.flatnonzero(model.moving_spheres)
+        cells, radii = np.zeros((0, 3)), np.zeros(0)
+        for first, last in ranges(len(audit.stamp_ns)):
+            centers = model.sphere_centers_batch(audit.position[first:last])[:, moving]
+            cells = np.concatenate([cells, np.floor(centers.reshape(-1, 3) / SPHERE_CELL)])
+            radii = np.concatenate([radii, np.tile(model.sphere_set.radii[moving], last - first)])
+            cells, index = np.unique(cells, axis=0, return_inverse=True)
+            largest = np.zeros(len(cells))
+            np.maximum.at(largest, index.ravel(), radii)
+            radii = largest
+        return cls(cells, radii, reach)
+
+    def near(self, points: Float64) -> Float64:
+        """Those of points (Q, 3) [m] that are."""
+        inside = points[self._box.contains(points)]
+        return inside[self._field.query(inside)[0] <= self._reach] if len(inside) else inside

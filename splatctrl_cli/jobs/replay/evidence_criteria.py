@@ -1,0 +1,341 @@
+"""Criteria of a replay's verdict: whether the evidence reaches."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from splatctrl_cli.jobs.replay.criteria_input import (
+    MARGIN,
+    UNKNOWN,
+    Judged,
+    least_of,
+    mm,
+    nearby,
+    seconds_at,
+)
+from splatctrl_cli.jobs.replay.request import OCCUPIED
+from splatctrl_cli.jobs.replay.state_store import Figures
+from splatctrl_cli.jobs.replay.time_criteria import clocks, evidence_age, judged_time, map_age
+
+from splatctrl_cli.config.fixed import (
+    BEYOND,
+    COARSE_VOXEL,
+    HIDDEN,
+    MISPLACED,
+    UNSEEN,
+)
+from splatctrl_cli.evaluate.conformal import ConformalBound
+from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
+from splatctrl_cli.records import Float64
+from splatctrl_cli.voxels import EvidenceClass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limit:
+    """A row of the table of evidence. asked: of what, in the documentation's words, and why. column: of
+    `NEAR_COLUMNS`, with the classes of which the least counts; most: the largest share allowed, or least [m]: the
+    least distance (0: the margin); words, remedy: what is said.
+    """
+
+    asked: str
+    why: str
+    column: str
+    parts: tuple[EvidenceClass, ...] = ()
+    most: float | None = None
+    least: float = 0.0
+    words: str
+    remedy: str
+
+    @property
+    def name(self) -> str:
+        """That of the class it limits, else of its column."""
+        return self.parts[0].name.lower() if self.parts else self.column
+
+    def values(self, near: Figures) -> Float64:
+        """What it limits, at each state (T,); NaN where the space about the arm was not looked at."""
+        values = near[self.column]
+        return values[:, self.parts].min(axis=1) if self.parts else values
+
+    def is_broken(self, near: Figures, margin: float) -> bool:
+        """Whether any state breaks it; margin [m]."""
+        values = self.values(near)
+        return bool(np.any(values <= (self.least or margin)) if self.most is None else np.any(values > self.most))
+
+    @property
+    def docs(self) -> str:
+        """The row of the documentation's table, its cells separated by |."""
+        within = f"at most {100 * self.most:g} %" if self.most is not None else ""
+        distance = f"more than {1e3 * self.least:g} mm" if self.least else "more than the margin"
+        return f"{self.asked} | {within or distance} | {self.why}"
+
+
+LIMITS = (
+    Limit(
+        asked="never seen, of all points within the margin",
+        why="faultless recordings of three cameras leave up to 49 %; what this alone finds is met from 50 % on",
+        column="unseen",
+        most=UNSEEN,
+        words="of the space within the margin of the arm was never seen by a camera",
+        remedy="add a camera that sees where the arm goes",
+    ),
+    Limit(
+        asked="never seen, from a surface of the map",
+        why="one side of a thing says little of where the other ends",
+        column="unseen_to_surface",
+        least=HIDDEN,
+        words="space within the margin of the arm that no camera saw is {} from a surface of the map, allowed "
+        "{allowed}: it may go on there",
+        remedy="add a camera that sees that side",
+    ),
+    Limit(
+        asked="never seen, as nine tenths of the points about a sphere of the arm, from a surface of the map",
+        why="where the arm comes to nothing but the unseen, a whole thing may stand",
+        column="blind_to_surface",
+        least=BEYOND,
+        words="a part of the arm comes to space of which cameras saw less than a tenth, {} from a surface of the "
+        "map: it may go on there, allowed {allowed}",
+        remedy="add a camera that sees where the arm goes",
+    ),
+    Limit(
+        asked="unanswered, from the arm",
+        why="a dark, shiny or clear thing stands where depth was due and none came",
+        column="nearest",
+        parts=(EvidenceClass.UNANSWERED,),
+        words="cameras looked at a place {} from the arm and got no depth from it, margin {allowed}",
+        remedy="a dark, shiny or clear thing may stand there: add a camera that gets depth there",
+    ),
+    Limit(
+        asked="contradicted, from the arm",
+        why="a shiny thing is measured far behind its place",
+        column="nearest",
+        parts=(EvidenceClass.CONTRADICTED,),
+        words="{} from the arm, margin {allowed}, a camera measures through what another one sees",
+        remedy="a shiny thing may stand there: add a camera that sees it, or check depth scale and poses",
+    ),
+    Limit(
+        asked="depth edge, from the arm",
+        why="a surface may go on for a pixel where its edge was lost",
+        column="nearest",
+        parts=(EvidenceClass.DEPTH_EDGE,),
+        words="the edge of a surface was lost {} from the arm, margin {allowed}: it may go on for a pixel",
+        remedy="keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
+    ),
+    Limit(
+        asked="outside of the workspace, from the arm",
+        why="what stands there is in no map",
+        column="nearest",
+        parts=(EvidenceClass.OUTSIDE,),
+        words="the workspace of the map ends {} from the arm, margin {allowed}",
+        remedy="reconstruct with a larger --box",
+    ),
+)
+PROOF = Limit(
+    asked="not free, with `--require-proof` or `--unseen occupied`, from the arm",
+    why="such a run would be safe by an assumption",
+    column="nearest",
+    parts=tuple(kind for kind in EvidenceClass if kind is not EvidenceClass.FREE),
+    words="space that no camera saw free in time is {} from the arm, margin {allowed}",
+    remedy="add cameras until every side of the arm is seen",
+)
+
+
+def known_space(judged: Judged) -> Iterator[Reason]:
+    """Every point within the margin of the arm has one class of evidence, and each class keeps its limit (the table
+    below); at most `--max-unknown` of the sphere centres are in space never seen. A baked field needs its channel
+    `observed`.
+    """
+    for limit in LIMITS:
+        yield from _within(judged, limit)
+    if judged.request.unseen == OCCUPIED:
+        yield from _within(judged, PROOF, partial(failed, label=MARGIN))
+    elif judged.request.require_proof:
+        yield from _within(judged, PROOF)
+    yield from _unknown_share(judged)
+
+
+def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
+    """The reason that a limit gives: it is kept, or the state that breaks it most, as a reason of the kind `broken`.
+    What was not recorded proves nothing.
+    """
+    near = judged.replay.near
+    values = limit.values(near)
+    if limit is PROOF and np.isnan(near["assumed"]).all():
+        yield lacking(sentence="what cameras saw of the space about the arm, and when, is not recorded")
+    if limit.most is not None:
+        worst = nearby(judged, values)
+        if worst is None:
+            return
+        words = f"{100 * worst[0]:.0f} % {limit.words}"
+        if not limit.is_broken(near, judged.replay.margin):
+            yield held(words, worst[0], limit.most, "", worst[2])
+            return
+        yield broken(
+            sentence=f"{words}, allowed {100 * limit.most:g} %",
+            value=worst[0],
+            threshold=limit.most,
+            time_s=worst[1],
+            remedy=limit.remedy,
+            count=worst[2],
+        )
+        return
+    if not limit.is_broken(near, judged.replay.margin):
+        return
+    at, allowed = int(np.nanargmin(values)), limit.least or judged.replay.margin
+    if limit.parts:
+        nearest = min(limit.parts, key=lambda kind: float(near["nearest"][at, kind]))
+        place = near["places"].reshape(len(values), -1, 3)[at, nearest]
+    else:
+        place = near[f"{limit.column}_place"][at]
+    yield broken(
+        sentence=limit.words.format(mm(values[at]), allowed=mm(allowed)),
+        value=float(values[at]),
+        threshold=allowed,
+        unit="m",
+        time_s=seconds_at(judged, at),
+        place=tuple(place.tolist()),
+        cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*place),
+        remedy=limit.remedy,
+        count=int((values <= allowed).sum()),
+    )
+
+
+def _unknown_share(judged: Judged) -> Iterator[Reason]:
+    """Of the sphere centres, in space that no camera saw and the robot never was in."""
+    share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
+    if share is None:
+        yield lacking(sentence="what cameras saw is not recorded")
+        return
+    if share <= allowed:
+        yield held(f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.num_states)
+        return
+    first = int(np.argmax(judged.replay.audit.unknown_share > allowed))
+    yield lacking(
+        sentence=f"{100 * share:.1f} % of the sphere centres lie in space no camera ever saw, allowed "
+        f"{100 * allowed:g} %, first",
+        value=share,
+        threshold=allowed,
+        time_s=seconds_at(judged, first),
+        remedy="add a camera, or give a larger --max-unknown",
+        count=judged.num_states,
+    )
+
+
+def map_error(judged: Judged) -> Iterator[Reason]:
+    """With `--evidence`: the surface clearance less the bound on the map's error is at least 0.
+
+    With a smaller clearance no contact was seen, but the map cannot exclude one: not
+    evaluable, unless another measure fails. So is evidence that is too little for a bound.
+    """
+    found, surface = judged.replay.map_error, least_of(judged.replay.between["surface"])
+    if found is None:
+        if judged.request.require_evidence:
+            yield lacking(sentence="not measured", remedy="give --evidence a camera that did not train the map")
+        return
+    if found.bound is None:
+        yield lacking(
+            sentence=f"not bounded: of {found.num_sets} held-out frame sets in the judged time {found.num_seen} show "
+            "surface near the motion, too few for two independent stretches",
+            who=found.source,
+            remedy="judge a longer motion, or name another camera; verdict.evidence_reach says how near",
+            count=found.num_seen,
+        )
+        return
+    value = found.bound.bound
+    if surface is None:
+        return  # no distance at any state, which is said of them
+    if surface >= value:
+        yield held(bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
+        return
+    yield lacking(
+        sentence=f"the map may miss surface by {mm(value)} ({bound_words(found.bound)}), but the motion keeps only "
+        f"{mm(surface)}; it missed most",
+        value=surface - value,
+        threshold=0.0,
+        unit="m",
+        time_s=found.time_s,
+        place=found.place,
+        who=found.source,
+        cause="" if found.place is None else "at ({:.2f}, {:.2f}, {:.2f}) m".format(*found.place),
+        remedy="a map that misses less needs more cameras, newer frames or a larger --max-splats",
+        count=found.num_points,
+    )
+
+
+def bound_words(bound: ConformalBound) -> str:
+    """The bound on the map's error, and what it rests on."""
+    return (
+        f"map error at most {mm(bound.bound)} with {100 * bound.confidence:.3g} % confidence from "
+        f"{bound.num_stretches} stretches of held-out depth"
+    )
+
+
+def belonging(judged: Judged) -> Iterator[Reason]:
+    """Scene, log and robot belong together: digests, first frames, calibration, times, joints, links; files as
+    written; splats that agree with their occupancy grid.
+    """
+    for mismatch in judged.inputs.mismatches:
+        yield lacking(sentence=mismatch.sentence, remedy=mismatch.remedy)
+
+
+def calibration(judged: Judged) -> Iterator[Reason]:
+    """The cameras see the robot within 5 mm of where its joints put it."""
+    figures = judged.inputs.scene.figures()
+    residual, by_link = figures.get("self_mask_residual_mm"), figures.get("self_mask")
+    if residual is None or not isinstance(by_link, dict):
+        return
+    value = 1e-3 * float(residual)
+    if value <= MISPLACED:
+        yield held(f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
+        return
+    link, worst = max(by_link.items(), key=lambda item: abs(float(item[1]["median_mm"])))
+    yield lacking(
+        sentence=f"the cameras see {link} {mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its "
+        f"joints put it, allowed {mm(MISPLACED)}",
+        value=value,
+        threshold=MISPLACED,
+        unit="m",
+        who=str(link),
+        remedy="calibrate the cameras ('splatctrl check'), or correct URDF, joint zeros or depth scale",
+        count=int(worst["num_pixels"]),
+    )
+
+
+def map_resolution(judged: Judged) -> Iterator[Reason]:
+    """The map's voxels are at most 25 mm, as what no splat stands for may be as large as one; and what was taken for
+    the robot is nearer to it than the margin, as a thing that touches it may go unseen as far.
+    """
+    figures, margin = judged.inputs.scene.figures(), judged.replay.margin
+    voxel, by_link = figures.get("voxel"), figures.get("self_mask")
+    if voxel is not None and voxel > COARSE_VOXEL:
+        yield lacking(
+            sentence=f"the map has voxels of {mm(voxel)}, allowed {mm(COARSE_VOXEL)} beside a robot",
+            value=float(voxel),
+            threshold=COARSE_VOXEL,
+            unit="m",
+            remedy="reconstruct with --urdf, or with --set scene.scale=1",
+        )
+    reaches = {link: 1e-3 * row.get("reach_mm", 0.0) for link, row in (by_link or {}).items()}
+    blind = max(reaches, key=reaches.__getitem__, default=None)
+    if blind is not None and reaches[blind] > margin:
+        yield lacking(
+            sentence=f"what is within {mm(reaches[blind])} of {blind} was taken for the robot, margin {mm(margin)}",
+            value=reaches[blind],
+            threshold=margin,
+            unit="m",
+            who=blind,
+            remedy="lower occupancy.self_mask_tolerance or occupancy.depth_error, or place a camera nearer",
+        )
+
+
+OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
+    Criterion(name="map error", find=map_error, broken=UNKNOWN),
+    Criterion(name="evidence", find=belonging, broken=f"{UNKNOWN}; a changed file is refused (exit 4)"),
+    Criterion(name="calibration", find=calibration, broken=UNKNOWN),
+    Criterion(name="map resolution", find=map_resolution, broken=UNKNOWN),
+    Criterion(name="judged time", find=judged_time, broken=f"{UNKNOWN}; `--start-time first-map` judges the rest"),
+    Criterion(name="known space", find=known_space, broken=UNKNOWN),
+    Criterion(name="evidence age", find=evidence_age, broken=UNKNOWN),
+    Criterion(name="map age", find=map_age, broken=f"{UNKNOWN}; *contact* or *margin broken* by its own depth"),
+    Criterion(name="clocks", find=clocks, broken=UNKNOWN),
+)

@@ -1,0 +1,310 @@
+"""What a replay's controller is asked to reach: a pose, a configuration, waypoints, or the log's own twists; and who
+commands the arm: ours, or a user's own controller.
+"""
+
+import csv
+import math
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.replay.result import OutsideRun
+from splatctrl_cli.jobs.running.progress import Progress
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.goals import TwistTrack
+from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController, class_command
+from splatctrl_cli.control.preconditions import checked_posture
+from splatctrl_cli.control.replay import Waypoint
+from splatctrl_cli.control.step import OURS, Commander, ControlStep
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.recording.state.twists import read_twists
+from splatctrl_cli.records import Float64, FloatRows, Stamps
+from splatctrl_cli.robot.model import RobotModel
+
+WORLD = "world"
+TWIST_FIGURES = {
+    "twist_share": DESCRIBES,
+    "twist_share_capped": BAD_SHARE,
+    **dict.fromkeys(
+        ("mean_twist_error_linear", "max_twist_error_linear"),
+        Scale(unit="m/s", better=Better.LOWER, absolute=1e-3, relative=0.02),
+    ),
+    **dict.fromkeys(
+        ("mean_twist_error_angular", "max_twist_error_angular"),
+        Scale(unit="rad/s", better=Better.LOWER, absolute=1e-3, relative=0.02),
+    ),
+}
+POSE = "x,y,z,qx,qy,qz,qw"
+POSE_COLUMNS = tuple(POSE.split(","))
+
+
+def check_goal(request: ReplayRequest) -> None:
+    """Raise UsageError for an option that the mode does not use."""
+    asked, driven = ("open-loop", "closed-loop"), ("closed-loop",)
+    modes: dict[str, tuple[str, ...]] = {"re_anchor": driven}
+    modes |= dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), asked)
+    for option, wanted in modes.items():
+        given = getattr(request, option)
+        if given is not None and given is not False and request.mode not in wanted:
+            name = "--" + option.replace("_", "-")
+            raise UsageError(
+                f"{name}: expected --mode {' or '.join(wanted)}, got {request.mode}", remedy=f"leave out {name}"
+            )
+
+
+def goal_waypoints(
+    request: ReplayRequest, model: RobotModel, frame: str, logged_end: Float64
+) -> tuple[Waypoint, ...]:
+    """The goals that the options give, at least one; else the logged pose at the end."""
+    if request.goal is not None:
+        return (Waypoint(T_world_goal=transform_from(request.goal[:3], request.goal[3:])),)
+    if request.goal_joints is not None:
+        posture = _posture(model, np.array(request.goal_joints), logged_end)
+        return (Waypoint(T_world_goal=model.frame_pose(posture, frame), posture=posture),)
+    if request.waypoints is not None:
+        return read_waypoints(request.waypoints, model, frame)
+    return (Waypoint(T_world_goal=model.frame_pose(logged_end, frame)),)
+
+
+def _posture(model: RobotModel, values: Float64, logged_end: Float64) -> Float64:
+    """The configuration (J,) of --goal-joints; fingers of a gripper that have no values stay as logged at the end.
+
+    Raises InputError for another number of values, naming the joints.
+    """
+    is_arm = [name not in model.urdf.grippers for name in model.joint_names]
+    if len(values) == sum(is_arm):
+        posture = logged_end.copy()
+        posture[is_arm] = values
+        values = posture
+    return checked_posture(model, values, what="--goal-joints")
+
+
+def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint, ...]:
+    """The waypoints of a file: poses (columns or keys x, y, z, qx, qy, qz, qw) or postures (one per joint name).
+
+    CSV has a header; TOML an array of tables ``[[waypoint]]`` with ``pose = [...]`` or ``joints = [...]``.
+    Raises InputError, naming the waypoint.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {error}", remedy="give --waypoints a .toml or .csv file") from None
+    read = _csv_rows(path, text, model.joint_names) if path.suffix == ".csv" else _toml_rows(path, text)
+    rows = list(read)
+    if not rows:
+        raise InputError(f"{path}: expected at least one waypoint, got none")
+    waypoints = []
+    for number, (kind, row) in enumerate(rows):
+        what = f"{path}: waypoint {number}"
+        if kind == "joints":
+            posture = checked_posture(model, np.array(row), what=what)
+            waypoints.append(Waypoint(T_world_goal=model.frame_pose(posture, frame), posture=posture))
+            continue
+        try:
+            values = checked_pose(row)
+        except ValueError as error:
+            raise InputError(f"{what}: {error}") from None
+        waypoints.append(Waypoint(T_world_goal=transform_from(values[:3], values[3:])))
+    return tuple(waypoints)
+
+
+def _csv_rows(path: Path, text: str, joints: tuple[str, ...]) -> Iterator[tuple[str, list[float]]]:
+    reader = csv.DictReader(text.splitlines())
+    header = tuple(reader.fieldnames or ())
+    wanted = next((names for names in (POSE_COLUMNS, joints) if set(names) <= set(header)), None)
+    if wanted is None:
+        raise InputError(
+            f"{path}: expected the columns {POSE} or {','.join(joints)}, got {','.join(header) or 'none'}"
+        )
+    for number, row in enumerate(reader):
+        try:
+            yield "pose" if wanted is POSE_COLUMNS else "joints", [float(row[name]) for name in wanted]
+        except (TypeError, ValueError):
+            raise InputError(f"{path}: waypoint {number}: expected numbers, got {list(row.values())}") from None
+
+
+def _toml_rows(path: Path, text: str) -> Iterator[tuple[str, list[float]]]:
+    try:
+        document: dict[str, Any] = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    entries = document.get("waypoint", [])
+    for number, entry in enumerate(entries if isinstance(entries, list) else [entries]):
+        if not isinstance(entry, dict) or len(entry) != 1 or not set(entry) <= {"pose", "joints"}:
+            raise InputError(f"{path}: waypoint {number}: expected pose = [...] or joints = [...], got {entry}")
+        ((kind, values),) = entry.items()
+        if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
+            raise InputError(f"{path}: waypoint {number}: {kind}: expected an array of numbers, got {values}")
+        yield kind, [float(value) for value in values]
+
+
+def checked_pose(values: Sequence[float]) -> tuple[float, ...]:
+    """A pose as `POSE`, as it is. Raises ValueError for another number of values, or no unit quaternion."""
+    if len(values) != 7:
+        raise ValueError(f"expected 7 numbers {POSE}, got {len(values)}")
+    if not all(math.isfinite(value) for value in values):
+        raise ValueError(f"expected finite numbers, got {','.join(map(str, values))}")
+    length = math.hypot(*values[3:])
+    if abs(length - 1.0) > 0.01:
+        raise ValueError(f"expected a unit quaternion qx,qy,qz,qw, got one of length {length:.3f}")
+    return tuple(values)
+
+
+def check_twists(request: ReplayRequest) -> None:
+    """Raise UsageError for twists where no controller runs, or a frame without them."""
+    if request.twist_topic is not None and request.mode == "audit":
+        raise UsageError(
+            "--twist-topic: expected --mode open-loop or closed-loop", remedy="an audit does not ask the controller"
+        )
+    if request.twist_frame is not None and request.twist_topic is None:
+        raise UsageError("--twist-frame: expected --twist-topic", remedy="leave it out")
+
+
+def twist_track(
+    request: ReplayRequest, model: RobotModel, span_ns: tuple[int, int], console: Progress
+) -> TwistTrack | None:
+    """The twists that --twist-topic names, None without it. span_ns: first and last joint state.
+
+    Raises InputError where they are in no frame that is known, or all at other times.
+    """
+    if request.twist_topic is None:
+        return None
+    logged = read_twists(request.log, request.twist_topic)
+    frame = logged.frame if request.twist_frame is None else request.twist_frame
+    if frame != WORLD and frame not in model.frame_names:
+        raise InputError(
+            f"{logged.where}: expected twists in world or a link of the robot, got frame {frame!r}",
+            remedy=f"give --twist-frame, one of: world, {', '.join(model.frame_names)}",
+        )
+    first, last = int(logged.stamp_ns[0]), int(logged.stamp_ns[-1])
+    if last < span_ns[0] or first > span_ns[1]:
+        raise InputError(
+            f"{logged.where}: mixed clocks: expected twists between the joint states' stamps {span_ns[0]} and "
+            f"{span_ns[1]} ns, got {first} to {last} ns",
+            remedy="record both by one clock",
+        )
+    from_s, to_s = ((stamp - span_ns[0]) * 1e-9 for stamp in (first, last))
+    console.log(f"replay: {len(logged.stamp_ns)} twists in {frame}, {from_s:.2f} to {to_s:.2f} s of the log")
+    for note in logged.notes:
+        console.log(f"replay: {request.twist_topic}: {note}")
+    return TwistTrack(stamp_ns=logged.stamp_ns, twist=logged.twist, axes=None if frame == WORLD else frame)
+
+
+def twist_figures(
+    model: ArmModel,
+    config: ControlConfig,
+    frame: str,
+    track: TwistTrack | None,
+    stamp_ns: Stamps,
+    position: FloatRows,
+    steps: Sequence[ControlStep | None],
+) -> Mapping[str, float | None]:
+    """`TWIST_FIGURES` of a controller's T steps: the share of states where a twist holds, the share of these where it
+    was capped, and by how much [m/s, rad/s] the commanded twist misses it. Empty without twists.
+    """
+    if track is None:
+        return {}
+    is_known = track.is_known(stamp_ns, config.twist_timeout)
+    num_known = num_capped = 0
+    linear, angular = np.full(len(stamp_ns), np.nan), np.full(len(stamp_ns), np.nan)
+    for i, (stamp, q, step, known) in enumerate(zip(stamp_ns, position, steps, is_known, strict=True)):
+        reference = track.reference(model, config, q, int(stamp))
+        if known:
+            num_known += 1
+            asked = track.asked(model, q, int(stamp), config.twist_timeout)
+            num_capped += not np.array_equal(reference, asked)
+        if step is not None:
+            missed = model.frame_jacobian(q, frame) @ step.velocity - reference
+            linear[i], angular[i] = np.linalg.norm(missed[:3]), np.linalg.norm(missed[3:])
+    values = [float(is_known.mean()), num_capped / num_known if num_known else None]
+    for errors in (linear[~np.isnan(linear)], angular[~np.isnan(angular)]):
+        values += [float(np.mean(errors)), float(np.max(errors))] if len(errors) else [None, None]
+    return dict(zip(TWIST_FIGURES, values, strict=True))
+
+
+def check_controller(request: ReplayRequest) -> None:
+    """Raise UsageError for a controller that no mode asks, that cannot be meant, or options without one."""
+    if request.controller is None and request.controller_command is None:
+        if request.controller_twice or request.controller_step_limit != STEP_LIMIT:
+            raise UsageError(
+                "--controller-twice, --controller-step-limit: expected a controller",
+                remedy="give --controller or --controller-command, or leave them out",
+            )
+        return
+    if request.controller is not None and request.controller_command is not None:
+        raise UsageError("--controller, --controller-command: expected one of them, got both")
+    if request.mode == "audit":
+        raise UsageError(
+            "--controller, --controller-command: expected --mode open-loop or closed-loop",
+            remedy="an audit does not ask a controller",
+        )
+    _named_command(request)
+
+
+@contextmanager
+def commander_of(
+    request: ReplayRequest,
+    model: RobotModel,
+    config: ControlConfig,
+    console: Progress,
+    *,
+    frame: str,
+    home: Float64 | None,
+) -> Iterator[Commander]:
+    """Who is asked: our own controller, or the user's, which has ended when this does. Raises InputError for one that
+    does not start.
+    """
+    if request.controller is None and request.controller_command is None:
+        yield OURS
+        return
+    name, command = _named_command(request)
+    console.log(f"replay: starting the controller {name}")
+    with OutsideController(
+        name,
+        command,
+        model,
+        config,
+        frame=frame,
+        home=home,
+        step_limit=request.controller_step_limit,
+        is_twice=request.controller_twice,
+    ) as outside:
+        yield outside
+        if outside.num_answers:
+            mean, slowest = outside.seconds / outside.num_answers, outside.slowest
+            console.log(
+                f"replay: {outside.num_answers} answers, {1e3 * mean:.2g} ms each, at most {1e3 * slowest:.2g}"
+            )
+
+
+def outside_run(commander: Commander) -> OutsideRun | None:
+    """What there is to say of a user's controller, None of ours."""
+    if not isinstance(commander, OutsideController):
+        return None
+    return OutsideRun(name=commander.name, num_answers=commander.num_answers, failure=commander.failure)
+
+
+def _named_command(request: ReplayRequest) -> tuple[str, tuple[str, ...]]:
+    """What people call the controller, and its command line."""
+    if request.controller is not None:
+        if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", request.controller):
+            raise UsageError(f"--controller: expected module:Class, got {request.controller!r}")
+        return request.controller, class_command(request.controller)
+    text = request.controller_command or ""
+    try:
+        words = shlex.split(text)
+    except ValueError as error:
+        raise UsageError(f"--controller-command {text!r}: {error}", remedy="close the quotes") from None
+    if not words:
+        raise UsageError("--controller-command: expected a program and its arguments, got nothing")
+    return text, tuple(words)

@@ -1,0 +1,156 @@
+"""What the map of a moment did not show yet: later depth has a thing in the arm's place of that moment."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+from splatctrl_cli.jobs.replay.known_scene import KnownScene
+
+from splatctrl_cli.config.fixed import UNWATCHED_AFTER_NS, UNWATCHED_APART_NS, UNWATCHED_NS
+from splatctrl_cli.control.near_space import NearSpace
+from splatctrl_cli.records import Float64, Stamps
+
+STEP_NS = 100_000_000  # between looks after a motion
+
+ClearanceIn = Callable[[int, Stamps, Float64], Float64]
+"""In the scene known at a stamp, of states (T,), (T, J): their clearances (T,) [m], declared contact left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unwatched:
+    """A stretch of time without depth from about the arm, from `since_ns` to `until_ns`, after which a thing stands
+    in its place: the arm of `stamp_ns`, in that time, is `clearance` [m] from it, less than the margin.
+    """
+
+    since_ns: int
+    until_ns: int
+    stamp_ns: int
+    clearance: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overtaken:
+    """A state that keeps the margin in the map that was known at `stamp_ns`, and is `clearance` [m], less than the
+    margin, from a thing that the depth of `depth_ns` shows, which that map did not have yet.
+    """
+
+    depth_ns: int
+    stamp_ns: int
+    clearance: float
+
+
+class NewerDepth:
+    """Holds states against the depth of their own time where maps are late, and the last against the next depth."""
+
+    def __init__(self, scene: KnownScene, margin: float, clearance_in: ClearanceIn) -> None:
+        self._scene, self._margin, self._clearance_in = scene, margin, clearance_in
+        self._waiting: list[tuple[int, Float64]] = []  # states whose own depth is not known yet
+        self._last: tuple[int, Float64] | None = None
+        self.found: list[Overtaken] = []
+
+    def add(self, stamps: Stamps, positions: Float64, clearance: Float64) -> None:
+        """The next states (T,), (T, J), and their clearances (T,) [m] in the map that was known then."""
+        is_clear = clearance >= self._margin
+        states = [(int(stamps[k]), positions[k].copy()) for k in np.flatnonzero(is_clear)]
+        self._last = states[-1] if is_clear[-1] else None
+        if self._scene.latency_ns:
+            self._waiting += states
+            self._hold(int(stamps[-1]))
+
+    def finish(self) -> None:
+        """After the motion: what its last states' own depth shows, and the next after that."""
+        if self._last is None or not self._scene.stamps_ns:
+            return
+        stamp_ns, q = self._last
+        own_ns = stamp_ns + self._scene.latency_ns
+        self._hold(own_ns)
+        before_ns, known_ns = self._scene.depth_ns(own_ns), self._scene.next_ns(own_ns)
+        next_ns = None if known_ns is None else self._scene.depth_ns(known_ns)
+        if known_ns is None or before_ns is None or next_ns is None or next_ns - before_ns > UNWATCHED_NS:
+            return  # or `Hindsight` looks back at all that time
+        self._compare(known_ns, [(stamp_ns, q)])
+
+    def _hold(self, now_ns: int) -> None:
+        """Against the scenes that are known by now."""
+        late = self._scene.latency_ns
+        due = [state for state in self._waiting if state[0] + late <= now_ns]
+        del self._waiting[: len(due)]
+        for _, together in groupby(due, key=lambda state: self._scene.depth_ns(state[0] + late)):
+            states = list(together)
+            self._compare(states[0][0] + late, states)
+
+    def _compare(self, known_ns: int, states: Sequence[tuple[int, Float64]]) -> None:
+        stamps = np.array([stamp for stamp, _ in states])
+        clearance = self._clearance_in(known_ns, stamps, np.array([q for _, q in states]))
+        worst = int(clearance.argmin())
+        depth_ns = self._scene.depth_ns(known_ns)
+        if clearance[worst] < self._margin and depth_ns is not None:
+            self.found.append(
+                Overtaken(depth_ns=depth_ns, stamp_ns=int(stamps[worst]), clearance=float(clearance[worst]))
+            )
+
+
+class Hindsight:
+    """Keeps the postures since the last depth from about the arm, and holds them against the map after the next."""
+
+    def __init__(self, scene: KnownScene, near: NearSpace, margin: float, clearance_in: ClearanceIn) -> None:
+        self._scene, self._near, self._margin, self._clearance_in = scene, near, margin, clearance_in
+        self._stamps: list[int] = []
+        self._postures: list[Float64] = []
+        self._seen_ns: int | None = None  # when most of the space about the arm was last seen
+        self.found: list[Unwatched] = []
+
+    def add(self, stamps: Stamps, positions: Float64) -> None:
+        """The next states (T,), (T, J) of the motion."""
+        for at, stamp in enumerate(stamps.tolist()):
+            if not self._stamps or stamp >= self._stamps[-1] + UNWATCHED_APART_NS or at == len(stamps) - 1:
+                self._stamps.append(stamp)
+                self._postures.append(positions[at].copy())
+
+    def looked(self, stamp_ns: int, age_s: float) -> None:
+        """At a stamp the depth from about the arm was so old; NaN where that is not known."""
+        if not np.isfinite(age_s):
+            return
+        seen_ns = stamp_ns - round(age_s * 1e9)
+        before, self._seen_ns = self._seen_ns, max(seen_ns, self._seen_ns or seen_ns)
+        num = int(np.searchsorted(self._stamps, self._seen_ns, side="right"))
+        if before is not None and self._seen_ns - before > UNWATCHED_NS and num:
+            self._hold_against(before, stamp_ns, num)
+        del self._stamps[:num], self._postures[:num]
+
+    def finish(self) -> None:
+        """After the motion: wait for the next depth, and look back once more."""
+        if not self._stamps or self._seen_ns is None:
+            return
+        last_ns, last = self._stamps[-1], self._postures[-1]
+        for stamp_ns in self._later(last_ns):
+            known = self._scene.seen_at(stamp_ns)
+            if known is not None:
+                self.looked(stamp_ns, self._near.look(stamp_ns, last, known).age)
+            if not self._stamps:
+                return
+
+    def _later(self, stamp_ns: int) -> Iterator[int]:
+        """Stamps at which a newer scene is known."""
+        shown = self._scene.age_s(stamp_ns)
+        for later_ns in range(stamp_ns + STEP_NS, stamp_ns + UNWATCHED_AFTER_NS, STEP_NS):
+            age = self._scene.age_s(later_ns)
+            if age < shown + (later_ns - stamp_ns) * 1e-9 - 1e-6:
+                yield later_ns
+
+    def _hold_against(self, since_ns: int, until_ns: int, num: int) -> None:
+        """The first `num` postures against the map at `until_ns`: those that were clear of what was known of then."""
+        stamps, q = np.array(self._stamps[:num]), np.asarray(self._postures[:num])
+        after = self._clearance_in(until_ns, stamps, q)
+        near = np.flatnonzero(after < self._margin)
+        before = (self._clearance_in(int(stamps[k]), stamps[[k]], q[[k]])[0] for k in near)  # each in its own time
+        late = [k for k, clearance in zip(near, before, strict=True) if clearance >= self._margin]
+        if not late:
+            return
+        worst = min(late, key=lambda k: after[k])
+        self.found.append(
+            Unwatched(
+                since_ns=since_ns, until_ns=until_ns, stamp_ns=self._stamps[worst], clearance=float(after[worst])
+            )
+        )

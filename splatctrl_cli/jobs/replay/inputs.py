@@ -1,0 +1,337 @@
+"""What a replay reads: the robot's model and what its spheres leave uncovered, and the states of a log."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.robot.logged_robot import other_frame, urdf_of, with_self_model
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+
+from splatctrl_cli.checks.check_states import PoseAgreement, check_angles, check_states, pose_agreement
+from splatctrl_cli.checks.clock_offset import (
+    ClockOffset,
+    ImageMotion,
+    RobotPoints,
+    estimate_clock_offset,
+    states_asked,
+)
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config.fixed import COVERED_COARSE, SELF_POSTURES
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
+from splatctrl_cli.geometry import transform_from, transform_points
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.recording.log.stored_frame import FrameSource
+from splatctrl_cli.recording.state.state_source import StateSource, open_states
+from splatctrl_cli.records import Box, Float64, RecordSource
+from splatctrl_cli.robot.coverage import LinkCoverage, coverage_of_solids
+from splatctrl_cli.robot.declared_contact import ExpectedContact
+from splatctrl_cli.robot.link_meshes import read_solids
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_collision import DisabledPair, read_srdf, without_disabled
+from splatctrl_cli.robot.self_margins import (
+    KeptMargin,
+    SelfSurfaces,
+    fixture_margins,
+    kept_margins,
+    with_kept_margins,
+)
+from splatctrl_cli.robot.self_model import ALWAYS
+
+MAX_NOTES = 10  # printed
+GRASPING = 1.0  # [s] before a thing is held, and after, in which the hand may touch it
+ANGLE = Scale(unit="rad")
+LOG_FIGURES = {  # they describe the log
+    "num_poses": DESCRIBES,
+    "max_pose_position": LENGTH,
+    "max_pose_rotation": ANGLE,
+    "max_pose_rest_position": LENGTH,
+    "max_pose_rest_rotation": ANGLE,
+    **dict.fromkeys(("clock_offset_s", "clock_uncertainty_s"), TIME),
+}
+FR3_LIMITS = (
+    "an FR3 refuses speeds near its position limits that its URDF allows; set control.velocity_limits = fr3 to keep "
+    "the published ones"
+)
+
+
+def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[RobotModel, FrameSource | StateSource]:
+    """The robot of the arguments or the log, and the log that moves it, fingers locked that it does not move.
+
+    Raises InputError for a log without joint states, UsageError where neither says which robot it is.
+    """
+    urdf = urdf_of(request.urdf, (request.log,), progress)
+    if urdf is None:
+        raise UsageError(f"replay: {request.log} does not describe the robot", remedy="give it with --urdf FILE")
+    T_world_base = None if request.base is None else transform_from(request.base[:3], request.base[3:])
+    model = RobotModel.from_urdf(
+        urdf, request.spheres, T_world_base=T_world_base, locked=request.locked, packages=request.packages
+    )
+    source = open_states(request.log, request.options, model.joint_names)
+    if not source.joint_names:
+        raise InputError(
+            f"{request.log}: expected joint states, got none", remedy="replay needs a log with /joint_states"
+        )
+    if request.urdf is None and request.base is None and (words := other_frame(urdf, source)):
+        progress.log(f"warning: the robot is placed at the origin: {words}; give --base if it stood elsewhere")
+    return with_self_model(model.moved_by(source.joint_names), request.self_model, request.scene), source
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredRobot:
+    """A robot whose spheres were measured against the URDF's collision geometry, the surfaces of its links (None
+    where they cannot be read), and the pairs of links whose spheres keep less than `control.self_margin`.
+    """
+
+    model: RobotModel
+    surfaces: SelfSurfaces | None
+    kept: tuple[KeptMargin, ...] = ()
+
+
+def measured_robot(
+    request: ReplayRequest, model: RobotModel, config: ControlConfig, recorded: Float64 | None = None
+) -> MeasuredRobot:
+    """The robot without the pairs that its SRDF names; for a controller, each pair with a margin that it can keep.
+
+    recorded: `recorded_postures`. Raises InputError where `config.coverage` is "margin" and no distance bounds what
+    is uncovered.
+    """
+    disabled: tuple[DisabledPair, ...] = ()
+    if request.srdf is not None:
+        disabled, _ = read_srdf(request.srdf, model.urdf)
+        model = model.with_self_pairs(without_disabled(model, disabled))
+    try:
+        solids = read_solids(model.urdf, list(request.packages))
+    except InputError as error:
+        model, surfaces = model.with_coverage(None, str(error)), None
+    else:
+        report = coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=COVERED_COARSE)
+        model = model.with_coverage(report)
+        surfaces = SelfSurfaces(model, solids, disabled, recorded)
+    if config.coverage == "margin":
+        _check_bounded(model)
+    kept = () if request.mode == "audit" else kept_margins(model, config.self_margin, surfaces)
+    beside = () if surfaces is None else fixture_margins(model, surfaces, config.margin)
+    model = with_kept_margins(model, config.self_margin, kept)
+    return MeasuredRobot(model=model, surfaces=surfaces, kept=(*kept, *beside))
+
+
+def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfig) -> list[str]:
+    """What a person should know of the robot before trusting this replay; a sentence each."""
+    model = robot.model
+    if request.mode == "audit":
+        return list(model.doubts)
+    is_fr3 = all(name.startswith("fr3_joint") for name in model.joint_names)
+    return [
+        *model.doubts,
+        *([FR3_LIMITS] if is_fr3 and config.velocity_limits == "urdf" else []),
+        *(
+            f"{' and '.join(pair.links)}: their spheres overlap in every posture sampled, and nothing tells whether "
+            "they touch: fit finer spheres (splatctrl robot spheres), or leave the pair out (--srdf)"
+            for pair in robot.kept
+            if pair.margin is None and not pair.is_fixture
+        ),
+    ]
+
+
+def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[str] = ()) -> dict[str, str]:
+    """What the robot's spheres stand for, by subject, a sentence each. by_surface: as of `ReplayTrace`."""
+    words = {"coverage": coverage_words(robot.model, config)}
+    kept = [pair for pair in robot.kept if pair.margin is not None]
+    if kept:
+        words["self_margins"] = _self_margin_words(robot, kept, config)
+    if by_surface:
+        links = ", ".join(dict.fromkeys(name.partition("[")[0] for name in by_surface))
+        words["by_surface"] = (
+            f"spheres that keep less than the margin, as their links' surfaces keep it: {len(by_surface)} of {links}"
+        )
+    if robot.surfaces is not None and robot.surfaces.fused:
+        pairs = ", ".join(" and ".join(pair) for pair in robot.surfaces.fused)
+        words["fused"] = (
+            f"not judged whether they touch, for they overlap in every posture recorded or sampled: {pairs}"
+        )
+    return words
+
+
+def _self_margin_words(robot: MeasuredRobot, kept: Sequence[KeptMargin], config: ControlConfig) -> str:
+    """Which pairs of links keep less than the margin asked for."""
+    each = ", ".join(f"{' and '.join(pair.links)} {1e3 * (pair.margin or 0.0):.1f} mm{_told(pair)}" for pair in kept)
+    judged = "" if robot.surfaces is None else "; whether links touch is judged by their surfaces"
+    return f"self-collision margin: {1e3 * config.self_margin:g} mm, or what spheres can keep: {each}{judged}"
+
+
+def _told(pair: KeptMargin) -> str:
+    if pair.surface_gap is None:
+        return ""
+    if pair.surface_gap <= 0:
+        return " (their spheres do not tell when their surfaces meet)"
+    return f" (their surfaces then {1e3 * pair.surface_gap:.1f} mm)"
+
+
+def coverage_words(model: RobotModel, config: ControlConfig) -> str:
+    """What the spheres leave uncovered, or why that is not known, and the margin that then holds for the surface."""
+    report = model.coverage
+    if report is None:
+        return f"how much of the surface the spheres cover is not known: {model.coverage_unknown}"
+    if not report.bare_links and report.max_deficit == 0:
+        return "the spheres cover all of the collision surface (proven): the margin is that of the surface"
+    far = max((link for link in report.links if link.deficit is not None), key=_proven, default=None)
+    words = "no link has spheres" if far is None else f"the spheres leave up to {1e3 * _proven(far):.2f} mm uncovered"
+    words += "" if far is None else f" ({far.link})"
+    if config.coverage == "margin":
+        words += (
+            f"; their rows keep that much more, link by link, so that the surface keeps {1e3 * config.margin:g} mm"
+        )
+    else:
+        left = 1e3 * (config.margin - (0.0 if far is None else _proven(far)))
+        words += f"; where they keep {1e3 * config.margin:g} mm the surface keeps " + (
+            f"{left:.2f} mm" if left > 0 else "nothing for certain"
+        )
+    bare = f", and nothing of {', '.join(report.bare_links)}, which have no sphere" if report.bare_links else ""
+    return words + bare
+
+
+def _check_bounded(model: RobotModel) -> None:
+    """Raise InputError where a link that moves has no sphere, or nothing was measured."""
+    wanted = "control.coverage = margin"
+    if model.coverage is None:
+        raise InputError(
+            f"{wanted}: {model.coverage_unknown}", remedy="or set control.coverage = report, which needs no meshes"
+        )
+    bare = bare_moving_links(model)
+    if bare:
+        raise InputError(
+            f"{wanted}: expected spheres on every link that moves, got none on {', '.join(bare)}",
+            remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {model.urdf.path.name}",
+        )
+
+
+def bare_moving_links(model: RobotModel) -> list[str]:
+    """Links with a body, moved by a joint, that have no sphere; none where the coverage was not measured."""
+    if model.coverage is None:
+        return []
+    bodies = model.urdf.rigid_bodies()
+    children = {child for _, child in model.urdf.parents}
+    return [link for link in model.coverage.bare_links if bodies[link][0] in children]
+
+
+def _proven(link: LinkCoverage) -> float:
+    return 0.0 if link.deficit is None else max(0.0, link.deficit.proven)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoggedStates:
+    """States in the model's joint order, where they are from, and what was found about them.
+
+    poses: beside forward kinematics, None where the log has no end-effector poses; clock: of cameras against the
+    robot, None where the log has no frames.
+    """
+
+    source: RecordSource
+    states: StateColumns
+    poses: PoseAgreement | None
+    clock: ClockOffset | None = None
+
+    def as_dict(self) -> Mapping[str, Any]:
+        """For states.json."""
+        return {
+            "num_states": len(self.states),
+            "loss": asdict(self.source.loss),
+            "end_effector_poses": None
+            if self.poses is None
+            else asdict(self.poses) | {"offset": self.poses.offset.tolist()},
+            "clock_offset": None if self.clock is None else asdict(self.clock),
+        }
+
+    def metrics(self) -> dict[str, float | None]:
+        """`LOG_FIGURES`: None where the log has no poses, or the offset is not known."""
+        poses, clock = self.poses, self.clock
+        values = (
+            0 if poses is None else poses.num_poses,
+            None if poses is None else poses.difference.max_position,
+            None if poses is None else poses.difference.max_rotation,
+            None if poses is None else poses.rest.max_position,
+            None if poses is None else poses.rest.max_rotation,
+            None if clock is None else clock.offset_s,
+            None if clock is None else clock.uncertainty_s,
+        )
+        return dict(zip(LOG_FIGURES, values, strict=True))
+
+    def counts(self) -> dict[str, int]:
+        """How many poses or intervals each of `metrics` rests on; the number of poses rests on the states."""
+        num_poses = 0 if self.poses is None else self.poses.num_poses
+        num_intervals = 0 if self.clock is None else self.clock.num_intervals
+        return {name: num_intervals if name.startswith("clock_") else num_poses for name in [*LOG_FIGURES][1:]}
+
+    def lines(self) -> list[str]:
+        """A line for each thing that a person should know."""
+        notes = self.source.loss.notes
+        more = [f"and {len(notes) - MAX_NOTES} more notes in states.json"] if len(notes) > MAX_NOTES else []
+        found = [check.sentence for check in (self.poses, self.clock) if check is not None]
+        return [f"log: {line}" for line in (*notes[:MAX_NOTES], *more, *found)]
+
+
+def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedStates:
+    """The states of the robot's joints in a log, whose frames are not read yet: `clock_of` is known after them.
+
+    Raises InputError where they cannot be the robot's.
+    """
+    states = source.states.of_log(*model.joint_columns(source.joint_names))
+    check_states(states, model.joint_names)
+    check_angles(model, states, source.name)
+    return LoggedStates(source=source, states=states, poses=pose_agreement(model, states))
+
+
+def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[ExpectedContact]:
+    """Where the links of a hand meet what it takes and leaves: at its place then, before and after.
+
+    Until `GRASPING` after it is taken, too: the map still has it at its place.
+    """
+    bodies = model.urdf.rigid_bodies(set(model.joint_names) - set(model.urdf.grippers))
+    first_ns = int(states.stamp_ns[0])
+    for part in [] if model.self_model is None else model.self_model.held:
+        for stamp, before in ((part.start_ns, GRASPING), (part.end_ns, 0.0)):
+            if stamp in ALWAYS:
+                continue
+            q = states.position[int(np.abs(states.stamp_ns - stamp).argmin())]
+            corners = transform_points(model.frame_pose(q, part.link), part.triangles.reshape(-1, 3))
+            box = Box(lower=corners.min(axis=0) - part.voxel, upper=corners.max(axis=0) + part.voxel)
+            time, reason = 1e-9 * (stamp - first_ns), part.words(first_ns)
+            for link in [link for link in bodies if bodies[link][0] == bodies[part.link][0]]:
+                yield ExpectedContact(
+                    link=link, box=box, start=time - before, end=time + GRASPING, reason=reason, is_learned=True
+                )
+
+
+def recorded_postures(states: StateColumns) -> Float64:
+    """Postures (R, J) of a log: SELF_POSTURES of them or somewhat more, evenly over it, or all."""
+    return states.position[np.arange(0, len(states), max(len(states) // SELF_POSTURES, 1))]
+
+
+def check_inside(model: RobotModel, q: Float64, box: Box) -> None:
+    """Raise NotEvaluableError for a posture (J,) of which no moving sphere is in the box of a baked field."""
+    centers = model.sphere_centers(q)[np.flatnonzero(model.moving_spheres)]
+    beyond = np.maximum(box.lower - centers, centers - box.upper).max(axis=1)
+    if not len(centers) or beyond.min() <= 0:
+        return
+    lower, upper = ("(" + ", ".join(f"{v:.2f}" for v in corner) + ")" for corner in (box.lower, box.upper))
+    raise NotEvaluableError(
+        f"--field: expected the robot in the grid from {lower} to {upper} m, got all {len(centers)} moving spheres "
+        f"outside it, the nearest by {beyond.min():.2f} m",
+        remedy="check --base and the frame of the field, or bake a --box around the robot",
+    )
+
+
+def clock_of(model: RobotModel, logged: LoggedStates, motion: ImageMotion) -> ClockOffset | None:
+    """The offset of the cameras' clock, by how the log's images change; None without images, times or states."""
+    states = logged.states
+    if not motion.cameras or not logged.source.has_clock or not len(states):
+        return None
+    asked = states.select(states_asked(states.stamp_ns, motion))
+    centers = model.sphere_centers_batch(asked.position[: len(asked)])
+    moving = model.moving_spheres
+    return estimate_clock_offset(
+        asked, motion, RobotPoints(centers=centers[:, moving], radii=model.sphere_set.radii[moving])
+    )

@@ -1,0 +1,323 @@
+"""What a replay may know of the scene: a baked grid, or the splats as they were known at each time."""
+
+import math
+from bisect import bisect_right
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.scene.scene_folder import open_scene
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import NEXT_SCENE_NS
+from splatctrl_cli.control.audit import BallDistance, DistanceFunction, Observed, observed_at
+from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
+from splatctrl_cli.control.near_space import Seen
+from splatctrl_cli.control.scene_field import SceneStep, guarded
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.field.clustered_splats import Spheres
+from splatctrl_cli.field.distance import SphereField, field_over
+from splatctrl_cli.field.grid_field import GridField, exact_channel
+from splatctrl_cli.field.obstacles import NO_SPLAT, ObstacleSpheres, obstacle_spheres
+from splatctrl_cli.files.output import Parts, sha256
+from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, Index, Label, SplatSet, UInt8
+from splatctrl_cli.voxels import SWEPT, Balls, EvidenceClass, OccupancyGrid, SeenVoxels, VoxelState
+
+Key = TypeVar("Key", bound=Hashable)
+BY_CAMERA = (VoxelState.FREE, VoxelState.UNCERTAIN, VoxelState.OCCUPIED)  # voxels that a camera saw
+HELD = 2  # scenes whose fields are kept: a rate of change needs two
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownFields:
+    """The fields of one scene: `barrier` is what a controller uses, `distances` what an audit puts side by side.
+
+    obstacles: points (Q, 3) [m], world -> what is nearest to each. human: its people alone, None without any.
+    splats_alone: the exact distance without voxels that no splat represents, None where there are no such voxels.
+    balls: those of the barrier, None for a grid and where people count nearer than they are.
+    """
+
+    barrier: DistanceField
+    distances: Mapping[str, DistanceFunction]
+    median_radius: float
+    obstacles: Callable[[Float64], tuple[Obstacle, ...]]
+    human: DistanceField | None = None
+    splats_alone: DistanceFunction | None = None
+    balls: BallDistance | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownScene:
+    """`at(stamp_ns)` gives the same object for the same scene as long as it is in use; nothing is known before
+    `first_ns` (None: always).
+
+    observed: None where what cameras saw is not recorded. cameras: the cameras that made it, None where that is not
+    recorded. stamps_ns: of the scenes that are there one after the other (so far, where they are made on the way:
+    `advance` to a stamp makes those known then), empty for one scene for all times; each is known `latency_ns` after
+    its stamp. finish: to be called when the replay is done. box: of the centres of a grid's cells, None for splats.
+    moment_ns: the one time that a baked field is of, None where it has none. seen_at: what was known at a stamp
+    of when space was last seen, None where nothing is recorded; without has_seen_times only of whether it ever was.
+    figures: what the reconstruction reported of itself, once the replay is done. has_people_margin: whether people
+    are kept at another distance than things. made_from: of a baked field, `SceneFolder.made_from`.
+    """
+
+    at: Callable[[int], KnownFields]
+    observed: Observed | None
+    first_ns: int | None
+    cameras: tuple[str, ...] | None
+    digests: dict[str, str]
+    stamps_ns: Sequence[int] = ()
+    latency_ns: int = 0
+    advance: Callable[[int], None] = lambda stamp_ns: None
+    finish: Callable[[], None] = lambda: None
+    box: Box | None = None
+    moment_ns: int | None = None
+    seen_at: Callable[[int], Seen | None] = lambda stamp_ns: None
+    has_seen_times: bool = True
+    figures: Callable[[], Mapping[str, Any]] = dict
+    has_people_margin: bool = False
+    made_from: Mapping[str, Any] = field(default_factory=dict)
+
+    def age_s(self, stamp_ns: int) -> float:
+        """How old [s] the scene in use at a stamp is, of a field how far its moment is from it; NaN where there are
+        no times.
+        """
+        if self.moment_ns is not None:
+            return abs(stamp_ns - self.moment_ns) * 1e-9
+        index = self._index_at(stamp_ns)
+        return math.nan if index < 0 else (stamp_ns - self.stamps_ns[index]) * 1e-9
+
+    def depth_ns(self, stamp_ns: int) -> int | None:
+        """The stamp [ns] of the newest depth in the scene that is known at a stamp; None where there are no times."""
+        index = self._index_at(stamp_ns)
+        return None if index < 0 else self.stamps_ns[index]
+
+    def step_at(self, stamp_ns: int) -> SceneStep | None:
+        """The two newest scenes at a stamp, None where there is only one."""
+        index = self._index_at(stamp_ns)
+        if index < 1:
+            return None
+        older_ns, newer_ns = self.stamps_ns[index - 1 : index + 1]
+        older, newer = (self.at(stamp + self.latency_ns).barrier for stamp in (older_ns, newer_ns))
+        return SceneStep(newer=newer, older=older, seconds=(newer_ns - older_ns) * 1e-9)
+
+    def next_ns(self, stamp_ns: int) -> int | None:
+        """The stamp [ns] from which the scene after the one in use at a stamp is known; None without one soon."""
+        later = self._index_at(stamp_ns) + 1
+        self.advance(stamp_ns + NEXT_SCENE_NS)
+        known_ns = [stamp + self.latency_ns for stamp in self.stamps_ns[later : later + 1]]
+        return next((known for known in known_ns if known <= stamp_ns + NEXT_SCENE_NS), None)
+
+    def _index_at(self, stamp_ns: int) -> int:
+        self.advance(stamp_ns)
+        return bisect_right(self.stamps_ns, stamp_ns - self.latency_ns) - 1
+
+
+def fields_at(
+    stamps_ns: Sequence[int], latency_ns: int, key_of: Callable[[int], Key], fields_of: Callable[[Key], KnownFields]
+) -> Callable[[int], KnownFields]:
+    """The fields of the newest scene (by its index among `stamps_ns`) that is known at a stamp; those of the HELD
+    scenes used last are kept. It raises NotEvaluableError where none is known yet.
+    """
+    kept = lru_cache(maxsize=HELD)(fields_of)
+
+    def at(stamp_ns: int) -> KnownFields:
+        index = bisect_right(stamps_ns, stamp_ns - latency_ns) - 1
+        if index < 0:
+            raise NotEvaluableError(
+                f"no scene is known at stamp {stamp_ns} ns", remedy="it was not seen yet; ask for a later time"
+            )
+        return kept(key_of(index))
+
+    return at
+
+
+def from_grid(path: Path) -> KnownScene:
+    """The scene of a baked grid: one field for all times. `path` is a field folder or a ``field.npz``."""
+    file = path / "field.npz" if path.is_dir() else path
+    grid = read_npz(Parts.beside(file).checked(file))
+    barrier = GridField(grid)
+    states = grid.channels.get("observed")
+    observed = None if states is None else partial(observed_at, states.astype("uint8"), grid.origin, grid.voxel)
+    seen = None if observed is None else _seen_in_grid(observed, grid)
+    fields = KnownFields(
+        barrier=barrier,
+        distances={
+            "exact": _distance(GridField(replace(grid, channels={"sdf": exact_channel(grid)}))),
+            "barrier": _distance(barrier),
+            "certified": barrier.certified,
+        },
+        median_radius=_median_radius(file, grid.header),
+        obstacles=lambda points: _nearest_cells(grid, barrier, points),
+    )
+    return KnownScene(
+        at=lambda stamp_ns: fields,
+        observed=observed,
+        seen_at=lambda stamp_ns: seen,
+        has_seen_times=False,
+        first_ns=None,
+        cameras=None,
+        digests={file.name: sha256(file)},
+        moment_ns=moment if isinstance(moment := grid.header.get("stamp_ns"), int) else None,
+        box=barrier.box,
+        made_from=made if isinstance(made := grid.header.get("made_from"), dict) else {},
+    )
+
+
+def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0) -> KnownScene:
+    """The scene of a reconstruction: at each stamp the fields of its newest snapshot that is as old as the latency.
+
+    Known space is what a camera saw, and what the robot itself was in at some time of the log.
+    """
+    scene = open_scene(path)
+    stamps = sorted({snapshot.stamp_ns for snapshot in scene.snapshots} | {scene.stamp_ns})
+    has_times = scene.has_clock and bool(scene.snapshots)
+    if latency_ns and not has_times:
+        raise UsageError(
+            f"--latency: {path} is one scene for all times: expected snapshots", remedy="leave --latency out"
+        )
+
+    def fields(stamp_ns: int | None) -> KnownFields:
+        splats = scene.splats() if stamp_ns is None else scene.splats_at(stamp_ns)
+        return splat_fields(splats, config, threads, scene.unrepresented_at(stamp_ns))
+
+    def key_of(index: int) -> int | None:
+        return stamps[index] if index < len(stamps) - 1 else None  # the last is the final map
+
+    @lru_cache(maxsize=HELD)
+    def voxels(index: int) -> SeenVoxels | None:
+        is_last = not has_times or index == len(stamps) - 1
+        return scene.seen() if is_last else scene.snapshot_at(stamps[index]).seen()
+
+    def seen_at(stamp_ns: int) -> Seen | None:
+        index = bisect_right(stamps, stamp_ns - latency_ns) - 1 if has_times else 0
+        known = None if index < 0 else voxels(index)
+        return None if known is None else seen_of(known)
+
+    always = stamps if has_times else [-(2**63)]
+    return KnownScene(
+        at=fields_at(always, latency_ns, key_of if has_times else lambda _: None, fields),
+        observed=known_space(scene.occupancy()),
+        first_ns=stamps[0] + latency_ns if has_times else None,
+        cameras=tuple(scene.cameras),
+        digests={"splats.ply": sha256(path / "splats.ply")},
+        stamps_ns=tuple(stamps) if has_times else (),
+        latency_ns=latency_ns,
+        seen_at=seen_at,
+        figures=lambda: scene.run.get("metrics", {}),
+        has_people_margin=config.control.human_margin > config.control.margin,
+    )
+
+
+def seen_of(voxels: SeenVoxels) -> Seen:
+    """What the space about an arm is asked for."""
+    edges = np.column_stack([voxels.edges.centers, voxels.edges.radii]).astype(np.float64)
+    return Seen(look=voxels.look, edges=edges, origin=voxels.origin, voxel=voxels.voxel)
+
+
+def _seen_in_grid(observed: Observed, grid: DistanceGrid) -> Seen:
+    """What a baked grid says: whether a camera ever saw a place. It does not say when, or why not."""
+
+    def look(points: Float64) -> tuple[NDArray[np.int64], UInt8]:
+        is_seen = np.isin(observed(points), BY_CAMERA)  # the robot's spheres stick out: swept by them is not seen
+        classes = np.where(is_seen, EvidenceClass.FREE, EvidenceClass.OUT_OF_VIEW).astype(np.uint8)
+        return np.where(is_seen, np.int64(0), np.int64(-1)), classes
+
+    return Seen(look=look, origin=grid.origin, voxel=grid.voxel)
+
+
+def known_space(occupancy: OccupancyGrid) -> Observed:
+    """What a camera saw or the robot was in, of an occupancy grid."""
+    known = (occupancy.num_updates > 0) | ((occupancy.entity & SWEPT) > 0)
+    return partial(observed_at, known.astype("uint8"), occupancy.origin, occupancy.voxel)
+
+
+def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: Balls | None = None) -> KnownFields:
+    """Exact and barrier field of the splats and of the occupied voxels without one, the robot's own left out; in the
+    latter people count as much nearer as `control.human_margin` asks.
+    """
+    obstacles = obstacle_spheres(splats, unrepresented)
+    chosen = obstacles.splats
+    spheres = Spheres.of(chosen.centers, chosen.radii)
+    people = chosen.labels == Label.HUMAN
+    human = SphereField(chosen.centers[people], chosen.radii[people], threads=threads) if people.any() else None
+    barrier = guarded(field_over(spheres, config.field, threads=threads), human, config.control)
+    exact = SphereField.over(spheres, threads=threads)
+    balls = BallDistance(of_points=_distance(exact), centers=chosen.centers, radii=chosen.radii)
+    return KnownFields(
+        barrier=barrier,
+        distances={
+            "exact": balls,
+            "barrier": _distance(barrier),
+        },
+        median_radius=float(np.median(chosen.radii)),
+        obstacles=lambda points: _nearest_spheres(obstacles, exact.nearest(points), points),
+        human=human,
+        splats_alone=_splats_alone(obstacles, threads),
+        balls=balls if human is None or config.control.human_margin <= config.control.margin else None,
+    )
+
+
+def _splats_alone(obstacles: ObstacleSpheres, threads: int) -> DistanceFunction | None:
+    """The exact distance without the balls of voxels that no splat represents, None where there are none."""
+    if not obstacles.num_unrepresented:
+        return None
+    is_splat = obstacles.index != NO_SPLAT
+    centers, radii = obstacles.splats.centers[is_splat], obstacles.splats.radii[is_splat]
+    if not len(radii):
+        return lambda points: np.full(len(points), np.inf)
+    field = SphereField(centers, radii, threads=threads)
+    return BallDistance(of_points=_distance(field), centers=centers, radii=radii)
+
+
+def _nearest_spheres(obstacles: ObstacleSpheres, index: Index, points: Float64) -> tuple[Obstacle, ...]:
+    """The spheres that are nearest to points (Q, 3), by their index (Q,) in the field."""
+    splats = obstacles.splats
+    in_file = [None if k == NO_SPLAT else int(k) for k in obstacles.index[index]]
+    offset = points - splats.centers[index].astype(np.float64)
+    gap = np.linalg.norm(offset, axis=1)
+    radius = splats.radii[index].astype(np.float64)
+    surface = splats.centers[index] + offset * (radius / np.maximum(gap, 1e-12))[:, None]
+    return tuple(
+        Obstacle(
+            distance=float(gap[k] - radius[k]),
+            position=_place(surface[k]),
+            splat=in_file[k],
+            label=UNREPRESENTED if in_file[k] is None else Label(splats.labels[sphere]).name.lower(),
+        )
+        for k, sphere in enumerate(index)
+    )
+
+
+def _nearest_cells(grid: DistanceGrid, field: GridField, points: Float64) -> tuple[Obstacle, ...]:
+    """The cells that hold the nearest surface to points (Q, 3), as the gradient points to it."""
+    distance, gradient = field.query(points)
+    length = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
+    surface = points - gradient * (distance / length)[:, None]
+    cells = np.nan_to_num(np.floor((surface - grid.origin) / grid.voxel + 0.5)).astype(np.int64)
+    return tuple(
+        Obstacle(
+            distance=float(distance[k]), position=_place(surface[k]), cell=(int(cell[0]), int(cell[1]), int(cell[2]))
+        )
+        for k, cell in enumerate(cells)
+    )
+
+
+def _place(point: Float64) -> tuple[float, float, float]:
+    return float(point[0]), float(point[1]), float(point[2])
+
+
+def _distance(field: DistanceField) -> DistanceFunction:
+    return lambda points: field.query(points)[0]
+
+
+def _median_radius(file: Path, header: Mapping[str, object]) -> float:
+    radius = header.get("radius")
+    if not isinstance(radius, Mapping) or not isinstance(radius.get("median"), float):
+        raise InputError(f"{file}: header: expected the splats' median radius, got none", remedy="bake it again")
+    return float(radius["median"])

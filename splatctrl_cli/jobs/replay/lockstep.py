@@ -1,0 +1,281 @@
+"""A log's reconstruction in lockstep with its replay: frame sets are taken in as the replay's clock passes them."""
+
+import time
+from bisect import bisect_right
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from splatctrl_cli.formats.scene.voxel_file import read_seen, read_unrepresented
+from splatctrl_cli.formats.splat.splats import read_ply
+from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest
+from splatctrl_cli.jobs.recordings.open_recording import check_pose_jumps
+from splatctrl_cli.jobs.replay.evidence import EVERY, every_of, trained, training_options
+from splatctrl_cli.jobs.replay.known_scene import (
+    KnownFields,
+    KnownScene,
+    fields_at,
+    from_grid,
+    from_splats,
+    known_space,
+    seen_of,
+    splat_fields,
+)
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, FitDevice
+from splatctrl_cli.jobs.running.progress import Progress
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import POSE_JUMP
+from splatctrl_cli.control.audit import Observed
+from splatctrl_cli.control.near_space import Seen
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.files.output import Stopwatch, write_run
+from splatctrl_cli.jobs.check import refuse_errors
+from splatctrl_cli.recording.calibrated import LOGGED
+from splatctrl_cli.recording.log.stored_frame import FrameSource
+from splatctrl_cli.recording.state.state_source import open_states
+from splatctrl_cli.records import Float64, RecordSource, RgbdFrame, UInt8
+from splatctrl_cli.robot.declared_contact import Declarations
+from splatctrl_cli.robot.model import RobotModel
+
+FOLDER = "scene"  # within the replay's
+
+
+def check_lockstep(request: ReplayRequest) -> None:
+    """Raise UsageError for options that mean nothing without it."""
+    if request.latency and request.field is not None:
+        raise UsageError("--latency: a baked field is one scene for all times", remedy="give --scene or --lockstep")
+    if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != POSE_JUMP):
+        raise UsageError("--allow-disagreement, --max-pose-jump: expected --lockstep", remedy="leave them out")
+    if not request.lockstep and request.device.startswith(CUDA):
+        raise UsageError(f"--device {request.device}: expected --lockstep: only a fit is worth a card", remedy=TO_CPU)
+
+
+def opened_scene(
+    request: ReplayRequest,
+    model: RobotModel,
+    declared: Declarations,
+    folder: Path,
+    console: Progress,
+    source: RecordSource,
+    observe: Callable[[RgbdFrame], None] | None = None,
+) -> KnownScene:
+    """The scene that the options of a replay name; what --lockstep reconstructs, of the log `source`, goes into
+    `folder`, and `observe` is shown every frame of it.
+    """
+    if request.field is not None:
+        if request.config.control.human_margin > request.config.control.margin:
+            raise UsageError(
+                "control.human_margin: a baked field does not tell people from things", remedy="give --scene"
+            )
+        return from_grid(request.field)
+    if request.scene is not None:
+        return from_splats(request.scene, request.config, request.threads, latency_ns=_latency_ns(request))
+    return from_log(request, model, folder, console, declared, source, observe)
+
+
+def _latency_ns(request: ReplayRequest) -> int:
+    return int(request.latency * 1e9 + 0.5)
+
+
+def reads_whole_log(request: ReplayRequest, source: RecordSource) -> bool:
+    """Whether the scene is made of all frames of the log as it was opened: none is left out as evidence."""
+    return request.lockstep and request.evidence not in source.cameras
+
+
+def from_log(
+    request: ReplayRequest,
+    model: RobotModel,
+    folder: Path,
+    console: Progress,
+    declared: Declarations | None = None,
+    source: RecordSource | None = None,
+    observe: Callable[[RgbdFrame], None] | None = None,
+) -> KnownScene:
+    """The scene that a log's own cameras give as it goes; what is reconstructed is left in `folder`/scene.
+
+    source: the log, where it is open already. observe: is shown every frame of it, those behind the replay's end when
+    that is done. Raises InputError for a log without frames or a clock.
+    """
+    config = request.config
+    source = _training_source(request, model, source)
+    check_pose_jumps(source, request.max_pose_jump)
+    allowed = ("agreement", "views-scale", "alignment") if request.allow_disagreement else ()
+    jumps = () if request.max_pose_jump == POSE_JUMP else ("pose-jump",)
+    refuse_errors(request.log, request.options, "reconstruct", (*allowed, *jumps))
+    place = folder / FOLDER
+    place.mkdir()
+    asked = ReconstructRequest(
+        source=source,
+        out=place,
+        config=config,
+        seed=request.seed,
+        threads=request.threads,
+        allow_disagreement=request.allow_disagreement,
+    )
+    fitted = Reconstruction(
+        asked,
+        model,
+        place,
+        identity={"command": "replay --lockstep"},
+        declared=declared,
+        observe=observe,
+        device=FitDevice(request.device),
+    )
+    lockstep = Lockstep(
+        fitted,
+        config,
+        _latency_ns(request),
+        console,
+        ends_with_log=request.mode != "closed-loop",
+        held_out_every=every_of(request.evidence),
+    )
+    return lockstep.scene()
+
+
+class Lockstep:
+    """Frame sets that wait, and the stamps and files of the maps after those that were taken in.
+
+    ends_with_log: known space is that of the whole log, else that of the frame sets that the replay passed.
+    held_out_every: of so many frame sets one is not taken in, as it is evidence of the map's error.
+    """
+
+    def __init__(
+        self,
+        fitted: Reconstruction,
+        config: Config,
+        latency_ns: int,
+        console: Progress,
+        *,
+        ends_with_log: bool,
+        held_out_every: int | None = None,
+    ) -> None:
+        self._fitted, self._config, self._console = fitted, config, console
+        self._latency_ns, self._ends_with_log = latency_ns, ends_with_log
+        self._stopwatch = Stopwatch()
+        self._taking: list[tuple[int, float]] = []  # of each frame set, its stamp [ns] and the time [s] that it took
+        self._held_out_every = held_out_every
+        self._steps = trained(fitted.time_steps(), held_out_every)
+        self._next = next(self._steps, None)
+        self._stamps_ns: list[int] = []
+        self._files: list[Path] = []
+        self._known: tuple[int, Observed] = (0, lambda points: np.zeros(len(points), np.uint8))  # after so many
+
+    def scene(self) -> KnownScene:
+        """As a replay sees it; the first frame sets, up to the first map, are taken in at once."""
+        while self._next is not None and not self._stamps_ns:
+            self._take()
+        self._fitted.check_found()
+        known_at = fields_at(self._stamps_ns, self._latency_ns, self._files.__getitem__, self._fields)
+        voxels = lru_cache(maxsize=1)(lambda file: read_seen(file.with_suffix(".npz")))
+
+        def at(stamp_ns: int) -> KnownFields:
+            self._advance(stamp_ns)
+            return known_at(stamp_ns)
+
+        def seen_at(stamp_ns: int) -> Seen | None:
+            self._advance(stamp_ns)
+            index = bisect_right(self._stamps_ns, stamp_ns - self._latency_ns) - 1
+            known = None if index < 0 else voxels(self._files[index])
+            return None if known is None else seen_of(known)
+
+        return KnownScene(
+            at=at,
+            seen_at=seen_at,
+            figures=self._fitted.metrics,
+            observed=self._observed,
+            first_ns=self._stamps_ns[0] + self._latency_ns,
+            cameras=tuple(self._fitted.cameras),
+            digests={},
+            stamps_ns=self._stamps_ns,
+            latency_ns=self._latency_ns,
+            has_people_margin=self._config.control.human_margin > self._config.control.margin,
+            advance=self._advance,
+            finish=self._finish,
+        )
+
+    def _advance(self, stamp_ns: int) -> None:
+        """Take in every frame set that is known at a stamp."""
+        while self._next is not None and self._next.stamp_ns + self._latency_ns <= stamp_ns:
+            self._take()
+
+    def _take(self) -> None:
+        step, fitted, start = self._next, self._fitted, time.perf_counter()
+        assert step is not None
+        with self._stopwatch.stage("fit"), fitted.device.told_how_to_go_on(Path()):
+            fitted.take(step, self._console)
+        with self._stopwatch.stage("read"):
+            self._next = next(self._steps, None)
+        taken = fitted.writer.snapshots
+        if self._next is None and fitted.rows and taken[-1].stamp_ns < step.stamp_ns:
+            fitted.snapshot(step.stamp_ns)  # the log's last map, due or not
+        fitted.writer.settle()
+        self._taking.append((step.stamp_ns, time.perf_counter() - start))
+        for snapshot in taken[len(self._files) :]:
+            self._stamps_ns.append(snapshot.stamp_ns)
+            self._files.append(snapshot.path)
+
+    def _fields(self, file: Path) -> KnownFields:
+        balls = read_unrepresented(file.with_suffix(".npz"))
+        return splat_fields(read_ply(file)[0], self._config, self._fitted.request.threads, balls)
+
+    def _observed(self, points: Float64) -> UInt8:
+        """The known space of the log, or of as much of it as the replay has passed."""
+        while self._ends_with_log and self._next is not None:
+            self._take()
+        num_taken, known = self._known
+        if num_taken != len(self._fitted.rows):
+            assert self._fitted.fitter is not None
+            known = known_space(self._fitted.fitter.occupancy.grid())
+            self._known = len(self._fitted.rows), known
+        return known(points)
+
+    def _finish(self) -> None:
+        """Leave a scene folder as `reconstruct` writes it, of the frame sets that were taken in; the others are only
+        shown to who observes.
+        """
+        fitted = self._fitted
+        if fitted.observe is not None:
+            with self._stopwatch.stage("read"):
+                for _ in self._steps:
+                    pass
+        with self._stopwatch.stage("write"):
+            fitted.finish()
+        write_run(
+            fitted.writer.folder,
+            command="replay",
+            config=self._config.as_dict(),
+            inputs=fitted.source.digests(),
+            metrics=fitted.metrics() | {EVERY: self._held_out_every},
+            stopwatch=self._stopwatch,
+            seed=fitted.request.seed,
+        )
+        fitted.device.close()
+        self._console.log(self._speed())
+
+    def _speed(self) -> str:
+        """How long a frame set takes from its frames to its map, and how far apart they were recorded."""
+        stamps_ns, seconds = zip(*self._taking, strict=True)
+        middle, most = (f"{1e3 * float(t):.0f} ms" for t in np.percentile(seconds, [50, 99]))
+        apart = f", recorded {1e-6 * float(np.median(np.diff(stamps_ns))):.0f} ms apart" if len(stamps_ns) > 1 else ""
+        return (
+            f"lockstep: {len(seconds)} frame sets{apart}, took {middle} each in the median, {most} at 99 %; their"
+            f" maps are in {FOLDER}/"
+        )
+
+
+def _training_source(request: ReplayRequest, model: RobotModel, source: RecordSource | None) -> FrameSource:
+    """The log, whose frames are read in step with the replay; opened anew where one of its cameras is evidence."""
+    source = open_states(request.log, request.options, model.joint_names) if source is None else source
+    if not source.cameras:
+        raise InputError(
+            f"{request.log}: --lockstep: expected cameras, got joint states alone",
+            remedy="give --scene or --field of the same place",
+        )
+    if request.evidence in source.cameras:
+        source = open_states(request.log, training_options(request, source.cameras), model.joint_names)
+    if not isinstance(source, LOGGED):
+        raise UsageError(f"{request.log}: --lockstep: expected a log or a capture", remedy="give --scene or --field")
+    return source

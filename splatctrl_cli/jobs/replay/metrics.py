@@ -1,0 +1,374 @@
+"""Every figure of a replay, by a name that is known before the work: its value, what it rests on, and when it first
+broke a bound.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
+from functools import partial
+from operator import attrgetter
+
+import numpy as np
+from splatctrl_cli.jobs.replay.goal import TWIST_FIGURES
+from splatctrl_cli.jobs.replay.inputs import LOG_FIGURES, LoggedStates
+from splatctrl_cli.jobs.replay.result import Replay
+from splatctrl_cli.jobs.replay.state_store import RUNGS
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config.fixed import MOTION_WINDOW
+from splatctrl_cli.control.events import first_intervention
+from splatctrl_cli.control.fallbacks import Rung
+from splatctrl_cli.control.replay import Outcome, ReplayTrace
+from splatctrl_cli.control.terms import RowKind
+from splatctrl_cli.evaluate.clearance_agreement import ClearanceAgreement
+from splatctrl_cli.evaluate.metrics import (
+    AGE,
+    BAD_SHARE,
+    DESCRIBES,
+    ERROR,
+    FAULTS,
+    GAP,
+    GOOD_SHARE,
+    LARGEST,
+    LAST,
+    LEAST,
+    LENGTH,
+    LOWEST,
+    MEAN,
+    P95,
+    TIME,
+    TOTAL,
+    Better,
+    Metric,
+    Scale,
+    Shown,
+    counted,
+    folded,
+    largest_of,
+    least_of,
+)
+from splatctrl_cli.records import Bool, Float64
+from splatctrl_cli.voxels import EvidenceClass
+
+Metrics = dict[str, float | None]
+Counts = dict[str, int]
+Declared = tuple[Metric[Replay], ...]
+
+
+def num_states(replay: Replay) -> int:
+    """That were judged."""
+    return len(replay.audit.stamp_ns)
+
+
+def is_blank(replay: Replay) -> Bool:
+    """(T,) True where a field has no distance."""
+    blank = np.zeros(len(replay.audit.stamp_ns), dtype=np.bool_)
+    for of in replay.audit.clearance.values():
+        blank |= np.isnan(of.distance)
+    return blank
+
+
+def _single(
+    name: str,
+    value: Callable[[Replay], float | None],
+    count: Callable[[Replay], int] = num_states,
+    scale: Scale = DESCRIBES,
+) -> Metric[Replay]:
+    """A figure that is not made of a column."""
+    return Metric(name=name, value=value, count=count, scale=scale)
+
+
+def _clearance(field: str) -> Metric[Replay]:
+    name = "min_clearance" if field == "exact" else f"min_clearance_{field}"
+    shown = least_of(f"clearance_{field}")
+    return folded(name, LEAST, lambda replay: replay.audit.clearance[field].distance, scale=GAP, shown=shown)
+
+
+def _exact(replay: Replay) -> Float64:
+    return replay.audit.clearance["exact"].distance
+
+
+def _of(columns: str, name: str, part: int | None = None) -> Callable[[Replay], Float64]:
+    """Reads a column of the replay's figures, or a part of one: `between`, `near`, `strain`, `divergence`, or those
+    of a controller.
+    """
+    figures = attrgetter(columns)
+    return lambda replay: figures(replay)[name] if part is None else figures(replay)[name][:, part]
+
+
+def _intervals(replay: Replay) -> int:
+    return num_states(replay) - 1
+
+
+def _num_sudden(replay: Replay) -> int:
+    """States that have an acceleration, where that has a limit."""
+    since = replay.audit.stamp_ns - replay.audit.stamp_ns[0]
+    return int(np.sum(since >= 2 * MOTION_WINDOW * 1e9)) if np.any(replay.config.control.max_acceleration) else 0
+
+
+def _map_error(name: str, figure: str, scale: Scale) -> Metric[Replay]:
+    """By held-out depth; None without, or where that is too little."""
+
+    def value(replay: Replay) -> float | None:
+        bound = None if replay.map_error is None else replay.map_error.bound
+        found: float | None = None if bound is None else getattr(bound, figure)
+        return found
+
+    return _single(name, value, lambda replay: 0 if replay.map_error is None else replay.map_error.num_seen, scale)
+
+
+LIMIT = Scale(unit="rad", better=Better.HIGHER, absolute=1e-3)  # or m, of a prismatic joint
+SPEED = Scale(unit="rad/s", better=Better.LOWER, absolute=1e-3, relative=0.02)
+SLACK = Scale(unit="m/s", better=Better.HIGHER, absolute=1e-3, relative=0.02)  # or rad/s, by the row
+AT_GOAL = Scale(unit="m", better=Better.LOWER, absolute=ControlConfig().goal_position)  # within it, it is reached
+TURNED = Scale(unit="rad", better=Better.LOWER, absolute=ControlConfig().goal_rotation)
+RESIDUAL = Scale(better=Better.LOWER, absolute=1e-6)
+FULFILLED = Scale(better=Better.HIGHER)  # of 0 or 1, and of counts
+NEAREST = least_of("clearance_exact")
+OF_AUDIT: Declared = (
+    _single("num_spheres", lambda replay: len(replay.model.sphere_set.radii)),
+    _single("num_bare_links", lambda r: len(r.model.bare_links), lambda r: len(r.model.urdf.links), FAULTS),
+    _single(
+        "coverage_deficit",
+        lambda r: None if r.model.coverage is None else r.model.coverage.max_deficit,
+        lambda r: 0 if r.model.coverage is None else len(r.model.coverage.links),
+        ERROR,
+    ),
+    _single("num_self_pairs", lambda replay: len(replay.model.self_pairs())),
+    _single("num_states", num_states),
+    _single("num_before_scene", lambda replay: replay.num_before_scene, scale=FAULTS),
+    _single(
+        "duration_s", lambda replay: float(replay.audit.stamp_ns[-1] - replay.audit.stamp_ns[0]) * 1e-9, scale=TIME
+    ),
+)
+OF_STATES: Declared = (
+    folded(
+        "min_clearance_true",
+        LEAST,
+        lambda r: np.asarray(() if r.true_clearance is None else r.true_clearance),
+        scale=GAP,
+        shown=least_of("clearance_true"),
+    ),
+    counted("num_below_margin", _exact, lambda replay, values: values < replay.margin, shown=NEAREST),
+    counted("num_in_collision", _exact, lambda _, values: values < 0, shown=NEAREST),
+    folded(
+        "min_self_clearance",
+        LEAST,
+        lambda replay: replay.audit.self_clearance,
+        lambda replay: int(np.isfinite(replay.audit.self_clearance).sum()),
+        scale=GAP,
+        shown=least_of("self_clearance"),
+    ),
+    folded(
+        "min_limit_margin",
+        LEAST,
+        lambda replay: replay.audit.limit_margin,
+        num_states,
+        scale=LIMIT,
+        shown=least_of("limit_margin"),
+    ),
+    folded("max_velocity_share", LARGEST, _of("strain", "velocity"), _intervals, scale=BAD_SHARE),
+    folded("max_acceleration_share", LARGEST, _of("strain", "acceleration"), _num_sudden, scale=BAD_SHARE),
+    folded("min_clearance_surface", LEAST, _of("between", "surface"), scale=GAP, shown=NEAREST),
+    folded("min_clearance_between", LEAST, _of("between", "lower"), scale=GAP, shown=NEAREST),
+    folded("min_clearance_splats", LEAST, _of("between", "represented"), scale=GAP, shown=NEAREST),
+    folded("max_unseen_share", LARGEST, _of("near", "unseen"), scale=BAD_SHARE),
+    folded("max_assumed_share", LARGEST, _of("near", "assumed"), scale=BAD_SHARE),
+    folded("min_unseen_to_surface", LEAST, _of("near", "unseen_to_surface"), num_states, scale=GAP),
+    folded("min_blind_to_surface", LEAST, _of("near", "blind_to_surface"), num_states, scale=GAP),
+    *(
+        figure
+        for kind in EvidenceClass
+        for figure in (
+            folded(f"max_share_{kind.name.lower()}", LARGEST, _of("near", "shares", kind), scale=BAD_SHARE),
+            folded(f"min_distance_{kind.name.lower()}", LEAST, _of("near", "nearest", kind), num_states, scale=GAP),
+        )
+    ),
+    folded("max_evidence_age_s", LARGEST, _of("near", "age"), scale=AGE),
+    _single("unjudged_s", lambda r: float(r.between["unbounded"].sum()) + r.lead_in_s, _intervals, AGE),
+    folded(
+        "unknown_share",
+        MEAN,
+        lambda replay: replay.audit.unknown_share,
+        scale=BAD_SHARE,
+        shown=largest_of("unknown_share"),
+    ),
+    counted("num_without_distance", lambda r: is_blank(r).astype(np.float64), lambda _, values: values > 0),
+    _single(
+        "num_static_violations",
+        lambda r: len(r.static_violations),
+        lambda r: len(r.statics),
+        Scale(better=Better.LOWER, absolute=2, relative=0.05),
+    ),
+    folded(
+        "max_map_age_s",
+        LARGEST,
+        lambda replay: np.asarray(replay.map_age_s),
+        scale=AGE,
+        shown=largest_of("map_age_s"),
+    ),
+    _map_error("map_error_bound", "bound", ERROR),
+    _map_error("map_error_blocks", "num_stretches", DESCRIBES),
+    _map_error("map_error_confidence", "confidence", GOOD_SHARE),
+)
+
+
+LARGEST_DIFFERENCE, LEAST_SLACK = largest_of("velocity_difference"), least_of("barrier_margin_logged")
+FULFILLED_STEPS = Scale(better=Better.HIGHER, relative=0.05)
+STEPS, ASKED = partial(_of, "kept_steps.figures"), partial(_of, "open_loop.figures")
+
+
+def _rung(rung: Rung) -> Metric[Replay]:
+    name, shown = "num_" + rung.value.replace("-", "_"), Shown(column="rung", pick=rung.value)
+    scale = FULFILLED_STEPS if rung is Rung.SOLVED else FAULTS
+    return counted(name, STEPS("rung"), lambda _, values: values == RUNGS.index(rung), scale=scale, shown=shown)
+
+
+def _first_intervention(replay: Replay) -> float | None:
+    first = first_intervention(replay.events)
+    return None if first is None else first.start_s
+
+
+OF_STEPS: Declared = (
+    folded("intervention_share", MEAN, STEPS("shaped")),
+    *(folded(f"intervention_share_{kind}", MEAN, STEPS(f"shaped {kind}")) for kind in RowKind),
+    _single("first_intervention_s", _first_intervention, scale=TIME),
+    folded("min_barrier_clearance", LOWEST, STEPS("clearance"), scale=GAP, shown=least_of("barrier_clearance")),
+    *(_rung(rung) for rung in (Rung.SOLVED, Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD)),
+    folded("num_refused", TOTAL, STEPS("refused"), scale=FAULTS),
+    counted("num_scaled_back", STEPS("scale"), lambda _, values: values < 1, shown=least_of("scale")),
+    folded("max_residual", LARGEST, STEPS("residual"), scale=RESIDUAL, shown=largest_of("residual")),
+)
+OF_OPEN_LOOP: Declared = (
+    folded("mean_velocity_difference", MEAN, ASKED("size"), scale=SPEED, shown=LARGEST_DIFFERENCE),
+    folded("p95_velocity_difference", P95, ASKED("size"), scale=SPEED, shown=LARGEST_DIFFERENCE),
+    folded("max_velocity_difference", LARGEST, ASKED("largest"), scale=SPEED, shown=LARGEST_DIFFERENCE),
+    folded("min_barrier_margin_logged", LOWEST, ASKED("barrier"), scale=SLACK, shown=LEAST_SLACK),
+    counted("num_barrier_broken_logged", ASKED("barrier"), lambda _, values: values < 0, shown=LEAST_SLACK),
+    folded(
+        "min_velocity_margin_logged", LOWEST, ASKED("limit"), scale=SLACK, shown=least_of("velocity_margin_logged")
+    ),
+)
+
+
+def _trace(name: str, value: Callable[[ReplayTrace], float], scale: Scale = DESCRIBES) -> Metric[Replay]:
+    """A figure of the closed loop."""
+
+    def of_trace(replay: Replay) -> float:
+        assert replay.closed_loop is not None
+        return value(replay.closed_loop)
+
+    return _single(name, of_trace, scale=scale)
+
+
+OF_CLOSED_LOOP: Declared = (
+    _trace("goal_reached", lambda trace: int(trace.outcome is Outcome.GOAL_REACHED), FULFILLED),
+    _trace("stalled", lambda trace: int(trace.outcome is Outcome.STALLED), FAULTS),
+    _trace("num_goals_reached", lambda trace: trace.num_reached, FULFILLED),
+    _single("start_time_s", lambda replay: replay.start_time_s, scale=TIME),
+    _trace("num_steps", lambda trace: len(trace.steps)),
+    _trace("position_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[:3])), AT_GOAL),
+    _trace("rotation_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[3:])), TURNED),
+    _trace("num_scene_hits", lambda trace: sum(change.is_hit for change in trace.scene_changes), FAULTS),
+    _trace("num_anchors", lambda trace: len(trace.anchored)),
+    _trace("num_detours", lambda trace: len(trace.detours)),
+    *(
+        folded(
+            f"{prefix}_divergence_{name}",
+            fold,
+            column,
+            num_states,
+            scale=Scale(unit=unit),
+            shown=largest_of(f"divergence_{name}"),
+        )
+        for prefix, fold in (("max", LARGEST), ("end", LAST))
+        for name, unit, column in (
+            ("joints", "rad", _of("divergence", "joints")),
+            ("position", "m", _of("divergence", "position")),
+            ("rotation_deg", "degrees", lambda replay: np.degrees(_of("divergence", "rotation")(replay))),
+        )
+    ),
+)
+OF_MODE: dict[str, Declared] = {
+    "audit": (),
+    "open-loop": (*OF_STEPS, *OF_OPEN_LOOP),
+    "closed-loop": (*OF_STEPS, *OF_CLOSED_LOOP),
+}
+TRUTH = tuple(("num_compared" if f.name == "num_states" else f.name) for f in fields(ClearanceAgreement))
+AGREEMENT = {
+    **dict.fromkeys(("median", "p95", "largest", "largest_over"), ERROR),
+    "share_within": GOOD_SHARE,
+    "num_compared": DESCRIBES,
+}  # scales of TRUTH, without its tolerance
+
+
+def _declared(mode: str, of_fields: Sequence[str]) -> Declared:
+    """The metrics of a --mode with fields by name ("exact" first)."""
+    return (*OF_AUDIT, *map(_clearance, of_fields), *OF_STATES, *OF_MODE[mode])
+
+
+def _declared_of(replay: Replay) -> Declared:
+    return _declared(replay.mode, tuple(replay.audit.clearance))
+
+
+def metric_names(
+    mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
+) -> tuple[str, ...]:
+    """The names that `metrics_of` and the log's own figures have for a --mode."""
+    return tuple(metric_scales(mode, of_fields, has_truth=has_truth, has_twists=has_twists))
+
+
+def metric_scales(
+    mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
+) -> dict[str, Scale]:
+    """How two runs are compared by each of `metric_names`."""
+    scales = {metric.name: metric.scale for metric in _declared(mode, of_fields)}
+    scales |= LOG_FIGURES
+    scales |= TWIST_FIGURES if has_twists else {}
+    if has_truth:
+        scales |= {f"truth_{figure}_{name}": scale for name in of_fields for figure, scale in AGREEMENT.items()}
+        scales["truth_tolerance"] = LENGTH
+    return scales
+
+
+def shown_metrics(mode: str, of_fields: Sequence[str]) -> dict[str, Shown]:
+    """Where ``steps.csv`` shows the metrics that it shows, by name."""
+    return {metric.name: metric.shown for metric in _declared(mode, of_fields) if metric.shown is not None}
+
+
+def metrics_of(replay: Replay) -> Metrics:
+    """Every figure that is printed, written and gated on, by name; None where there is no value."""
+    metrics: Metrics = {metric.name: metric.value(replay) for metric in _declared_of(replay)}
+    metrics |= replay.twist_figures
+    for name, agreement in replay.agreement.items():
+        found = dict(zip(TRUTH, asdict(agreement).values(), strict=True))
+        tolerance = found.pop("tolerance")
+        metrics |= {f"truth_{figure}_{name}": value for figure, value in found.items()}
+        metrics["truth_tolerance"] = tolerance
+    return metrics
+
+
+def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> Counts:
+    """How many states, intervals, spheres or points each metric rests on; where nothing else is known of it, the
+    states that were judged.
+    """
+    found = dict.fromkeys(metrics, num_states(replay))
+    found |= {metric.name: metric.count(replay) for metric in _declared_of(replay)}
+    for field, agreement in replay.agreement.items():
+        names = (name for name in TRUTH if name not in {"num_compared", "tolerance"})
+        found |= {f"truth_{name}_{field}": agreement.num_states for name in names}
+    return {name: (found | logged.counts())[name] for name in metrics}
+
+
+def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> float | None:
+    """The first time [s] at which a metric, taken over the states until then, does not hold; None where it is no
+    figure of single states.
+    """
+    running = next((of.running for of in _declared_of(replay) if of.name == metric), None)
+    if running is None:
+        return None
+    start, values = running(replay)
+    if not holds(start):
+        return None
+    stamps = replay.audit.stamp_ns
+    first = next((index for index, value in enumerate(values) if not holds(float(value))), None)
+    return None if first is None else float(stamps[first] - stamps[0]) * 1e-9

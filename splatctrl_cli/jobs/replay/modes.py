@@ -1,0 +1,278 @@
+"""The replays themselves: audit, open loop and closed loop over what was read, and the truth beside them."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from splatctrl_cli.jobs.replay.detours import planned_ways_out
+from splatctrl_cli.jobs.replay.goal import commander_of, goal_waypoints, outside_run, twist_figures, twist_track
+from splatctrl_cli.jobs.replay.inputs import check_inside
+from splatctrl_cli.jobs.replay.known_scene import KnownScene
+from splatctrl_cli.jobs.replay.provenance import times_apart
+from splatctrl_cli.jobs.replay.request import FIRST_MAP, ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.result import Replay
+from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
+from splatctrl_cli.jobs.replay.state_store import Figures, StoredLoop, StoredOpenLoop
+from splatctrl_cli.jobs.running.progress import Progress
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.barriers import scene_margin
+from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
+from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
+from splatctrl_cli.control.preconditions import StaticViolation, check_within_limits, static_violations
+from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, StepRecord, closed_loop, divergence, scene_change
+from splatctrl_cli.control.step import Commander
+from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.records import Float64, Stamps
+from splatctrl_cli.robot.model import RobotModel
+
+
+def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
+    """The replay that --mode asks for, with its events."""
+    if inputs.scene.box is not None:
+        check_inside(inputs.model, inputs.states.position[0], inputs.scene.box)
+    mode = {"audit": _audited, "open-loop": _asked, "closed-loop": _driven}[request.mode]
+    return mode(request, inputs, config, console)
+
+
+def _audited(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
+    """The audit of every logged state for which a scene was known."""
+    first, record = _first_judged(request, inputs), _record(request, inputs, config)
+    for stamps, positions, velocities in _blocks(record, inputs.states, first):
+        record.explain(record.measured(stamps, positions, velocities))
+    return _logged(request, inputs, config, record, first)
+
+
+def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
+    """The audit, and the controller's command at every state of it."""
+    scene, model, states = inputs.scene, inputs.model, inputs.states
+    first, record = _first_judged(request, inputs), _record(request, inputs, config)
+    frame = request.frame or model.frame_names[-1]
+    twists = twist_track(request, model, _span(inputs), console)
+    task = OpenLoopTask(frame=frame, twists=twists)
+    if any(given is not None for given in (request.goal, request.goal_joints, request.waypoints)):
+        goals = goal_waypoints(request, model, frame, states.position[-1])
+        task = OpenLoopTask(frame=frame, T_world_goal=goals[-1].T_world_goal, home=goals[-1].posture)
+    console.log(f"replay: asking the controller at {len(states) - first} states")
+    asked = StoredOpenLoop()
+    with commander_of(request, model, config.control, console, frame=frame, home=task.home) as commander:
+        for stamps, positions, velocities in _blocks(record, states, first):
+            part = record.measured(stamps, positions, velocities)
+            trace = open_loop(
+                model,
+                config.control,
+                LoggedMotion(stamp_ns=stamps, position=positions, velocity=velocities),
+                task,
+                lambda stamp: scene.at(stamp).barrier,
+                has_distance=np.all([np.isfinite(c.distance) for c in part.clearance.values()], axis=0),
+                scene_step_at=scene.step_at,
+                commander=commander,
+            )
+            asked.add(trace)
+            record.explain(part, trace.steps)
+    audit = record.audit
+    figures = twist_figures(model, config.control, frame, twists, audit.stamp_ns, audit.position, asked.steps)
+    return replace(
+        _logged(request, inputs, config, record, first),
+        open_loop=asked,
+        kept_steps=asked.kept,
+        twist_figures=figures,
+        outside=outside_run(commander),
+    )
+
+
+def _with_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -> ReplayTrace:
+    """With what the first scene after the motion shows: something may have come between the last two."""
+    last_ns = int(trace.stamp_ns[-1])
+    next_ns = scene.next_ns(last_ns)
+    if next_ns is None:
+        return trace
+    before, after = scene.at(last_ns).barrier, scene.at(next_ns).barrier
+    change = scene_change(model, next_ns, np.asarray(trace.position[-1]), before, after)
+    return replace(trace, scene_changes=(*trace.scene_changes, change))
+
+
+def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
+    """The closed loop, the audit of the states it went through, and how far they are from the log."""
+    scene, model, record = inputs.scene, inputs.model, _record(request, inputs, config)
+    motion = inputs.motion()
+    twists = twist_track(request, model, _span(inputs), console)
+    task = _task(request, inputs, motion, twists, config.control.limit_tolerance)
+    start_s = (task.stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
+    limit = "to the log's end" if task.last_ns is not None else f"at most {config.control.max_time:g} s"
+    console.log(f"replay: from {start_s:.2f} s of the log, {limit}")
+    loop = StoredLoop(model.num_joints)
+    with commander_of(request, model, config.control, console, frame=task.frame, home=task.home) as commander:
+        trace = _trace(inputs, task, config, loop, commander)
+    trace = _with_next_scene(trace, scene, model)
+    apart = Figures()
+    for first, last in record.blocks(trace.stamp_ns):
+        stamps, positions = trace.stamp_ns[first:last], np.asarray(trace.position[first:last])
+        steps = trace.steps[first:last]
+        straight = np.zeros_like(positions)  # the driven arm moves straight from state to state
+        record.explain(record.measured(stamps, positions, straight), steps)
+        joints, position, rotation = divergence(model, task.frame, stamps, positions, motion)
+        apart.append(joints=joints, position=position, rotation=rotation)
+    return replace(
+        _replay(request, inputs, config, record, trace.static_violations, radius_of=0),
+        closed_loop=trace,
+        kept_steps=loop.kept,
+        divergence=apart,
+        twist_figures=twist_figures(
+            model, config.control, task.frame, task.twists, trace.stamp_ns, trace.position, trace.steps
+        ),
+        outside=outside_run(commander),
+    )
+
+
+def _trace(
+    inputs: ReplayInputs,
+    task: ReplayTask,
+    config: Config,
+    record: StepRecord,
+    commander: Commander,
+) -> ReplayTrace:
+    """The closed loop of a commander."""
+    scene = inputs.scene
+    return closed_loop(
+        inputs.model,
+        config.control,
+        task,
+        lambda stamp: scene.at(stamp).barrier,
+        scene_step_at=scene.step_at,
+        plan_detour=planned_ways_out(inputs, task, config),
+        record=record,
+        commander=commander,
+        distance_to=scene.at(task.stamp_ns).distances["exact"],
+        balls_at=lambda stamp: scene.at(stamp).balls,
+    )
+
+
+def _record(request: ReplayRequest, inputs: ReplayInputs, config: Config) -> ReplayRecord:
+    return ReplayRecord(
+        inputs.model,
+        inputs.scene,
+        config=config,
+        max_map_age=request.max_map_age,
+        is_continuous=request.re_anchor is None,
+        declared=inputs.declared,
+        first_state_ns=int(inputs.states.stamp_ns[0]),
+        surfaces=inputs.surfaces,
+        kept=inputs.kept,
+    )
+
+
+def _blocks(record: ReplayRecord, states: StateColumns, start: int) -> Iterator[tuple[Stamps, Float64, Float64]]:
+    """Stamps (T,), positions and velocities (T, J) of the states from `start` on, a block at a time."""
+    for first, last in record.blocks(states.stamp_ns[start:]):
+        part = slice(start + first, start + last)
+        yield states.stamp_ns[part], states.position[part], states.velocity[part]
+
+
+def _logged(request: ReplayRequest, inputs: ReplayInputs, config: Config, record: ReplayRecord, first: int) -> Replay:
+    """The replay of logged states from `first` on, whose static violations are those at the end."""
+    states, model = inputs.states, inputs.model
+    last = inputs.scene.at(int(states.stamp_ns[-1]))
+    statics = static_violations(model, last.barrier, states.position[-1], scene_margin(model, config.control))
+    return _replay(request, inputs, config, record, statics, radius_of=-1)
+
+
+def _replay(
+    request: ReplayRequest,
+    inputs: ReplayInputs,
+    config: Config,
+    record: ReplayRecord,
+    statics: tuple[StaticViolation, ...],
+    *,
+    radius_of: int,
+) -> Replay:
+    stamps = record.audit.stamp_ns
+    requested, logged = _requested_ns(request, inputs), inputs.states.stamp_ns
+    before = logged[(logged >= requested) & (logged < stamps[0])]
+    record.newer_depth.finish()
+    record.hindsight.finish()
+    return Replay(
+        model=inputs.model,
+        config=config,
+        audit=record.audit,
+        num_before_scene=len(before),
+        lead_in_s=float(int(stamps[0]) - int(before[0])) * 1e-9 if len(before) else 0.0,
+        median_radius=inputs.scene.at(int(stamps[radius_of])).median_radius,
+        static_violations=statics,
+        obstacles=record.obstacles,
+        map_age_s=record.ages.rows("map_age_s"),
+        start_time_s=float(int(stamps[0]) - int(inputs.states.stamp_ns[0])) * 1e-9,
+        between=record.between,
+        near=record.near,
+        unwatched=tuple(record.hindsight.found),
+        overtaken=tuple(record.newer_depth.found),
+        strain=record.strain,
+        statics=record.statics,
+        closest=record.closest,
+        events=record.events.events(),
+    )
+
+
+def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
+    """The stamp from which on the request wants the log replayed. Raises InputError for one after its end,
+    NotEvaluableError where all of the log is before the scene.
+    """
+    scene, stamps = inputs.scene, inputs.states.stamp_ns
+    if scene.first_ns is not None and scene.first_ns > stamps[-1]:
+        apart = times_apart(stamps, (scene.first_ns, max((scene.first_ns, *scene.stamps_ns))))
+        raise NotEvaluableError(
+            f"{inputs.source.name}: all {len(stamps)} joint states are earlier than the first known scene"
+            + ("" if apart is None else f": {apart.sentence}"),
+            remedy="reconstruct with more snapshots, or replay against --field" if apart is None else apart.remedy,
+        )
+    if request.start_time is None:
+        return int(stamps[0])
+    if request.start_time == FIRST_MAP:
+        return max(int(stamps[0]), int(stamps[0]) if scene.first_ns is None else scene.first_ns)
+    start = int(stamps[0]) + round(float(request.start_time) * 1e9)
+    if start > stamps[-1]:
+        raise InputError(
+            f"{inputs.source.name}: expected a start within {(stamps[-1] - stamps[0]) * 1e-9:.2f} s of joint states, "
+            f"got {(start - stamps[0]) * 1e-9:.2f} s",
+            remedy="give an earlier --start-time",
+        )
+    return start
+
+
+def _first_judged(request: ReplayRequest, inputs: ReplayInputs) -> int:
+    """The first requested state for which a scene is known."""
+    scene, stamps = inputs.scene, inputs.states.stamp_ns
+    earliest = _requested_ns(request, inputs)
+    return int(np.searchsorted(stamps, earliest if scene.first_ns is None else max(earliest, scene.first_ns)))
+
+
+def _span(inputs: ReplayInputs) -> tuple[int, int]:
+    return int(inputs.states.stamp_ns[0]), int(inputs.states.stamp_ns[-1])
+
+
+def _task(
+    request: ReplayRequest, inputs: ReplayInputs, motion: LoggedMotion, twists: TwistTrack | None, tolerance: float
+) -> ReplayTask:
+    """The start (logged, and not before the scene is known) and the goal (given, or the logged end)."""
+    stamps, positions = motion.stamp_ns, motion.position
+    start = _first_judged(request, inputs)
+    frame = request.frame or inputs.model.frame_names[-1]
+    end = positions[-1] if twists is None else positions[start]
+    *via, goal = goal_waypoints(request, inputs.model, frame, end)
+    for waypoint in (*via, goal):
+        if waypoint.posture is not None:
+            check_within_limits(inputs.model, waypoint.posture, tolerance, what="goal")
+    return ReplayTask(
+        start=positions[start],
+        T_world_goal=goal.T_world_goal,
+        frame=frame,
+        stamp_ns=int(stamps[start]),
+        home=goal.posture,
+        via=tuple(via),
+        follow=motion if request.follow else None,
+        twists=twists,
+        end_ns=motion.last_ns,
+        anchors=motion if request.re_anchor else None,
+        anchor_period=request.re_anchor or 0.0,
+    )

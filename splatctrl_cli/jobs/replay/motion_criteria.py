@@ -1,0 +1,386 @@
+"""Criteria of a replay's verdict: the motion against the scene, itself, its limits and its goal."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from splatctrl_cli.jobs.replay.control_criteria import commanded, controller, goal, scene_hits
+from splatctrl_cli.jobs.replay.criteria_input import (
+    BROKEN,
+    CONTACT,
+    LIMITS,
+    MARGIN,
+    SLOW,
+    UNKNOWN,
+    Judged,
+    events_of,
+    least_of,
+    mm,
+    time_of_least,
+)
+from splatctrl_cli.jobs.replay.inputs import bare_moving_links, recorded_postures
+
+from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
+from splatctrl_cli.control.events import Event, EventKind
+from splatctrl_cli.evaluate.verdict import Criterion, Reason, counted, failed, held, lacking
+from splatctrl_cli.robot.self_margins import least_gap
+
+
+def clearance(judged: Judged) -> Iterator[Reason]:
+    """The exact distance of every moving sphere to the splats keeps the margin."""
+    represented = least_of(judged.replay.between["represented"])
+    if represented is not None and represented >= judged.threshold:
+        yield from _unrepresented(judged, represented)
+    else:
+        yield from _by_source(judged, "exact")
+
+
+def certified_clearance(judged: Judged) -> Iterator[Reason]:
+    """With a grid alone: the bound that interpolation cannot break keeps the margin."""
+    clearance = judged.replay.audit.clearance
+    if "certified" not in clearance:
+        return
+    least, exact = (least_of(clearance[name].distance) for name in ("certified", "exact"))
+    if least is None or exact is None or not least < judged.threshold <= exact:
+        yield from _by_source(judged, "certified")
+        return
+    room, loss = exact - judged.threshold, exact - least
+    voxel = judged.metrics.get("voxel") or 0.02
+    yield lacking(
+        sentence=f"the grid is too coarse: its certified bound is {mm(least)}, its interpolated value {mm(exact)}",
+        value=least,
+        threshold=judged.replay.margin,
+        unit="m",
+        remedy=f"bake again with --voxel at most {max(voxel * room / loss, 1e-3):.2g}, or give --scene",
+        count=judged.num_states,
+    )
+
+
+def clearance_of_people(judged: Judged) -> Iterator[Reason]:
+    """With `control.human_margin`: people are kept at that distance."""
+    if judged.inputs.scene.has_people_margin:
+        yield from _by_source(judged, "barrier")
+
+
+def true_clearance(judged: Judged) -> Iterator[Reason]:
+    """With `--truth`: the true clearance of every moving sphere keeps the margin."""
+    if judged.replay.true_clearance is not None:
+        yield from _by_source(judged, "true")
+
+
+def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
+    replay = judged.replay
+    values = replay.true_clearance if source == "true" else replay.audit.clearance[source].distance
+    least = least_of(np.asarray(values))
+    if least is None:
+        return
+    if least >= judged.threshold:
+        yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
+        return
+    kind = EventKind.IN_COLLISION if least < 0 else EventKind.BELOW_MARGIN
+    events = events_of(replay, kind, source)
+    worst = min(events, key=lambda event: event.worst)
+    states = sum(event.num_states for event in events)
+    yield _at_worst(
+        worst,
+        failed(
+            sentence=f"{worst.worst_name} is {mm(abs(least))} {'deep in' if least < 0 else 'from'} the scene, "
+            f"margin {mm(replay.margin)}, {states} states in {counted(len(events), 'interval')}, worst",
+            value=least,
+            threshold=replay.margin,
+            unit="m",
+            count=judged.num_states,
+            label=CONTACT if least < 0 else MARGIN,
+        ),
+    )
+
+
+def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
+    """Kept by the splats, which are `represented` [m] away; maybe not by the voxels that have none."""
+    replay = judged.replay
+    least = least_of(replay.audit.clearance["exact"].distance)
+    assert least is not None
+    if least >= judged.threshold:
+        yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
+        return
+    worst = min(events_of(replay, EventKind.BELOW_MARGIN, "exact"), key=lambda event: event.worst)
+    yield _at_worst(
+        worst,
+        lacking(
+            sentence=f"{worst.worst_name} is {mm(least)} from space that is occupied and has no splat (the splats "
+            f"are {mm(represented)} away), margin {mm(replay.margin)}",
+            value=least,
+            threshold=replay.margin,
+            unit="m",
+            remedy="the map is starved: raise --max-splats",
+            count=judged.num_states,
+        ),
+    )
+
+
+def _at_worst(event: Event, reason: Reason) -> Reason:
+    """The reason with when, who and where of an event's worst state."""
+    there = event.obstacle
+    return replace(
+        reason,
+        time_s=event.worst_s,
+        who=event.worst_name,
+        place=None if there is None else there.position,
+        cause="" if there is None else f"near {there}",
+    )
+
+
+def self_clearance(judged: Judged) -> Iterator[Reason]:
+    """No two links of the arm overlap, none comes within the margin of one that stands still and carries none (a
+    table of the URDF), and none that were given a lower margin are driven nearer to each other than
+    `control.self_margin` (or half of the largest gap that they ever have) and than in the recording. By their
+    collision surfaces; by their spheres where these cannot be read.
+    """
+    least = least_of(judged.replay.audit.self_clearance)
+    events = events_of(judged.replay, EventKind.SELF_COLLISION)
+    if least is None or not np.isfinite(least):
+        return
+    if not events:
+        apart = held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
+        yield _beside_fixture(judged) or _brought_together(judged) or apart
+        return
+    worst = min(events, key=lambda event: event.worst)
+    yield _at_worst(
+        worst,
+        failed(
+            sentence=f"{worst.worst_name} are {mm(-worst.worst)} deep in each other",
+            value=worst.worst,
+            threshold=0.0,
+            unit="m",
+            remedy="pairs that may touch are named by --srdf",
+            count=judged.num_states,
+            label=CONTACT,
+        ),
+    )
+
+
+def _beside_fixture(judged: Judged) -> Reason | None:
+    """A moving link that came nearer than the margin to a link that stands still, such as a table of the URDF."""
+    found = [(gap, stamp, pair) for pair, (gap, stamp) in judged.replay.closest.items() if pair.is_fixture]
+    gap, stamp, pair = min(found, key=lambda one: one[0] - one[2].apart, default=(np.inf, 0, None))
+    if pair is None or gap >= pair.apart - SLIGHTLY_UNDER:
+        return None
+    return failed(
+        sentence=f"{' and '.join(pair.links)}, one of which stands still, are {mm(gap)} apart, margin "
+        f"{mm(pair.apart)}",
+        value=gap,
+        threshold=pair.apart,
+        unit="m",
+        who=" and ".join(pair.links),
+        time_s=float(stamp - int(judged.replay.audit.stamp_ns[0])) * 1e-9,
+        remedy="pairs that may touch are named by --srdf",
+        count=judged.num_states,
+        label=MARGIN,
+    )
+
+
+def _brought_together(judged: Judged) -> Reason | None:
+    """What our controller brought nearer than a lowered margin is to keep it, and than the recording had it: the rows
+    did not hold there what was asked for.
+    """
+    inputs, replay = judged.inputs, judged.replay
+    if replay.outside is not None:
+        return None
+    recorded = recorded_postures(inputs.states)
+    for pair, (gap, stamp) in sorted(replay.closest.items(), key=lambda item: item[1][0] - item[0].apart):
+        if pair.is_fixture or gap >= pair.apart - SLIGHTLY_UNDER:
+            continue
+        before = least_gap(inputs.model, inputs.surfaces, pair, recorded)
+        if gap < before - SLIGHTLY_UNDER:
+            bound = f"at least {mm(before)}" if before < pair.apart else f"{mm(pair.apart)} or more"
+            return failed(
+                sentence=f"{' and '.join(pair.links)} came together to {mm(gap)}, in the recording {bound}: their "
+                f"spheres keep {mm(pair.margin or 0.0)} of {mm(replay.config.control.self_margin)} asked for",
+                value=gap,
+                threshold=min(pair.apart, before),
+                unit="m",
+                remedy="fit finer spheres there (splatctrl robot spheres), or lower control.self_margin",
+                count=judged.num_states,
+                label=MARGIN,
+                time_s=float(stamp - int(replay.audit.stamp_ns[0])) * 1e-9,
+                who=" and ".join(pair.links),
+            )
+    return None
+
+
+def static_clearance(judged: Judged) -> Iterator[Reason]:
+    """Nothing comes within the margin of a link that no joint moves, by its own surface, in two scenes in a row and
+    1 cm or more (beside its mount 3 cm) from all that stood there when a camera first looked. What stands there from
+    the start is a note.
+    """
+    broken = {
+        name: (first, least)
+        for name, (first, least) in judged.replay.statics.items()
+        if least < min(judged.threshold, first)
+    }
+    if broken:
+        name, (first, least) = min(broken.items(), key=lambda item: item[1][1])
+        yield failed(
+            sentence=f"the scene comes within {mm(least)} of {name}, which no joint moves (at first {mm(first)})",
+            value=least,
+            threshold=judged.replay.margin,
+            unit="m",
+            who=name,
+            count=len(judged.replay.statics),
+            label=CONTACT if least < 0 else MARGIN,
+        )
+
+
+def position_limits(judged: Judged) -> Iterator[Reason]:
+    """Those of the URDF, with `control.limit_tolerance` for encoder noise."""
+    least, tolerance = least_of(judged.replay.audit.limit_margin), judged.request.config.control.limit_tolerance
+    if least is None:
+        return
+    if least < -tolerance:
+        worst = min(events_of(judged.replay, EventKind.OUTSIDE_LIMITS), key=lambda event: event.worst)
+        yield _at_worst(
+            worst,
+            failed(
+                sentence=f"{worst.worst_name} is {-least:.4f} rad or m outside its limits",
+                value=least,
+                threshold=0.0,
+                unit="rad",
+                remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
+                count=judged.num_states,
+                label=LIMITS,
+            ),
+        )
+    else:
+        yield held(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.num_states)
+
+
+def velocity_limits(judged: Judged) -> Iterator[Reason]:
+    """At most one percent above those of the URDF, in the motion and in the commands of a controller of one's own."""
+    too_fast = commanded(judged)
+    if too_fast is None:
+        yield from _share_of_limit(judged, "velocity", EventKind.TOO_FAST)
+    else:
+        yield too_fast
+
+
+def acceleration_limits(judged: Judged) -> Iterator[Reason]:
+    """At most one percent above `control.max_acceleration`, where it is set."""
+    yield from _share_of_limit(judged, "acceleration", EventKind.TOO_SUDDEN)
+
+
+def _share_of_limit(judged: Judged, column: str, kind: EventKind) -> Iterator[Reason]:
+    values = judged.replay.strain[column]
+    most = float(np.max(values)) if len(values) else 0.0
+    if most > LIMIT_EXCEEDED:
+        worst = max(events_of(judged.replay, kind), key=lambda event: event.worst)
+        yield _at_worst(
+            worst,
+            failed(
+                sentence=f"{worst.worst_name} reaches {most:.2f} times its limit",
+                value=most,
+                threshold=1.0,
+                remedy="check the stamps and units of the states, and the URDF's limits",
+                count=judged.num_states,
+                label=LIMITS,
+            ),
+        )
+    elif len(judged.replay.model.joint_names) and (kind is EventKind.TOO_FAST or most > 0):
+        yield held(f"at most {most:.2f} of the limit", most, 1.0, "", judged.num_states)
+
+
+def surface_clearance(judged: Judged) -> Iterator[Reason]:
+    """The spheres' clearance less what they leave uncovered keeps the margin, and every moving link has a
+    sphere.
+    """
+    model = judged.replay.model
+    deficit = model.sphere_deficit[np.asarray(model.moving_spheres)]
+    if np.isnan(deficit).any():
+        yield lacking(
+            sentence=f"how much of the robot its spheres cover is not known: {model.coverage_unknown}",
+            remedy="give a URDF with collision geometry (--packages finds its meshes)",
+        )
+        return
+    bare = bare_moving_links(judged.replay.model)
+    if bare:
+        yield lacking(
+            sentence=f"no sphere on {', '.join(bare)}: nothing is known of their clearance",
+            who=bare[0],
+            remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {judged.inputs.model.urdf.path}",
+        )
+    spheres, surface, between = _of_body(judged)
+    if surface is None:
+        return
+    if surface < judged.threshold:
+        yield lacking(
+            sentence=f"the spheres keep {mm(spheres)}, but the surface may keep only {mm(surface)}: up to "
+            f"{mm(float(np.nanmax(deficit)))} of it lies outside them",
+            value=surface,
+            threshold=judged.replay.margin,
+            unit="m",
+            time_s=time_of_least(judged, judged.replay.between["surface"]),
+            remedy="use spheres that cover the robot: splatctrl robot spheres",
+            count=judged.num_states,
+        )
+    elif between is None or between >= judged.threshold:
+        yield held(f"at least {mm(surface)}", surface, judged.replay.margin, "m", judged.num_states)
+
+
+def clearance_between_states(judged: Judged) -> Iterator[Reason]:
+    """A lower bound, by the spheres' lever arms, keeps the margin; intervals are halved where it is too low."""
+    model, columns = judged.replay.model, judged.replay.between
+    _, surface, between = _of_body(judged)
+    if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
+        return
+    if between < judged.threshold <= surface:
+        is_met = bool(columns["met"][int(np.nanargmin(columns["lower"]))])
+        yield lacking(
+            sentence=f"on the straight way between two states the arm comes to at most {mm(between)}"
+            if is_met
+            else f"the arm may have come within {mm(between)} between two states",
+            value=between,
+            threshold=judged.replay.margin,
+            unit="m",
+            time_s=time_of_least(judged, columns["lower"]),
+            remedy=SLOW,
+            count=judged.num_states,
+        )
+
+
+def _of_body(judged: Judged) -> tuple[float, float | None, float | None]:
+    """The least clearance [m] of the spheres, of the surface, and between the states; the last two None where they
+    are not known, or the spheres' own already says that the margin is broken.
+    """
+    clearance = judged.replay.audit.clearance
+    spheres = least_of(clearance["certified" if "certified" in clearance else "exact"].distance)  # as `surface` is
+    if spheres is None or spheres < judged.threshold:
+        return np.nan, None, None
+    return spheres, least_of(judged.replay.between["surface"]), least_of(judged.replay.between["lower"])
+
+
+OF_MOTION: tuple[Criterion[Judged], ...] = (
+    Criterion(
+        name="clearance",
+        find=clearance,
+        broken=f"{BROKEN}; {UNKNOWN} where only voxels that are occupied and have no splat break it (a starved map: "
+        "raise `--max-splats`)",
+    ),
+    Criterion(
+        name="certified clearance",
+        find=certified_clearance,
+        broken=f"{UNKNOWN}: the grid is too coarse, and the largest voxel that would do; {BROKEN} where the "
+        "interpolated value breaks it too",
+    ),
+    Criterion(name="clearance of people", find=clearance_of_people, broken=BROKEN),
+    Criterion(name="true clearance", find=true_clearance, broken=BROKEN),
+    Criterion(name="self-clearance", find=self_clearance, broken=f"{BROKEN} (contact, margin broken)"),
+    Criterion(name="static clearance", find=static_clearance, broken=BROKEN),
+    Criterion(name="position limits", find=position_limits, broken=BROKEN),
+    Criterion(name="velocity limits", find=velocity_limits, broken=BROKEN),
+    Criterion(name="acceleration limits", find=acceleration_limits, broken=BROKEN),
+    Criterion(name="controller", find=controller, broken=BROKEN),
+    Criterion(name="scene hits", find=scene_hits, broken=f"{BROKEN} (contact, margin broken)"),
+    Criterion(name="goal", find=goal, broken=BROKEN),
+    Criterion(name="surface clearance", find=surface_clearance, broken=UNKNOWN),
+    Criterion(name="clearance between states", find=clearance_between_states, broken=UNKNOWN),
+)
+"""By weight: of several failures the first one is in the sentence."""

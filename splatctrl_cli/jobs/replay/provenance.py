@@ -1,0 +1,203 @@
+"""Whether a scene or field, a log and a robot belong together, by what they contain."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder
+from splatctrl_cli.jobs.recordings.same_recording import changed_files, differences
+
+from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.config.fixed import (
+    CLOCK_MIXED,
+    RECORDINGS_APART_NS,
+    SAME_CLEARANCE,
+    SAME_LINK,
+    SAME_LINK_AREA,
+    SAME_MOTION_STATES,
+)
+from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB
+from splatctrl_cli.records import RecordSource, Stamps
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.unrepresented import agreement_with_grid
+from splatctrl_cli.simulate.truth import Truth
+
+S = TypeVar("S", SceneConfig, OccupancyConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mismatch:
+    """What does not fit, as a sentence, and what to do about it."""
+
+    sentence: str
+    remedy: str
+
+
+def scene_mismatches(
+    scene: SceneFolder, source: RecordSource, states: StateColumns, model: RobotModel
+) -> Iterator[Mismatch]:
+    """How a reconstruction and a log with states of a robot do not belong together; nothing where they do.
+
+    By `made_from_mismatches`, the times that both cover, and whether its parts agree.
+    """
+    if not scene.has_digests:
+        yield Mismatch(
+            sentence=f"{scene.path} is of an earlier version: nothing tells whether its files are as written",
+            remedy="reconstruct again",
+        )
+    yield from made_from_mismatches(scene.path, scene.made_from, source, model)
+    if scene.has_clock and not scene.snapshots:
+        yield Mismatch(
+            sentence=f"{scene.path} has no snapshot: the map of its end would judge the log from its beginning",
+            remedy="reconstruct again",
+        )
+    if scene.has_clock and len(states):
+        stamps = [*(snapshot.stamp_ns for snapshot in scene.snapshots), scene.stamp_ns]
+        found = times_apart(states.stamp_ns, (min(stamps), max(stamps)))
+        if found is not None:
+            yield found
+    yield from _map_mismatches(scene)
+
+
+def made_from_mismatches(
+    path: Path, made_from: Mapping[str, Any], source: RecordSource, model: RobotModel
+) -> Iterator[Mismatch]:
+    """How a scene or a field made from that (`SceneFolder.made_from`) does not belong to a log and a robot.
+
+    By the digests of files of the same names and of the calibration, each training camera's first frame, and the
+    joints and links of the robot that it was told apart from; and whether it rests on depth as it was recorded.
+    """
+    files, digests = made_from.get("inputs", {}), source.digests()
+    other, recorded = changed_files(files, digests), made_from.get("first_frames")
+    made, given = _calibrations(files), _calibrations(digests)
+    if made.keys() != given.keys():
+        with_made, with_given = (
+            f"with {', '.join(names.values())}" if names else "without one" for names in (made, given)
+        )
+        yield Mismatch(
+            sentence=f"calibration: {path} was made {with_made}, this log is read {with_given}",
+            remedy="give the --calibration that it was made with, or reconstruct",
+        )
+    elif not other and recorded and source.cameras:
+        other = differences(recorded, source.records())
+    if other:
+        yield Mismatch(
+            sentence=f"{path} was made from another recording: {'; '.join(other[:3])}", remedy="reconstruct this log"
+        )
+    if made_from.get("depth_bend"):
+        yield Mismatch(
+            sentence=f"{path} rests on depth corrected by up to {100 * made_from['depth_bend']:.1f} %, which no"
+            " sensor measured",
+            remedy="reconstruct with --urdf or without --refine-poses: depth stays as recorded",
+        )
+    if robot := _robot_difference(made_from, model):
+        yield Mismatch(
+            sentence=f"{path} was told apart from another robot, {robot}",
+            remedy="reconstruct with this --urdf, or give the one that it was made with",
+        )
+
+
+def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
+    """Names by digest of the calibrations among files that were read, and of what was done to these."""
+    return {
+        digest: name.removeprefix(CALIBRATION)
+        for name, digest in files.items()
+        if name.startswith((CALIBRATION, PERTURB))
+    }
+
+
+def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
+    """How the robot that a scene's splats were told apart from differs from a model, in words; empty where it does
+    not. What it has and the model lacks is neither in the map nor on the robot; what only the model has is in both.
+    """
+    joints = made_from.get("robot_joints")
+    if joints is None:
+        return ""
+    if tuple(joints) != tuple(model.joint_names):
+        return f"with joints {', '.join(joints)}"
+    theirs, ours = made_from.get("robot_links"), model.extents()
+    if theirs is None:
+        return "of which an earlier version kept the joints alone"
+    for link, (*corners, area) in theirs.items():
+        if link not in ours:
+            return f"with link {link}, which this one lacks: nothing else stands for it"
+        off = np.abs(np.subtract(corners, ours[link][:-1])).max()
+        if off > SAME_LINK:
+            return f"whose link {link} reaches {1e3 * off:.1f} mm farther, or less far"
+        if abs(area / ours[link][-1] - 1) > SAME_LINK_AREA:
+            return f"whose link {link} has a surface of {area:.4f} m^2, not {ours[link][-1]:.4f}"
+    return ""
+
+
+def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Mismatch | None:
+    """How states at stamps (T,) [ns], T > 0, and a scene from one stamp to another share no time; None where they do,
+    or nearly.
+    """
+    first, last = int(states_ns[0]), int(states_ns[-1])
+    apart_ns = max(scene_ns[0] - last, first - scene_ns[1])
+    if apart_ns <= RECORDINGS_APART_NS:
+        return None
+    ours, theirs = (f"from {start * 1e-9:.2f} to {end * 1e-9:.2f} s" for start, end in ((first, last), scene_ns))
+    is_other_clock = apart_ns > CLOCK_MIXED * 1e9
+    return Mismatch(
+        sentence=f"joint states {ours} and a scene {theirs} are "
+        + ("on clocks that do not overlap" if is_other_clock else "of different times"),
+        remedy="record both by one clock, or reconstruct this log",
+    )
+
+
+def _map_mismatches(scene: SceneFolder) -> Iterator[Mismatch]:
+    """Splats that are not those of their occupancy grid: of another scale, moved, or taken away."""
+    known = scene.known() if scene.has_digests else None
+    if known is None:
+        return
+    used = scene.run.get("config", {})
+    found = agreement_with_grid(
+        scene.splats(), known, _used(SceneConfig, used.get("scene")), _used(OccupancyConfig, used.get("occupancy"))
+    )
+    if not found.holds and found.num_voxels:
+        yield Mismatch(
+            sentence=f"{scene.path}: splats and occupancy disagree: {100 * found.on_surface:.0f} % of the splats "
+            f"lie on occupied voxels, {100 * found.represented:.0f} % of {found.num_voxels} occupied "
+            "voxels are represented",
+            remedy="check the splats' units and frame, or reconstruct again",
+        )
+
+
+def _used(section: type[S], values: object) -> S:
+    """The section of a configuration that a ``run.json`` has; the default where it has none."""
+    known = {field.name for field in fields(section)}
+    given = values if isinstance(values, dict) else {}
+    return section(**{name: value for name, value in given.items() if name in known})
+
+
+def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Mismatch | None:
+    """How a truth file and a log with states are of different recordings, by the clearance that the truth has."""
+    stamps = states.stamp_ns
+    shared = np.intersect1d(truth.stamps, stamps)
+    if not len(shared):
+        return Mismatch(
+            sentence=f"{truth.path} is of another recording: none of its {len(truth.stamps)} stamps is in the log",
+            remedy="give the truth.json that simulate wrote beside the log",
+        )
+    if tuple(truth.joint_names) != tuple(model.joint_names) or not truth.robot_spheres.is_file():
+        return None  # another model on purpose: nothing to compare with
+    own = RobotModel.from_urdf(truth.robot_urdf, truth.robot_spheres, T_world_base=truth.T_world_base)
+    own = own.moved_by(truth.joint_names)
+    moving = np.flatnonzero(own.moving_spheres)
+    worst = 0.0
+    for stamp in shared[:: max(len(shared) // SAME_MOTION_STATES, 1)]:
+        q = states.position[int(np.searchsorted(stamps, stamp))]
+        gap = truth.distance(own.sphere_centers(q)[moving], int(stamp)) - own.sphere_set.radii[moving]
+        recorded = truth.clearance[int(np.searchsorted(truth.stamps, stamp))]
+        worst = max(worst, abs(float(gap.min()) - float(recorded)))
+    if worst <= SAME_CLEARANCE:
+        return None
+    return Mismatch(
+        sentence=f"{truth.path} is of another recording: the logged motion has clearances up to {1e3 * worst:.0f} mm "
+        "off those that it recorded",
+        remedy="give the truth.json that simulate wrote beside the log",
+    )

@@ -1,0 +1,199 @@
+"""A replay from its request to its result: read, replay, measure, write."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from splatctrl_cli.formats.scene.scene_folder import open_scene
+from splatctrl_cli.jobs.reconstruct.reconstruct import declarations_of
+from splatctrl_cli.jobs.replay.criteria_input import Judged
+from splatctrl_cli.jobs.replay.evidence import Evidence, check_evidence, map_error, open_evidence
+from splatctrl_cli.jobs.replay.files import write_replay
+from splatctrl_cli.jobs.replay.goal import check_controller, check_goal, check_twists
+from splatctrl_cli.jobs.replay.inputs import (
+    LoggedStates,
+    MeasuredRobot,
+    clock_of,
+    doubts_of,
+    grasp_contacts,
+    measured_robot,
+    open_log,
+    read_states,
+    recorded_postures,
+    words_of,
+)
+from splatctrl_cli.jobs.replay.known_scene import KnownScene
+from splatctrl_cli.jobs.replay.lockstep import check_lockstep, opened_scene, reads_whole_log
+from splatctrl_cli.jobs.replay.metrics import Metrics, metric_names, metrics_of
+from splatctrl_cli.jobs.replay.modes import replayed
+from splatctrl_cli.jobs.replay.pictures import draw_worst_frames, worst_sights
+from splatctrl_cli.jobs.replay.provenance import Mismatch, made_from_mismatches, scene_mismatches, truth_mismatch
+from splatctrl_cli.jobs.replay.request import MODES, ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.result import Replay
+from splatctrl_cli.jobs.replay.truth import with_agreement, with_truth
+from splatctrl_cli.jobs.replay.verdict import ASKED, replay_verdict
+from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+
+from splatctrl_cli.checks.clock_offset import ImageMotion
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.evaluate.gates import check_gate_names
+from splatctrl_cli.evaluate.verdict import Verdict, brief
+from splatctrl_cli.evaluate.views import frames_of
+from splatctrl_cli.evaluate.worst_frames import Sight
+from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
+from splatctrl_cli.recording.capture.capture_header import ROBOT
+from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.truth import load_truth
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayResult:
+    """What a replay found, all of it written to `out`.
+
+    inputs: what it read, with the scene as it was known at each time (of ``lockstep``, while the replay ran).
+    verdict: what it comes to; notes: sentences on the robot, the pictures and the log. is_damaged: part of the log
+    was lost.
+    """
+
+    __repr__ = brief
+
+    out: Path
+    inputs: ReplayInputs
+    replay: Replay
+    metrics: Metrics
+    verdict: Verdict
+    notes: tuple[str, ...]
+    is_damaged: bool
+
+    def exit_code(self, *, report_only: bool = False) -> int:
+        """1 or 5 as the verdict says, 3 for a damaged log, else 0; with `report_only` only the request's own gates
+        turn it.
+        """
+        return self.verdict.exit_code_of(ASKED if report_only else None) or (3 if self.is_damaged else 0)
+
+
+def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
+    """Replay, and write the output folder. Raises SplatCtrlError for what cannot be replayed."""
+    check_request(request)
+    config, stopwatch = request.config, Stopwatch()
+    with output_path(request.out, force=request.force, is_folder=True) as folder:
+        motion = ImageMotion()
+        with stopwatch.stage("read"):
+            inputs, logged, evidence, robot = _read(request, folder, progress, motion)
+        for doubt in doubts_of(request, robot, config.control):
+            progress.log(f"warning: {doubt}")
+        with stopwatch.stage("replay"):
+            found = replayed(request, inputs, config, progress)
+        inputs.scene.finish()
+        logged = replace(logged, clock=clock_of(inputs.model, logged, motion))
+        with stopwatch.stage("truth"):
+            found, sights = _seen_by_cameras(request, inputs, found)
+        if evidence is not None:
+            with stopwatch.stage("evidence"):
+                found = replace(found, map_error=map_error(evidence, inputs, found.audit, config.verdict))
+        metrics = metrics_of(found) | logged.metrics()
+        with stopwatch.stage("verdict"):
+            judged = Judged(request=request, inputs=inputs, logged=logged, replay=found, metrics=metrics)
+            verdict = replay_verdict(judged)
+        with stopwatch.stage("worst_frames"):
+            unseen = draw_worst_frames(folder, found, sights)
+        write_json(folder / "states.json", logged.as_dict())
+        by_surface = () if found.closed_loop is None else found.closed_loop.by_surface
+        of_robot = words_of(robot, config.control, by_surface)
+        write_replay(
+            folder, found, metrics, verdict, of_robot, config=config, inputs=inputs.digests, stopwatch=stopwatch
+        )
+    return ReplayResult(
+        out=request.out,
+        inputs=inputs,
+        replay=found,
+        metrics=metrics,
+        verdict=verdict,
+        notes=(*of_robot.values(), *unseen, *logged.lines()),
+        is_damaged=bool(inputs.source.loss.damaged),
+    )
+
+
+def check_request(request: ReplayRequest) -> None:
+    """Raise UsageError for what no replay can be made of: gates on figures that it does not have, options that
+    belong to another mode.
+    """
+    fields = ("exact", "barrier", *(("certified",) if request.field is not None else ()))
+    has_truth, has_twists = request.truth is not None, request.twist_topic is not None
+    names = {mode: metric_names(mode, fields, has_truth=has_truth, has_twists=has_twists) for mode in MODES}
+    check_gate_names(request.require, names[request.mode], {f"--mode {mode}": names[mode] for mode in names})
+    check_lockstep(request)
+    check_evidence(request)
+    check_twists(request)
+    check_goal(request)
+    check_controller(request)
+
+
+def _seen_by_cameras(
+    request: ReplayRequest, inputs: ReplayInputs, replay: Replay
+) -> tuple[Replay, list[Sight | None]]:
+    """With the truth, and images of the worst moments: one pass over the frames for both."""
+    frames: Iterator[RgbdFrame] = frames_of(inputs.source) if inputs.source.cameras else iter(())
+    replay, surfaces = with_truth(inputs, replay)
+    if surfaces is not None:
+        frames = surfaces.watching(frames)
+    sights = worst_sights(inputs, replay, request.worst_frames, frames)
+    if surfaces is not None:
+        for _ in frames:  # those that no moment needs
+            pass
+        replay = with_agreement(replay, surfaces)
+    return replay, sights
+
+
+def _read(
+    request: ReplayRequest, folder: Path, progress: Progress, motion: ImageMotion
+) -> tuple[ReplayInputs, LoggedStates, Evidence | None, MeasuredRobot]:
+    """What the replay needs; `motion` is shown all frames of the log now, or as a lockstep takes them in."""
+    model, opened = open_log(request, progress)
+    if request.urdf is None:  # for who looks at the run
+        (folder / ROBOT).write_text(model.urdf.text, encoding="utf-8", newline="")
+    logged = read_states(opened, model)
+    robot = measured_robot(request, model, request.config.control, recorded_postures(logged.states))
+    model = robot.model
+    truth = None if request.truth is None else load_truth(request.truth)
+    if truth is not None and (other := truth_mismatch(truth, logged.states, model)) is not None:
+        raise InputError(other.sentence, remedy=other.remedy)
+    declared = declarations_of(request.declare, model)
+    meant = (*declared.expected_contact, *grasp_contacts(model, logged.states))
+    declared = replace(declared, expected_contact=meant)
+    evidence = open_evidence(request, model)
+    source = logged.source
+    observe = motion.add if reads_whole_log(request, source) else None
+    if source.cameras and observe is None:
+        for frame in frames_of(source):
+            motion.add(frame)
+    scene = opened_scene(request, model, declared, folder, progress, source, observe)
+    given = (request.urdf, request.spheres, request.self_model, request.srdf, request.truth, request.declare)
+    files = [path for path in given if path not in (None, NO_SELF_MODEL)]
+    digests = {**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}}
+    inputs = ReplayInputs(
+        source=source,
+        states=logged.states,
+        model=model,
+        scene=scene,
+        truth=truth,
+        digests=digests,
+        mismatches=_mismatches(request, scene, logged, model),
+        declared=declared,
+        surfaces=robot.surfaces,
+        kept=robot.kept,
+    )
+    return inputs, logged, evidence, robot
+
+
+def _mismatches(
+    request: ReplayRequest, known: KnownScene, logged: LoggedStates, model: RobotModel
+) -> tuple[Mismatch, ...]:
+    """What does not belong together; a log that is its own scene always does."""
+    if request.field is not None:
+        return tuple(made_from_mismatches(request.field, known.made_from, logged.source, model))
+    if request.scene is None:
+        return ()
+    return tuple(scene_mismatches(open_scene(request.scene), logged.source, logged.states, model))

@@ -1,0 +1,318 @@
+"""States of a replay as they come, block by block: measured, explained, and kept in files."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from operator import attrgetter
+
+import numpy as np
+from splatctrl_cli.jobs.replay.hindsight import Hindsight, NewerDepth
+from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene
+from splatctrl_cli.jobs.replay.state_store import BLOCK, Figures, StoredAudit, StoredObjects
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
+from splatctrl_cli.control.arm import sphere_names
+from splatctrl_cli.control.audit import AuditTrace, Clearance, audit, moving_clearance, part_clearances
+from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
+from splatctrl_cli.control.fixed_parts import FixedParts
+from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
+from splatctrl_cli.control.limits import MotionLimits
+from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace, Seen
+from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals
+from splatctrl_cli.control.step import ControlStep
+from splatctrl_cli.records import Float64, Stamps
+from splatctrl_cli.robot.declared_contact import Declarations
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_gaps
+from splatctrl_cli.voxels import EvidenceClass
+
+KINDS = len(EvidenceClass)
+NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # of what was known about the arm, and their shapes at a state
+    **dict.fromkeys(("age", "ahead", "unseen", "assumed", "unseen_to_surface", "blind_to_surface"), ()),
+    **{
+        "unseen_to_surface_place": (3,),
+        "blind_to_surface_place": (3,),
+        "shares": (KINDS,),
+        "nearest": (KINDS,),
+        "places": (KINDS * 3,),
+    },
+}
+
+
+class ReplayRecord:
+    """The audit of states (T,) in the scenes as they were known, what is nearest to the nearest sphere of each, in
+    words, the age (T,) [s] of each state's scene, and what happened.
+
+    between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), 1 where that is
+    the clearance of a posture on the way instead (`met`), the time [s] that nobody can bound (`unbounded`), the
+    clearance [m] of the body at the state (`surface`), and that of the spheres to the splats alone (`represented`).
+    near: what was known about the arm (`NEAR_COLUMNS`), NaN at states that were not looked at.
+    hindsight: what later depth says of times without any; newer_depth: of states that a late map judged. strain:
+    velocity and acceleration as shares of their limits. closest: of pairs of links that keep less than the
+    margin asked for, how near they came [m] and the stamp; nothing of those that stayed apart.
+    """
+
+    def __init__(
+        self,
+        model: RobotModel,
+        scene: KnownScene,
+        *,
+        config: Config,
+        max_map_age: float,
+        is_continuous: bool = True,
+        declared: Declarations | None = None,
+        first_state_ns: int = 0,
+        surfaces: SelfSurfaces | None = None,
+        kept: Sequence[KeptMargin] = (),
+    ) -> None:
+        """is_continuous: False where the arm is put elsewhere on the way, so that nothing holds between states.
+        declared: contact that is meant, at times that count from `first_state_ns`. surfaces: of the links, which tell
+        where the arm touches itself; None for its spheres alone. kept: margins of pairs of links.
+        """
+        self._declared, self._first_state_ns = declared or Declarations(), first_state_ns
+        self.audit, self.obstacles, self.ages = StoredAudit(), StoredObjects[str](), Figures()
+        self.between, self.strain = Figures(), Figures()
+        self.events = EventFold()
+        self._robot = self._model = model
+        self._scene, self._max_map_age = scene, max_map_age
+        self._margin, self._longest = config.control.margin, config.verdict.longest_interval
+        self._fixed = FixedParts(model, 2.0 * (self._margin - SLIGHTLY_UNDER))
+        self._spheres = sphere_names(model.sphere_set)
+        self._number = {name: number for number, name in enumerate(self._spheres)}
+        self._surfaces, self._kept = surfaces, kept
+        self._enough = max(config.control.self_margin, config.control.margin)
+        self.closest: dict[KeptMargin, tuple[float, int]] = {}
+        spheres = [f"{self._spheres[a]} and {self._spheres[b]}" for a, b in model.self_pairs()]
+        self._pairs = spheres if surfaces is None else surfaces.names
+        self._reach, self._is_continuous = Reach.of(model), is_continuous
+        limit = np.asarray(config.control.max_acceleration, np.float64)
+        self._limits = MotionLimits(
+            np.asarray(model.velocity_limit),
+            np.broadcast_to(limit, model.velocity_limit.shape) if limit.any() else None,
+        )
+        self.near, self._near = Figures(), NearSpace(model, config.control.margin, max_map_age)
+        self._posture_before: Float64 | None = None  # at the end of the last block
+        self.hindsight = Hindsight(scene, self._near, config.control.margin, self._clearance_in)
+        self.newer_depth = NewerDepth(scene, config.control.margin - SLIGHTLY_UNDER, self._clearance_in)
+        self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
+        self._last_scene: KnownFields | None = None
+        self._seen_before: Seen | None = None  # when the fixed spheres were last looked at
+
+    def blocks(self, stamps: Stamps) -> Iterator[tuple[int, int]]:
+        """Ranges of at most BLOCK consecutive states of stamps (T,) that see the same scene with one surface of the
+        robot.
+        """
+        first = 0
+        while first < len(stamps):
+            scene, last = self._scene.at(int(stamps[first])), first + 1
+            changes = [stamp for stamp in self._robot.changes if stamp > stamps[first]]
+            end = min(first + BLOCK, len(stamps), *np.searchsorted(stamps, changes).tolist())
+            while last < end and self._scene.at(int(stamps[last])) is scene:
+                last += 1
+            yield first, last
+            first = last
+
+    def measured(self, stamps: Stamps, positions: Float64, velocities: Float64) -> AuditTrace:
+        """The audit of the next block of states (T, J), which see one scene."""
+        scene, self._model = self._scene, self._robot.at(int(stamps[0]))
+        part = audit(self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed)
+        part = self._look_at_self(self._without_expected(part))
+        self.audit.add(part)
+        self.newer_depth.add(stamps, positions, part.clearance["exact"].distance)
+        self.obstacles.extend(["" if obstacle is None else str(obstacle) for obstacle in self._nearest(part)])
+        self.ages.append(map_age_s=np.array([scene.age_s(stamp) for stamp in stamps.tolist()]))
+        self._bound(part, velocities)
+        strain = self._limits.add(stamps, positions if self._is_continuous else np.zeros_like(positions))
+        self.strain.append(velocity=strain.velocity, acceleration=strain.acceleration)
+        self._strain = strain
+        self._look_at_statics(part)
+        self._look_around(part)
+        self._tell_represented(part)
+        return part
+
+    def explain(self, part: AuditTrace, steps: Sequence[ControlStep | None] = ()) -> None:
+        """Find what happened in the block that was measured last, with what a controller did there."""
+        signals = audit_signals(part, self._margin, self._spheres, self._model.joint_names, self._pairs)
+        signals += limit_signals(self._strain, self._model.joint_names)
+        signals += interval_signals(self._lower, self._unbounded, self._margin - SLIGHTLY_UNDER)
+        age_s = np.array([self._scene.age_s(stamp) for stamp in part.stamp_ns.tolist()])
+        signals.append(stale_signal(age_s, self._max_map_age))
+        if steps:
+            signals += step_signals(steps)
+
+        def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
+            if name not in self._number or kind is EventKind.WITHOUT_DISTANCE:
+                return None
+            center = self._model.sphere_centers(part.position[at])[[self._number[name]]]
+            return self._scene.at(int(part.stamp_ns[at])).obstacles(center)[0]
+
+        self.events.add(part.stamp_ns, signals, near)
+
+    def _without_expected(self, part: AuditTrace) -> AuditTrace:
+        """The audit without the spheres whose contact is declared, where they would break the margin."""
+        if not self._declared.expected_contact:
+            return part
+        clearance, of_spheres, moving = dict(part.clearance), dict(part.of_spheres), self._reach.moving
+        known = self._scene.at(int(part.stamp_ns[0]))
+        for name, each in part.of_spheres.items():
+            kept = of_spheres[name] = self._unexpected(known, part.stamp_ns, part.position, each)
+            nearest = kept.argmin(axis=1)
+            clearance[name] = Clearance(distance=kept[np.arange(len(kept)), nearest], sphere=moving[nearest])
+        return replace(part, clearance=clearance, of_spheres=of_spheres)
+
+    def _unexpected(self, known: KnownFields, stamps: Stamps, positions: Float64, each: Float64) -> Float64:
+        """Clearances `each` (T, M) [m] of the moving spheres, infinite where contact is declared."""
+        links, kept = self._model.sphere_set.links, each.copy()
+        for state, column in zip(*np.nonzero(each < self._margin), strict=True):
+            sphere = int(self._reach.moving[column])
+            center = self._model.sphere_centers(positions[state])[[sphere]]
+            place = np.array(known.obstacles(center)[0].position)
+            if self._declared.expects(links[sphere], place, (int(stamps[state]) - self._first_state_ns) * 1e-9):
+                kept[state, column] = np.inf
+        return kept
+
+    def _clearance_in(self, scene_ns: int, stamps: Stamps, positions: Float64) -> Float64:
+        """Of states (T,), (T, J) in the scene that is known at another time than theirs (T,) [m]."""
+        known, found = self._scene.at(scene_ns), []
+        for its in np.split(np.arange(len(stamps)), np.searchsorted(stamps, self._robot.changes)):
+            if len(its):
+                robot = self._robot.at(int(stamps[its[0]]))
+                each = moving_clearance(robot, positions[its], known.distances["exact"])[1]
+                found.append(self._unexpected(known, stamps[its], positions[its], each).min(axis=1))
+        return np.concatenate(found)
+
+    def _look_at_self(self, part: AuditTrace) -> AuditTrace:
+        """The audit with how near the links' own surfaces come to each other, where they are known: spheres that
+        stick out may overlap where nothing touches, and those that leave something uncovered be apart where it does.
+        And how near the pairs came that keep less than the margin asked for.
+        """
+        surfaces, gaps = self._surfaces, np.empty((len(part.position), 0))
+        if surfaces is not None:
+            gaps = surfaces.gaps(part.position, self._model.sphere_centers_batch(part.position), self._enough)
+            nearest = gaps.argmin(axis=1) if gaps.size else np.full(len(gaps), -1)
+            part = replace(part, self_clearance=gaps.min(axis=1, initial=np.inf), self_pair=nearest)
+        for pair in self._kept:
+            number = None if surfaces is None else surfaces.number_of(pair.links)
+            own = sphere_gaps(self._model, pair.links, part.position) if number is None else gaps[:, number]
+            at = int(own.argmin())
+            if own[at] < min(pair.apart, self.closest.get(pair, (np.inf, 0))[0]):
+                self.closest[pair] = float(own[at]), int(part.stamp_ns[at])
+        return part
+
+    def _bound(self, part: AuditTrace, velocities: Float64) -> None:
+        """Bounds between the states of a block, and since the last state of the one before, in this block's scene."""
+        known = self._scene.at(int(part.stamp_ns[0])).distances
+        name = "certified" if "certified" in known else "exact"
+        is_surface = part_clearances(self._model, part.position[:1], known[name])[1]
+        deficit = self._reach.radii - self._model.sphere_set.radii[self._reach.moving]
+        deficit[is_surface] = 0.0
+        stamps, positions, at_states = part.stamp_ns, part.position, part.of_spheres[name] - deficit
+        if self._before is not None:
+            stamp, q, velocity = self._before
+            earlier = clearances(self._model, self._reach, q[None], known[name])
+            earlier[:, np.isinf(at_states[0])] = np.inf  # what is meant now was meant on the way
+            stamps, positions = np.concatenate([[stamp], stamps]), np.concatenate([q[None], positions])
+            velocities = np.concatenate([velocity[None], velocities])
+            at_states = np.concatenate([earlier, at_states])
+        between = between_states(
+            self._model,
+            self._reach,
+            stamps,
+            positions,
+            velocities,
+            at_states,
+            known[name],
+            margin=self._margin - SLIGHTLY_UNDER,
+            longest=self._longest,
+        )
+        self._keep_bounds(between, stamps, at_states, is_first=self._before is None)
+        self._before = int(stamps[-1]), positions[-1], velocities[-1]
+
+    def _keep_bounds(self, between: Between, stamps: Stamps, at_states: Float64, *, is_first: bool) -> None:
+        unbounded = np.where(between.is_bounded | (not self._is_continuous), 0.0, np.diff(stamps) * 1e-9)
+        lower = np.where(between.is_bounded & self._is_continuous, between.lower, np.nan)
+        surface = at_states.min(axis=1) if is_first else at_states[1:].min(axis=1)
+        met = between.is_met.astype(np.float64)
+        if is_first:
+            lower, unbounded, met = np.insert(lower, 0, np.nan), np.insert(unbounded, 0, 0.0), np.insert(met, 0, 0.0)
+        self._lower, self._unbounded = lower, unbounded
+        self.between.append(lower=lower, unbounded=unbounded, met=met, surface=surface)
+
+    def _look_at_statics(self, part: AuditTrace) -> None:
+        """Look once at each scene for what comes near the fixed links."""
+        stamp = int(part.stamp_ns[0])
+        known = self._scene.at(stamp)
+        if known is self._last_scene:
+            return
+        self._last_scene, before, self._seen_before = known, self._seen_before, self._scene.seen_at(stamp)
+        was_seen = None if before is None else lambda places: before.look(places)[0] >= 0
+        self._fixed.look(known.distances["exact"], part.position[0], was_seen)
+
+    @property
+    def statics(self) -> dict[str, tuple[float, float]]:
+        """`FixedParts.found`."""
+        return self._fixed.found
+
+    def _look_around(self, part: AuditTrace) -> None:
+        """What was known of the space about the arm, at some of the states and on the way there."""
+        num = len(part.stamp_ns)
+        columns = {name: np.full((num, *shape), np.nan) for name, shape in NEAR_COLUMNS.items()}
+        if self._scene.has_seen_times:
+            self.hindsight.add(part.stamp_ns, part.position)
+        for at, is_timed in self._near.due(part.stamp_ns, self._model.sphere_centers_batch(part.position)).items():
+            stamp = int(part.stamp_ns[at])
+            known = self._scene.seen_at(stamp)
+            if known is not None:
+                exact = self._scene.at(stamp).distances["exact"]
+                before, q = part.position[at - 1] if at else self._posture_before, part.position[at]
+                way = self._near.on_the_way(before, q) if before is not None and self._is_continuous else ()
+                accounts = [self._near.look(stamp, each, known, exact) for each in (q, *way)]
+                for name, value in _folded(accounts).items():
+                    columns[name][at] = value
+                if not self._scene.has_seen_times:
+                    columns["assumed"][at] = np.nan  # space that was once free may not be now
+                elif is_timed:
+                    columns["age"][at], columns["ahead"][at] = accounts[0].age, accounts[0].ahead
+                    self.hindsight.looked(stamp, accounts[0].age)
+        self._posture_before = part.position[-1]
+        self.near.append(**columns)
+
+    def _tell_represented(self, part: AuditTrace) -> None:
+        """The clearance (T,) [m] without the balls of voxels that have no splat, where these make a difference."""
+        exact = part.clearance["exact"].distance
+        alone, splats_alone = exact.copy(), self._scene.at(int(part.stamp_ns[0])).splats_alone
+        low = np.flatnonzero(exact < self._margin - SLIGHTLY_UNDER)
+        if splats_alone is not None and len(low):
+            alone[low] = moving_clearance(self._model, part.position[low], splats_alone)[0].distance
+        self.between.append(represented=alone)
+
+    def _nearest(self, part: AuditTrace) -> list[Obstacle | None]:
+        """What is nearest to the nearest sphere, by the controller's field; None without a distance."""
+        nearest = part.clearance["barrier"]
+        found: list[Obstacle | None] = [None] * len(part.stamp_ns)
+        states = np.flatnonzero(np.isfinite(nearest.distance))
+        if len(states):
+            centers = self._model.sphere_centers_batch(part.position[states])
+            points = np.ascontiguousarray(centers[np.arange(len(states)), nearest.sphere[states]])
+            obstacles = self._scene.at(int(part.stamp_ns[0])).obstacles(points)
+            for state, obstacle in zip(states.tolist(), obstacles, strict=True):
+                found[state] = obstacle
+        return found
+
+
+def _folded(accounts: Sequence[Account]) -> dict[str, float | Float64]:
+    """The shares at a state; of it and of the postures on the way, the largest unseen share and least distances."""
+    shares, nearest = (np.array([getattr(each, name) for each in accounts]) for name in ("shares", "nearest"))
+    least, places = nearest.argmin(axis=0), np.array([each.places for each in accounts])
+    unseen, blind = (min(accounts, key=attrgetter(f"{name}_to_surface")) for name in ("unseen", "blind"))
+    return {
+        "shares": shares[0],
+        "nearest": nearest.min(axis=0),
+        "places": places[least, np.arange(KINDS)].ravel(),
+        "unseen": float(shares[:, NEVER_SEEN].sum(axis=1).max()),
+        "assumed": max(each.assumed for each in accounts),
+        "unseen_to_surface": unseen.unseen_to_surface,
+        "unseen_to_surface_place": unseen.unseen_place,
+        "blind_to_surface": blind.blind_to_surface,
+        "blind_to_surface_place": blind.blind_place,
+    }

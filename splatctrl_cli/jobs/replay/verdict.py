@@ -1,0 +1,118 @@
+"""The verdict of a replay: every criterion of *safe*, with what it found, when, where and what to do about it."""
+
+from collections.abc import Iterator
+from operator import attrgetter
+
+from splatctrl_cli.jobs.replay.criteria_input import CONTACT, SAFE, Judged, nearby
+from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words
+from splatctrl_cli.jobs.replay.metrics import counts_of, first_time
+from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+
+from splatctrl_cli.control.line_process import shown
+from splatctrl_cli.evaluate.gates import gate_reasons
+from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
+from splatctrl_cli.robot.declared_contact import carried_words
+
+ASKED = ("--require",)  # criteria that the request itself asked for
+LARGER_IS_LAXER = (
+    *("max_unknown", "max_map_age", "max_pose_jump", "allow_disagreement", "config.control.limit_tolerance"),
+    *("config.verdict.unjudged", "config.verdict.lead_in", "config.verdict.longest_interval"),
+)
+SMALLER_IS_LAXER = (
+    *("config.verdict.confidence", "config.verdict.evidence_reach"),
+    *("config.control.margin", "config.control.self_margin"),
+)
+CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
+
+
+def replay_verdict(judged: Judged) -> Verdict:
+    """The verdict on a replay: every criterion, and each ``--require`` of its request."""
+    replay, request = judged.replay, judged.request
+    reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
+    reasons.sort(key=lambda reason: reason.label != CONTACT)  # by any measure, before what only broke a margin
+    counts = counts_of(replay, judged.logged, judged.metrics)
+    reasons += gate_reasons(
+        request.require, judged.metrics, counts, first_time=lambda name, holds: first_time(replay, name, holds)
+    )
+    stamps = replay.audit.stamp_ns
+    first, last = replay.start_time_s, replay.start_time_s + float(stamps[-1] - stamps[0]) * 1e-9
+    motion = "driven" if replay.closed_loop else "logged"
+    span, past = f"{motion} motion from {first:.2f} to {last:.2f} s of the log", judged.past_end_s
+    if past > 0:
+        span = f"{motion} motion from {first:.2f} s of the log to {past:.2f} s past its end"
+    who = "" if replay.outside is None else f", controller {shown(replay.outside.name)}"
+    return verdict_of(
+        "replay",
+        reasons,
+        scope=f"{span}, {len(stamps)} states{who}",
+        passed=SAFE,
+        how=_how(judged),
+        notes=tuple(_notes(judged)),
+        is_damaged=bool(judged.inputs.source.loss.damaged),
+        counts=counts,
+    )
+
+
+def _how(judged: Judged) -> str:
+    """How a safe run passed: waived, proven or neither. Proven: cameras saw all space within the margin free."""
+    if any(waivers(judged.request)):
+        return "waived"
+    assumed = nearby(judged, judged.replay.near["assumed"])
+    return "proven" if assumed is not None and assumed[0] <= 0 else ""
+
+
+def _notes(judged: Judged) -> Iterator[str]:
+    found = judged.replay.map_error
+    yield "map error not measured" if found is None or found.bound is None else bound_words(found.bound)
+    close = [name for name, (first, _) in judged.replay.statics.items() if first < judged.threshold]
+    if close:
+        yield f"{len(close)} fixed spheres stand within the margin of their surroundings"
+    if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
+        yield f"{judged.replay.lead_in_s:.2f} s before the first map are left out"
+    unseen, assumed = (nearby(judged, judged.replay.near[name]) for name in ("unseen", "assumed"))
+    if unseen is None:
+        yield "space about the arm not judged"
+    if assumed is not None and assumed[0] > 0:
+        yield f"at most {100 * assumed[0]:.0f} % of the space within the margin of the arm was assumed to be free"
+    if nearby(judged, judged.replay.near["age"]) is None:
+        yield "age of the evidence about the arm not judged"
+    yield from _declared_notes(judged)
+    yield from waivers(judged.request)
+    inside = judged.inputs.scene.figures().get("inside_robot_points")
+    if inside:
+        yield f"{inside} measured points lie inside the robot: contact, a carried object, or calibration"
+    if judged.request.re_anchor is not None:
+        yield "the arm is put back into the log's posture on the way: nothing is said between states"
+
+
+def waivers(request: ReplayRequest) -> Iterator[str]:
+    """Options and settings of the evidence and the margins that are laxer than their defaults."""
+    usual = ReplayRequest(log=request.log, out=request.out)
+    for name in (*LARGER_IS_LAXER, *SMALLER_IS_LAXER):
+        given, default = (attrgetter(name)(each) for each in (request, usual))
+        if given > default if name in LARGER_IS_LAXER else given < default:
+            words = name.removeprefix("config.") if "." in name else f"--{name.replace('_', '-')}"
+            yield f"waived: {words}" + ("" if given is True else f" {given:g} (by default {default:g})")
+
+
+def _declared_notes(judged: Judged) -> Iterator[str]:
+    """Parts that were learned, declared contact, what the map was told that the robot carries, and unused entries."""
+    declared, inputs = judged.inputs.declared, judged.inputs
+    if inputs.model.self_model is not None:
+        yield from (part.words(int(inputs.states.stamp_ns[0])) for part in inputs.model.self_model.parts)
+    for index, entry in enumerate(declared.expected_contact):
+        num = declared.num_uses.get(("expected_contact", index), 0)
+        if entry.is_learned and not num:
+            continue
+        used = f"{num} times" if num else "warning: not used by any state; check its links and times, or leave it out"
+        how = "meant" if entry.is_learned else "declared"
+        yield f"contact of {entry.link} {how} ({entry.reason}): {used}"
+    of_map = judged.inputs.scene.figures().get("carried", [])
+    yield from map(carried_words, of_map)
+    for given in declared.carried_uses():
+        if not any(given | {"num_uses": 0} == made | {"num_uses": 0} for made in of_map):
+            yield (
+                f"{given['link']} carries a box: warning: the map was made without this declaration; give reconstruct"
+                " the same --declare"
+            )

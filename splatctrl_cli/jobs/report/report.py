@@ -1,0 +1,325 @@
+"""A report from its request to its page: one run, or every job of a batch, in one file that opens from disk; and a
+page that only shows a scene, a field, splats or a replay in 3-D.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from splatctrl_cli.jobs.batch.graph import columns_of
+from splatctrl_cli.jobs.report.sections import PASSED, changes_since, section_of
+from splatctrl_cli.jobs.report.spaces import space_of, space_of_run
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.jobs.runs.run_folder import (
+    AS_EXPECTED,
+    REPLAY,
+    BatchFolder,
+    FolderRequest,
+    Node,
+    RunFolder,
+    WrittenFile,
+    is_batch,
+    open_batch,
+    open_run,
+)
+
+from splatctrl_cli.errors import DAMAGE, InputError, SplatCtrlError
+from splatctrl_cli.files.output import output_path
+from splatctrl_cli.report.page import Cell, Page, Picture, Row, RunSection, Table, packed, picture, rendered
+
+MOST_SCENES = 6  # of a batch, without `all_scenes`
+PICTURES = {True: (3, 800), False: (1, 640)}  # of a batch's run with and without a scene: how many, how wide [px]
+LOG_LINES = 12  # of a job that ended in an error
+MOST_ROWS = 40  # of recordings that are shown at once
+WITHOUT_A_RUN = ("skipped", "to do")  # states of jobs
+WITH_SPACE = ("replay", "reconstruct", "sdf-bake")
+MAP = "reconstruct"
+WITH_PICTURES = {  # by command: what is in a picture's name, and what it shows
+    "score": ("_best_worst", "photo, render and depth error of the best and the worst view"),
+    "sdf-bake": ("slices", "slices of the distance"),
+}
+MOST_PICTURES, PICTURE_WIDTH = 24, 560  # of recordings as expected: how many, how wide [px]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRequest(FolderRequest):
+    """A page on `path`, a run, scene or field folder, a grid or a file of splats, into `out`, None for PATH.html."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WriteReportRequest(ViewRequest):
+    """A report on `path`, the folder of a run or of a batch, into the HTML file `out`, None for PATH.html.
+
+    against: an earlier run or batch, or a stored baseline, since which it says what changed. all_scenes: of a batch,
+    every scene in 3-D and not only the failed, changed and worst.
+    """
+
+    against: Path | None = None
+    all_scenes: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class WriteReportResult(WrittenFile):
+    """The page: how many runs it tells of, how many of them in 3-D, and why others are not."""
+
+    num_runs: int
+    num_scenes: int
+    notes: tuple[str, ...]
+
+
+def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> WriteReportResult:
+    """Write the page. Raises InputError for a folder that is no run and no batch, that is not whole, or that a newer
+    version wrote, and for `against` what cannot be compared with it.
+    """
+    if is_batch(request.path):
+        page = _of_batch(request, open_batch(request.path), progress)
+    else:
+        page = _of_run(request, open_run(request.path))
+    file = _write(request, page)
+    return WriteReportResult(
+        file=file,
+        bytes=file.stat().st_size,
+        num_runs=len(page.runs),
+        num_scenes=len(page.scenes),
+        notes=tuple(f"{run.title or run.anchor}: {run.no_space}" for run in page.runs if run.no_space),
+    )
+
+
+def _write(request: FolderRequest, page: Page) -> Path:
+    out = request.out or beside(request.path)
+    with output_path(out, force=request.force, is_folder=False) as partial:
+        partial.write_text(rendered(page), encoding="utf-8")
+    return out
+
+
+def beside(path: Path) -> Path:
+    """NAME.html for a folder or file."""
+    place = path.absolute() if not path.name.strip(".") else path
+    return place.with_name(f"{place.stem if place.is_file() else place.name}.html")
+
+
+def _of_run(request: WriteReportRequest, run: RunFolder) -> Page:
+    section, scenes = section_of(run, anchor="run", title=run.path.absolute().name), {}
+    if run.command in WITH_SPACE:
+        try:
+            scenes["scene"] = packed(space_of_run(run, request.roots))
+            section = replace(section, space="scene")
+        except SplatCtrlError as error:
+            section = replace(section, no_space=f"not in 3-D: {error}")
+    return Page(
+        title=f"{run.command} {run.path.absolute().name}",
+        state=section.state,
+        sentence=section.sentence,
+        tables=changes_since(request.against, request.path, has_links=False)[0],
+        runs=[replace(section, title="", sentence="")],
+        scenes=scenes,
+        opens=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Job:
+    """A job of a batch with its folder, if that can be read, and else why not."""
+
+    node: Node
+    run: RunFolder | None
+    why: str
+    is_changed: bool
+
+    @property
+    def least(self) -> float:
+        """The least clearance [m], infinity where there is none."""
+        metrics = {} if self.run is None else self.run.metrics
+        values = [metrics.get(name) for name in ("min_clearance", "min_clearance_true")]
+        return min((float(value) for value in values if isinstance(value, int | float)), default=math.inf)
+
+    @property
+    def order(self) -> tuple[bool, bool, bool, float]:
+        """Not as expected first, then changed, then not passed, then by clearance."""
+        node = self.node
+        return (node.state == AS_EXPECTED, not self.is_changed, node.outcome in ("passed", None), self.least)
+
+
+def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progress) -> Page:
+    changes, changed = changes_since(request.against, request.path, has_links=True)
+    jobs = sorted((_job(batch, node, node.id in changed) for node in batch.nodes), key=lambda job: job.order)
+    replayed = {job.node.recording for job in jobs if job.node.command == REPLAY}
+    told = [job for job in jobs if _is_told(job, is_seen=request.all_scenes and job.node.recording not in replayed)]
+    wanted = [job for job in told if job.run is not None and job.run.command in WITH_SPACE]
+    chosen = {job.node.id for job in (wanted if request.all_scenes else wanted[:MOST_SCENES])}
+    scenes: dict[str, str] = {}
+    sections = []
+    for number, job in enumerate(told, start=1):
+        progress.log(f"{number} of {len(told)}: {job.node.id}")
+        sections.append(_section(request, batch, job, scenes, has_space=job.node.id in chosen))
+    unexpected = [job for job in jobs if job.node.state != AS_EXPECTED]
+    linked = {job.node.id for job in told}
+    return Page(
+        title=f"batch {batch.suite}",
+        state="failed" if unexpected else "passed",
+        sentence=_sentence(jobs, unexpected),
+        lines=[_versions(batch)],
+        tables=[
+            *changes,
+            *([_list("Not as expected", unexpected, linked)] if unexpected else []),
+            *_matrix(batch, jobs, linked),
+            replace(_list("All jobs, with time and memory", jobs, linked), is_folded=True),
+        ],
+        runs=sections,
+        pictures=_gallery(jobs, linked),
+        scenes=scenes,
+    )
+
+
+def _gallery(jobs: Sequence[_Job], linked: set[str]) -> list[Picture]:
+    """A picture of each recording without one in a section: of its score, else of its field."""
+    shown = {job.node.recording for job in jobs if job.node.id in linked and job.run is not None}
+    found = list[Picture]()
+    for command, (name, words) in WITH_PICTURES.items():
+        for job in jobs:
+            run, recording = job.run, job.node.recording
+            if run is None or run.command != command or recording in shown or len(found) == MOST_PICTURES:
+                continue
+            files = [path for path in run.pictures() if name in path.stem]
+            shown |= {recording} if files else set()
+            found += [picture(path, f"{job.node.id}: {words}", PICTURE_WIDTH) for path in files[:1]]
+    return found
+
+
+def _sentence(jobs: Sequence[_Job], unexpected: Sequence[_Job]) -> str:
+    """How many jobs are as expected, and the first that is not."""
+    count = len(jobs) - len(unexpected)
+    if not unexpected:
+        damaged = dict.fromkeys(job.node.recording for job in jobs if job.node.damage)
+        return f"all {count} jobs as expected" + (f"; {DAMAGE}: {', '.join(damaged)}" if damaged else "")
+    node = unexpected[0].node
+    said = node.sentence or node.cause or node.state
+    return f"{len(unexpected)} of {len(jobs)} jobs not as expected; first {node.id}: {said}"
+
+
+def _job(batch: BatchFolder, node: Node, is_changed: bool) -> _Job:
+    if not node.out or node.outcome is None:  # it only prints, or left nothing
+        return _Job(node=node, run=None, why="", is_changed=is_changed)
+    try:
+        place = batch.inside(node.out)
+        run = open_run(place) if (place / "run.json").is_file() or node.command == REPLAY else None
+        run = None if run is None else replace(run, words=tuple(map(str, node.words)))
+        return _Job(node=node, run=run, why="", is_changed=is_changed)
+    except InputError as error:
+        return _Job(node=node, run=None, why=str(error), is_changed=is_changed)
+
+
+def _is_told(job: _Job, *, is_seen: bool) -> bool:
+    """Replays, and whatever did not come out as expected or as before, have a section of their own; so has a map
+    that is to be seen.
+    """
+    if is_seen and job.node.command == MAP and job.run is not None:
+        return True
+    if job.node.state in WITHOUT_A_RUN:
+        return job.is_changed
+    return job.node.command == REPLAY or job.node.state != AS_EXPECTED or job.is_changed
+
+
+def _section(
+    request: WriteReportRequest, batch: BatchFolder, job: _Job, scenes: dict[str, str], *, has_space: bool
+) -> RunSection:
+    node, run = job.node, job.run
+    if run is None:
+        return RunSection(
+            anchor=node.id,
+            title=node.id,
+            state=node.state,
+            sentence=node.sentence or node.cause or node.state,
+            lines=[f"expected: {node.expect}", *([job.why] if job.why else [])],
+            details=[_log(batch, node)],
+        )
+    most, width = PICTURES[has_space]
+    section = section_of(run, anchor=node.id, title=node.id, most_pictures=most, width=width)
+    if node.state != AS_EXPECTED:
+        lines = [f"expected: {node.expect}", *([node.cause] if node.cause else []), *section.lines]
+        section = replace(section, state=node.state, lines=lines, details=[*section.details, _log(batch, node)])
+    if not has_space:
+        hint = "not in 3-D: --all-scenes has it" if run.command in WITH_SPACE else ""
+        return replace(section, no_space=hint)
+    try:
+        scenes[f"scene-{len(scenes)}"] = packed(space_of_run(run, (batch.path, *request.roots)))
+        return replace(section, space=f"scene-{len(scenes) - 1}")
+    except SplatCtrlError as error:
+        return replace(section, no_space=f"not in 3-D: {error}")
+
+
+def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> list[Table]:
+    """A row for each recording, those with the worst jobs first, and a column for each job and variant."""
+    nodes = {(job.node.recording, job.node.column): job.node for job in jobs}
+    recordings = dict.fromkeys(job.node.recording for job in jobs)
+    names = columns_of(((node.job, node.column) for node in batch.nodes), batch.jobs)
+    rows = [
+        Row(cells=[recording, *(_cell(nodes.get((recording, name)), linked) for name in names)])
+        for recording in recordings
+    ]
+    table = Table(title="Recordings", header=("recording", *(name.replace("+", " +") for name in names)))
+    more = replace(table, title=f"{len(rows) - MOST_ROWS} more recordings", rows=rows[MOST_ROWS:], is_folded=True)
+    return [replace(table, rows=rows[:MOST_ROWS]), *([more] if more.rows else [])]
+
+
+def _cell(node: Node | None, linked: set[str]) -> Cell:
+    """The verdict of a job; in the colour of its state where that is not as expected."""
+    if node is None:
+        return Cell(text="-")
+    state = node.outcome if node.state == AS_EXPECTED and node.outcome else node.state
+    is_expected = node.state == AS_EXPECTED and node.outcome != PASSED
+    words = f"{node.label or node.state}{node.damage}{', as expected' if is_expected else ''}"
+    return Cell(text=words, state="" if is_expected else state, link=node.id if node.id in linked else "")
+
+
+def _list(title: str, jobs: Sequence[_Job], linked: set[str]) -> Table:
+    rows = []
+    for job in jobs:
+        node = job.node
+        name = Cell(text=node.id, link=node.id if node.id in linked else "")
+        least = None if job.least == math.inf else round(1e3 * job.least, 1)
+        words = node.sentence or node.cause
+        cost = (node.seconds or None, node.peak_mb or None)
+        cells = (name, f"{node.label or node.state}{node.damage}", node.expect, least, words, *cost)
+        rows.append(Row(cells=cells, state=node.state))
+    return Table(title=title, header=("job", "verdict", "expected", "least mm", "sentence", "s", "MB"), rows=rows)
+
+
+def _versions(batch: BatchFolder) -> str:
+    versions = sorted({node.version for node in batch.nodes if node.version})
+    recordings = len({node.recording for node in batch.nodes})
+    return f"{recordings} recordings, {len(batch.nodes)} jobs; splatctrl {', '.join(versions) or 'unknown'}"
+
+
+def _log(batch: BatchFolder, node: Node) -> Table:
+    try:
+        lines = batch.inside(node.log).read_text(encoding="utf-8", errors="replace").splitlines()
+    except (OSError, InputError):
+        lines = ["no log"]
+    return Table(title="Log", text="\n".join(lines[-LOG_LINES:]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewResult(WrittenFile):
+    """The page, and what is to be seen: splats, states of the arm, cubes of space never seen."""
+
+    num_splats: int
+    num_states: int
+    num_unknown: int
+
+
+def view(request: ViewRequest) -> ViewResult:
+    """Write the page. Raises InputError for what there is nothing to see of."""
+    space = space_of(request.path, request.roots)
+    name = request.path.absolute().name
+    section = RunSection(anchor="scene", title="", state="", sentence="", space="scene")
+    page = Page(title=name, state="", sentence="", runs=[section], scenes={"scene": packed(space)}, opens=True)
+    file = _write(request, page)
+    return ViewResult(
+        file=file,
+        bytes=file.stat().st_size,
+        num_splats=max((len(at.splats) for at in space.splats), default=0),
+        num_states=0 if space.motion is None else len(space.motion.seconds),
+        num_unknown=0 if space.unknown is None else len(space.unknown),
+    )

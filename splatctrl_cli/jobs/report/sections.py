@@ -1,0 +1,187 @@
+"""What a page says of one run: its reasons, the timeline of a replay, pictures, settings and where it came from; and
+what changed since an earlier run or batch, or a stored baseline.
+"""
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, FigureChange, compare
+from splatctrl_cli.jobs.runs.run_folder import RunFolder
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.events import INTERVENTIONS, SHOWN
+from splatctrl_cli.report.page import Cell, Row, RunSection, Table, picture
+from splatctrl_cli.report.timeline import legend, timeline
+
+PASSED = "passed"
+MOST_METRICS = 400  # rows of a table
+WIDTH = 900  # pixels of a picture at most
+PICTURES = {  # by the beginning of a file's name: what it shows
+    "worst_": "a moment of least clearance: photo, and the arm's spheres as the replay had them",
+    "clearance": "clearance over time",
+    "commands": "what the controller commanded",
+    "open_loop": "commanded less logged velocity",
+    "divergence": "distance of the driven arm from the log",
+    "methods": "clearance of every method",
+    "slices": "slices of the distance",
+    "gradient": "length of the gradient",
+    "probability": "probability of collision",
+    "reliability": "predicted and true collisions",
+}
+
+
+def section_of(
+    run: RunFolder, *, anchor: str, title: str, most_pictures: int | None = None, width: int = WIDTH
+) -> RunSection:
+    """The section of a run, without its scene; width: of its pictures [px], of which there are at most so many."""
+    verdict = run.verdict
+    states = run.states
+    replayed: dict[str, Any] = {}
+    if states is not None and len(states.seconds):
+        about = (run.json_of("summary.json") or {}).get("about", {})
+        drawn = timeline(
+            states.seconds, states.clearance, float(about.get("margin", 0.0)), _events(run), states.rungs
+        )
+        replayed = {"timeline": drawn, "legend": legend(states.clearance)}
+    found = (run.json_of("summary.json") or {}).get("when_and_why", []) if states is not None else []
+    return RunSection(
+        anchor=anchor,
+        title=title,
+        state=str(verdict.get("outcome", "done")),
+        sentence=str(verdict.get("sentence", f"{run.command}: done; it judges nothing")),
+        reasons=_reasons(verdict, holds=False),
+        lines=[str(line) for line in found],
+        pictures=_pictures(run, most_pictures, width, has_timeline=states is not None),
+        details=[*_held(verdict), _metrics(run), _settings(run), _provenance(run)],
+        **replayed,
+    )
+
+
+def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
+    """The criteria of a verdict that hold, or those that do not, first the one that decided it."""
+    rows = []
+    for reason in verdict.get("reasons", []):
+        when = "" if reason["time_s"] is None else f" at {reason['time_s']:.2f} s"
+        words = "; ".join(part for part in (reason["sentence"] + when, reason["cause"], reason["remedy"]) if part)
+        if (reason["outcome"] == PASSED) is holds:
+            rows.append(Row(cells=(reason["criterion"], reason["outcome"], words), state=reason["outcome"]))
+    return Table(header=("criterion", "outcome", "found"), rows=rows)
+
+
+def _held(verdict: Mapping[str, Any]) -> list[Table]:
+    table = _reasons(verdict, holds=True)
+    return [replace(table, title=f"Criteria that hold ({len(table.rows)})")] if table.rows else []
+
+
+def _events(run: RunFolder) -> dict[str, list[tuple[float, float]]]:
+    """First and last time [s] of the events, by kind and measure: what went wrong, then what shaped a command."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    events = (run.json_of("events.json") or {}).get("events", [])
+    shown = [event for event in events if event["source"] in SHOWN]
+    for event in sorted(shown, key=lambda event: event["kind"] in INTERVENTIONS):
+        name = f"{event['kind']}{SHOWN[event['source']]}"
+        found.setdefault(name, []).append((float(event["start_s"]), float(event["end_s"])))
+    return found
+
+
+def _pictures(run: RunFolder, most: int | None, width: int, *, has_timeline: bool) -> list[Any]:
+    """The pictures of a folder; of a replay the moments first, and not the clearance, which is the timeline."""
+    files = [path for path in run.pictures() if not (has_timeline and path.name == "clearance.png")]
+    files.sort(key=lambda path: not path.name.startswith("worst_"))
+    words = {path: next((w for start, w in PICTURES.items() if path.name.startswith(start)), "") for path in files}
+    return [picture(path, f"{path.name}: {words[path]}".removesuffix(": "), width) for path in files[:most]]
+
+
+def _metrics(run: RunFolder) -> Table:
+    rows = [Row(cells=(name, value)) for name, value in run.metrics.items() if not isinstance(value, dict | list)]
+    return Table(title="Figures", header=("name", "value"), rows=rows[:MOST_METRICS])
+
+
+def _settings(run: RunFolder) -> Table:
+    """The command line, and each key of the configuration that is not the default."""
+    used, default = run.run.get("config", {}), Config().as_dict()
+    rows = [
+        Row(cells=(f"{section}.{key}", json.dumps(value), json.dumps(default[section].get(key))))
+        for section, values in used.items()
+        if isinstance(values, dict) and section in default
+        for key, value in values.items()
+        if value != default[section].get(key)
+    ]
+    text = f"splatctrl {shlex.join(run.arguments)}" + ("" if rows else "\nevery setting as by default")
+    return Table(title="Settings", header=("setting", "value", "default"), rows=rows, text=text)
+
+
+def _provenance(run: RunFolder) -> Table:
+    """Versions, times, and the sha256 of what went in."""
+    about = {
+        "splatctrl": run.run.get("splatctrl"),
+        "python": run.run.get("python"),
+        "machine": run.run.get("machine"),
+        "seed": run.run.get("seed"),
+        **dict(run.run.get("versions", {})),
+        **{f"seconds: {name}": value for name, value in dict(run.run.get("seconds", {})).items()},
+        **{f"sha256 of {name}": value for name, value in dict(run.run.get("inputs", {})).items()},
+    }
+    rows = [Row(cells=item) for item in about.items()]
+    return Table(title="Versions and provenance", header=("what", "value"), rows=rows)
+
+
+HEADER = ("job", "what", "before", "now", "", "allowed", "unit", "where")
+STATES = {Change.WORSE: "failed"}  # of a row
+
+
+def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple[list[Table], frozenset[str]]:
+    """Tables of what changed, the second folded, and the jobs that got worse or have another verdict.
+
+    before: a folder, else a baseline; None for no tables. has_links: each job has a section. Raises InputError for
+    what cannot be compared.
+    """
+    if before is None:
+        return [], frozenset()
+    is_folder = before.is_dir()
+    found = compare(
+        CompareRequest(runs=(before, after) if is_folder else (after,), against=None if is_folder else before)
+    )
+
+    def job(name: str) -> Cell:
+        return Cell(text=name, link=name if has_links else "")
+
+    def rows(figures: Sequence[FigureChange]) -> list[Row]:
+        return [
+            Row(
+                cells=(
+                    job(one.run),
+                    one.metric,
+                    one.before,
+                    one.after,
+                    one.change,
+                    one.allowed,
+                    one.unit,
+                    None if one.where is None else f"{one.where.time_s:.2f} s, {one.where}",
+                ),
+                state=STATES.get(one.change, ""),
+            )
+            for one in figures
+        ]
+
+    worse = [one for one in found.figures if one.change is Change.WORSE]
+    better = rows([one for one in found.figures if one.change is Change.BETTER])
+    first = [
+        Row(
+            cells=(job(one.run), "verdict", one.before, one.after, one.change, None, None, None),
+            state=STATES.get(one.change, ""),
+        )
+        for one in found.verdicts
+    ]
+    unlike = [Row(cells=("", name, *values, "not alike", "", "", "")) for name, values in found.differences.items()]
+    text = ". ".join([found.verdict.sentence, *map(str, found.verdict.said)])
+    tables = [Table(title="What changed", header=HEADER, rows=[*first, *rows(worse), *unlike], text=text)]
+    if better:
+        tables.append(
+            Table(title=f"Figures that got better ({len(better)})", header=HEADER, rows=better, is_folded=True)
+        )
+    return tables, frozenset([one.run for one in found.verdicts] + [one.run for one in worse])

@@ -1,0 +1,270 @@
+"""The three-dimensional scene of a run, a scene folder, a field or a file of splats."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from splatctrl_cli.formats.grid.iso_surface import iso_surface
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder, Snapshot, open_scene
+from splatctrl_cli.formats.splat.splats import nearest_splats, read_splats
+from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, States, open_run
+
+from splatctrl_cli.control.arm import sphere_names
+from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.recording.capture.capture_header import ROBOT
+from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
+from splatctrl_cli.report.page import Deciding, Motion, Space, SplatsAt, Surface, bodies_of, coarsened
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.voxels import OccupancyGrid, VoxelState
+
+MOST_STATES = 240  # of a motion
+MOST_SETS = 5  # of splats over time
+MOST_UNKNOWN = 6000  # cubes of space never seen
+MOST_CELLS = 80  # along a side of a grid of which the surface is drawn
+PLACE = re.compile(r"at \((-?[\d.]+), (-?[\d.]+), (-?[\d.]+)\)")
+
+
+def space_of(path: Path, roots: tuple[Path, ...] = ()) -> Space:
+    """What there is to see of a run, a scene or field folder, or a file of splats or of a field.
+
+    Raises InputError for anything else, and for a run whose scene or robot is not found.
+    """
+    if not path.is_file():
+        return space_of_run(open_run(path), roots)
+    if path.suffix == ".npz":
+        return space_of_grid(path)
+    splats = read_splats(path)[0]
+    chosen = splats if isinstance(splats, SplatSet) else nearest_splats(splats)
+    return Space(splats=[SplatsAt(time_s=0.0, splats=chosen)])
+
+
+def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
+    """As `space_of`, of an open run."""
+    path = run.path
+    if run.command == REPLAY:
+        return space_of_replay(run, roots)
+    if (path / "field.npz").is_file():
+        return space_of_grid(run.parts.checked(path / "field.npz"))
+    if (path / "splats.ply").is_file():
+        return space_of_scene(open_scene(path))
+    raise InputError(
+        f"{path}: {run.command} leaves nothing to see in 3-D", remedy="give a scene, a field, a replay or splats"
+    )
+
+
+def space_of_scene(scene: SceneFolder) -> Space:
+    """The splats at the end of a scene, and the space that was never seen."""
+    if scene.is_anisotropic:
+        return Space(splats=[SplatsAt(time_s=0.0, splats=nearest_splats(scene.gaussians()))])
+    return _with_unknown(Space(splats=[SplatsAt(time_s=0.0, splats=scene.splats())]), scene.occupancy(), scene)
+
+
+def space_of_grid(path: Path) -> Space:
+    """Where a baked distance is 0, on a thinned grid, and the space that was never seen."""
+    grid = read_npz(path)
+    if "sdf" not in grid.channels:
+        raise InputError(f"{path}: expected the channel sdf, got {', '.join(grid.channels)}")
+    step = -(-max(grid.channels["sdf"].shape) // MOST_CELLS)
+    channels = {"sdf": np.ascontiguousarray(grid.channels["sdf"][::step, ::step, ::step])}
+    thinned = DistanceGrid(origin=grid.origin, voxel=step * grid.voxel, channels=channels, header=grid.header)
+    try:
+        found = iso_surface(thinned)
+        surface = Surface(vertices=found.vertices.astype(np.float32), faces=found.faces.astype(np.uint32))
+    except NotEvaluableError:
+        surface = None
+    space = Space(surface=surface)
+    if "observed" not in grid.channels:
+        return space
+    is_unknown = np.asarray(grid.channels["observed"]) == VoxelState.NEVER_SEEN
+    unknown, edge = coarsened(is_unknown, grid.origin, grid.voxel, MOST_UNKNOWN)
+    return replace(space, unknown=unknown, voxel=edge)
+
+
+def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
+    """The scene of a replay as it was known at each time, its robot over the states, and what decided."""
+    states = run.states
+    if states is None:
+        raise InputError(f"{run.path}: no steps.csv", remedy="replay again")
+    robot = robot_of(run, states, roots)
+    deciding = _deciding(run, states, robot)
+    space = replace(_scene_of(run, states, roots, deciding), deciding=deciding)
+    return replace(space, motion=_motion(run, states, robot))
+
+
+def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> RobotModel:
+    """The robot of a replay with these states, as its command line or its log named it. Raises InputError where its
+    files are not found.
+    """
+    files = {name: run.option(f"--{name}") for name in ("urdf", "spheres")}
+    found = {name: _file(run, given, roots) for name, given in files.items() if given is not None}
+    if files["urdf"] is None and run.parts.has(run.path / ROBOT):
+        found["urdf"] = run.parts.checked(run.path / ROBOT)
+    if "urdf" not in found:
+        raise InputError(f"{run.path}: its command line has no --urdf", remedy="replay with the command line")
+    base = run.option("--base")
+    locks = tuple((name, float(value)) for name, _, value in (word.partition("=") for word in run.options("--lock")))
+    packages = tuple(place for word in run.options("--packages") if (place := run.place_of(word, roots)))
+    pose = None if base is None else tuple(float(part) for part in base.split(","))
+    digests = tuple(sha256(path) for path in found.values())
+    robot = _robot(found["urdf"], found.get("spheres"), pose, locks, packages, digests)
+    return robot.moved_by(tuple(states.joints))
+
+
+@lru_cache(maxsize=4)
+def _robot(
+    urdf: Path,
+    spheres: Path | None,
+    pose: tuple[float, ...] | None,
+    locks: tuple[tuple[str, float], ...],
+    packages: tuple[Path, ...],
+    _digests: tuple[str, ...],
+) -> RobotModel:
+    """The runs of a batch have mostly the same robot; the digests tell a file that was changed."""
+    T = None if pose is None else transform_from(pose[:3], pose[3:])
+    return RobotModel.from_urdf(urdf, spheres, T_world_base=T, locked=dict(locks), packages=packages)
+
+
+@lru_cache(maxsize=4)
+def robot_bodies(robot: RobotModel) -> dict[str, Surface]:
+    """The collision geometry of its links, by name."""
+    return bodies_of(robot.surface)
+
+
+def _file(run: RunFolder, given: str, roots: tuple[Path, ...]) -> Path:
+    inputs: Mapping[str, Any] = run.run.get("inputs", {})
+    place = run.place_of(given, roots, inputs.get(Path(given).name))
+    if place is None:
+        raise InputError(
+            f"{run.path}: {given} of its command line is not found, or was changed since",
+            remedy="give the folder that it was relative to with --root",
+        )
+    return place
+
+
+def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding: Deciding | None) -> Space:
+    """The splats by time and the unknown space when the verdict was decided; of a field its surface."""
+    grid = run.option("--field")
+    if grid is not None:
+        place = _file(run, grid, roots)
+        return space_of_grid(place / "field.npz" if place.is_dir() else place)
+    scene = scene_of(run, roots)
+    known = sets_known(run, states, scene)
+    times, used = [time for time, _ in known], [snapshot for _, snapshot in known]
+    when = 0.0 if deciding is None else deciding.time_s
+    chosen = spread(times, when)
+    sets = [SplatsAt(time_s=times[i] if n else 0.0, splats=used[i].splats()) for n, i in enumerate(chosen)]
+    at = max((i for i in chosen if times[i] <= when), default=None)
+    grid_then = None if at is None else used[at].occupancy()
+    return _with_unknown(Space(splats=sets), grid_then, scene)
+
+
+def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
+    """The scene of a replay, as its command line named it. Raises InputError where it is not found."""
+    given = run.option("--scene")
+    folder = run.path / "scene" if given is None else run.place_of(given, roots)
+    if folder is None or not folder.exists():
+        raise InputError(
+            f"{run.path}: the scene {given or 'scene/'} of its command line is not found",
+            remedy="give the folder that it was relative to with --root",
+        )
+    return open_scene(folder)
+
+
+def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple[float, Snapshot]]:
+    """The snapshots that a replay came to, each with the time [s] of the motion from which it was known."""
+    latency_ns = round(1e9 * float(run.option("--latency") or 0.0))
+    first, last = (int(stamp) - latency_ns for stamp in (states.stamps_ns[0], states.stamps_ns[-1]))
+    known = [s for s in scene.snapshots if s.stamp_ns <= last] if scene.has_clock else list(scene.snapshots[-1:])
+    early = [s for s in known if s.stamp_ns <= first]
+    used = [*early[-1:], *known[len(early) :]]
+    return [(max(0.0, 1e-9 * (snapshot.stamp_ns - first)), snapshot) for snapshot in used]
+
+
+def spread(times: list[float], when: float) -> list[int]:
+    """At most MOST_SETS of the sets known from `times` on: the first, the last, the one at `when`, others evenly."""
+    if not times:
+        return []
+    count = len(times)
+    at = max((i for i, time in enumerate(times) if time <= when), default=0)
+    most = min(count, MOST_SETS)
+    even = np.linspace(0, count - 1, most).round().astype(int).tolist()
+    nearest = min(range(most), key=lambda i: abs(even[i] - at))
+    if 0 < nearest < most - 1:
+        even[nearest] = at
+        return sorted(set(even))
+    return sorted({*even, at})
+
+
+def _with_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) -> Space:
+    if grid is None:
+        return space
+    used: Mapping[str, Any] = scene.run.get("config", {}).get("occupancy", {})
+    states = grid.states(float(used.get("free_below", 0.3)), float(used.get("occupied_above", 0.7)))
+    unknown, edge = coarsened(states == VoxelState.NEVER_SEEN, grid.origin, grid.voxel, MOST_UNKNOWN)
+    return replace(space, unknown=unknown, voxel=edge)
+
+
+def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
+    """The arm over at most MOST_STATES of the states: evenly, with the one of least clearance."""
+    count = len(states.seconds)
+    chosen = set(np.linspace(0, count - 1, min(count, MOST_STATES)).round().astype(int).tolist())
+    worst = states.worst()
+    which = sorted(chosen if worst is None else chosen | {worst})
+    bodies = robot_bodies(robot)
+    end = run.option("--frame") or robot.frame_names[-1]
+    postures = [position_of(states, robot, state) for state in which]
+    least = np.fmin.reduce(list(states.clearance.values())) if states.clearance else np.full(count, np.nan)
+    about = run.json_of("summary.json") or {}
+    return Motion(
+        seconds=states.seconds[which],
+        bodies=bodies,
+        poses=np.array([[robot.frame_pose(q, link) for link in bodies] for q in postures]),
+        path=np.array([robot.frame_pose(q, end)[:3, 3] for q in postures]),
+        clearance=least[which],
+        margin=float(about.get("about", {}).get("margin", 0.0)),
+    )
+
+
+def position_of(states: States, robot: RobotModel, state: int) -> Float64:
+    """Joint positions (J,) of a state, in the robot's order."""
+    try:
+        return np.array([states.joints[name][state] for name in robot.joint_names], np.float64)
+    except KeyError as error:
+        raise InputError(
+            f"steps.csv: no column q_{error.args[0]} of the robot's joint", remedy="replay again"
+        ) from None
+
+
+def _deciding(run: RunFolder, states: States, robot: RobotModel) -> Deciding | None:
+    """The first reason of the verdict that has a time and a place; else the least clearance and what was near."""
+    reasons = run.verdict.get("reasons", [])
+    for reason in reasons:
+        if reason["outcome"] != "passed" and reason["place"] is not None and reason["time_s"] is not None:
+            words = f"{reason['sentence']} at {reason['time_s']:.2f} s, {reason['cause']}"
+            return _decided(states, robot, words, float(reason["time_s"]), reason["place"], str(reason["who"]))
+    worst = states.worst()
+    if worst is None or not states.obstacles or not (place := PLACE.search(states.obstacles[worst])):
+        return None
+    least = float(np.fmin.reduce([values[worst] for values in states.clearance.values()]))
+    time_s = float(states.seconds[worst])
+    words = f"least clearance {1e3 * least:.1f} mm at {time_s:.2f} s, near {states.obstacles[worst]}"
+    return _decided(states, robot, words, time_s, [float(part) for part in place.groups()], "")
+
+
+def _decided(states: States, robot: RobotModel, words: str, time_s: float, place: list[float], who: str) -> Deciding:
+    """With the sphere that is named, else the nearest to the place among those that move."""
+    state = int(np.argmin(np.abs(states.seconds - time_s)))
+    centers, radii = robot.sphere_centers(position_of(states, robot, state)), robot.sphere_set.radii
+    names = sphere_names(robot.sphere_set)
+    gaps = np.linalg.norm(centers - np.array(place), axis=1) - radii
+    sphere = names.index(who) if who in names else int(np.argmin(np.where(robot.moving_spheres, gaps, np.inf)))
+    return Deciding(
+        sentence=words, time_s=time_s, place=np.array(place), sphere=(centers[sphere], float(radii[sphere]))
+    )

@@ -1,0 +1,334 @@
+"""What `robot` does, from requests to results: fit spheres, measure them, list self-collision pairs, show a robot."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config.fixed import DEFAULT_SPHERES
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons, parse_gate
+from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
+from splatctrl_cli.files.output import finite, output_path
+from splatctrl_cli.geometry import transform_points
+from splatctrl_cli.records import SphereSet
+from splatctrl_cli.report.robot_picture import robot_picture
+from splatctrl_cli.robot.coverage import CoverageReport, LinkCoverage, coverage_of_solids
+from splatctrl_cli.robot.link_meshes import Solid, mesh_path, read_solids
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_collision import SelfCollisionPairs, read_srdf, self_collision_pairs
+from splatctrl_cli.robot.sphere_files import (
+    SphereFile,
+    are_links_renamed,
+    matched_links,
+    read_sphere_file,
+    read_spheres,
+    spheres_yaml,
+)
+from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
+from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
+
+DEFAULT_MARGIN = ControlConfig().margin  # [m] that a controller keeps: what is farther outside may touch all the same
+SCALES = {
+    "max_deficit": ERROR,
+    "uncovered_share": BAD_SHARE,
+    "max_protrusion": ERROR,
+    "num_spheres": DESCRIBES,
+    **dict.fromkeys(("num_bare_links", "num_open_links", "num_stray_spheres"), FAULTS),
+}
+METRICS: dict[str, Callable[[CoverageReport], float | None]] = {  # lengths in metres, None where no figure bounds it
+    "max_deficit": lambda report: report.max_deficit,
+    "uncovered_share": lambda report: report.uncovered_share,
+    "max_protrusion": lambda report: report.max_protrusion,
+    "num_spheres": lambda report: report.num_spheres,
+    "num_bare_links": lambda report: len(report.bare_links),
+    "num_open_links": lambda report: len(report.open_links),
+    "num_stray_spheres": lambda report: report.stray_spheres,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotRequest:
+    """A robot, and what to do with it.
+
+    spheres: a file of its collision spheres, None for those of the URDF; packages: folders of its meshes; locked:
+    values [rad or m] of joints that hold still. Of a fit or a check: `picture`, a PNG to draw, and `require`, gates
+    on METRICS. Of a fit: `out`, the file to write, and `fit`. Of pairs: `srdf`, or `postures`, how many
+    configurations are sampled, and `drop_never`, whether what never comes near in them is left out.
+    """
+
+    urdf: Path
+    spheres: Path | None = None
+    packages: tuple[Path, ...] = ()
+    locked: Mapping[str, float] = field(default_factory=dict)
+    picture: Path | None = None
+    require: tuple[str, ...] = ()
+    out: Path = Path("spheres.yaml")
+    fit: FitOptions = field(default_factory=lambda: FitOptions(max_spheres=DEFAULT_SPHERES))
+    force: bool = False
+    srdf: Path | None = None
+    postures: int = 2000
+    drop_never: bool = False
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoverageResult:
+    """How spheres cover a robot: the file they are in (None: one that was just fitted), links it names in vain."""
+
+    report: CoverageReport
+    verdict: Verdict
+    spheres: Path
+    file: SphereFile | None = None
+    is_renamed: bool = False
+    links_left_out: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        links = [_plain_link(link) for link in self.report.links]
+        return {"metrics": {name: of(self.report) for name, of in METRICS.items()}, "links": links}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsResult:
+    """Which links may collide; num_foreign: pairs of the SRDF whose links the robot does not have."""
+
+    found: SelfCollisionPairs
+    num_foreign: int
+    doubts: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        rows = [
+            {
+                "links": list(pair.links),
+                "left_out": pair.left_out,
+                "sphere_pairs": pair.num_sphere_pairs,
+                "least_gap": finite(pair.least_gap),
+                "largest_gap": finite(pair.largest_gap),
+                "hit_share": finite(pair.hit_share),
+            }
+            for pair in self.found.link_pairs
+        ]
+        return {"num_sphere_pairs": len(self.found.pairs), "num_postures": self.found.num_postures, "pairs": rows}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotResult:
+    """A robot, its joints that are locked, and what is wrong with each mesh that is not found."""
+
+    model: RobotModel
+    locked: Mapping[str, float]
+    lost_meshes: tuple[str, ...]
+
+    @property
+    def joints(self) -> list[tuple[str, float, float, float]]:
+        """Name, lower and upper limit [rad or m] and velocity limit of each joint."""
+        model = self.model
+        limits = zip(model.joint_names, model.lower, model.upper, model.velocity_limit, strict=True)
+        return [(name, float(lower), float(upper), float(velocity)) for name, lower, upper, velocity in limits]
+
+    @property
+    def doubts(self) -> list[str]:
+        """What may be wrong with the spheres, where there are some."""
+        return list(self.model.doubts) if len(self.model.sphere_set.radii) else []
+
+    def as_dict(self) -> dict[str, Any]:
+        urdf = self.model.urdf
+        joints = [
+            {"name": name, "lower": finite(lower), "upper": finite(upper), "velocity": finite(velocity)}
+            for name, lower, upper, velocity in self.joints
+        ]
+        return {
+            "urdf": str(urdf.path),
+            "joints": joints,
+            "locked": dict(self.locked),
+            "links": list(urdf.links),
+            "collision_links": list(urdf.collision_links),
+            "num_meshes": len(urdf.meshes),
+            "num_shapes": len(urdf.shapes),
+            "num_spheres": len(self.model.sphere_set.radii),
+            "doubts": self.doubts,
+            "meshes_not_found": list(self.lost_meshes),
+        }
+
+
+def fit_robot(request: RobotRequest, progress: Progress = SILENT) -> CoverageResult:
+    """Fit spheres that cover each link's collision geometry, write them, and measure what was written."""
+    check_gate_names(request.require, METRICS)
+    with output_path(request.out, force=request.force, is_folder=False) as partial:
+        urdf = read_urdf(request.urdf)
+        solids = read_solids(urdf, request.packages)
+        progress.log(f"robot spheres: fitting {len(solids)} links")
+        fitted = fit_spheres(solids, request.fit)
+        report = coverage_of_solids(urdf, solids, fitted)
+        partial.write_text(spheres_yaml(fitted, _comments(request.urdf, report)), encoding="utf-8")
+    spheres = read_spheres(request.out)
+    if request.picture is not None:
+        _draw(request.picture, urdf, solids, spheres)
+    allowed = max(DEFAULT_MARGIN, request.fit.max_deficit)
+    verdict = _verdict(report, urdf, solids, "robot spheres", request.require, allowed)
+    return CoverageResult(report=report, verdict=verdict, spheres=request.out)
+
+
+def check_robot(request: RobotRequest) -> CoverageResult:
+    """Measure how much of the collision surface a set of spheres covers."""
+    check_gate_names(request.require, METRICS)
+    urdf, path = read_urdf(request.urdf), request.spheres or request.urdf
+    file = read_sphere_file(path)
+    spheres, left_out = matched_links(file.spheres, urdf, str(path))
+    solids = read_solids(urdf, request.packages)
+    report = coverage_of_solids(urdf, solids, spheres)
+    if request.picture is not None:
+        _draw(request.picture, urdf, solids, spheres)
+    return CoverageResult(
+        report=report,
+        verdict=_verdict(report, urdf, solids, "robot check", request.require, DEFAULT_MARGIN),
+        spheres=path,
+        file=file,
+        is_renamed=are_links_renamed(file.spheres, urdf),
+        links_left_out=tuple(left_out),
+    )
+
+
+def robot_pairs(request: RobotRequest) -> PairsResult:
+    """Which links may collide with each other, and why others may not."""
+    model = RobotModel.from_urdf(request.urdf, request.spheres, locked=request.locked)
+    disabled, foreign = ((), ()) if request.srdf is None else read_srdf(request.srdf, model.urdf)
+    found = self_collision_pairs(
+        model, disabled, num_postures=request.postures, seed=request.seed, drop_never=request.drop_never
+    )
+    return PairsResult(found=found, num_foreign=len(foreign), doubts=tuple(model.doubts))
+
+
+def describe_robot(request: RobotRequest) -> RobotResult:
+    """The joints, links, shapes and spheres of a robot; without `spheres`, those of the URDF if it has only such."""
+    urdf = read_urdf(request.urdf)
+    has_own = bool(urdf.shapes) and all(shape.kind == "sphere" for shape in urdf.shapes) and not urdf.meshes
+    none = SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
+    locked = urdf.with_followers(request.locked)
+    spheres = request.spheres if request.spheres is not None or has_own else none
+    model = RobotModel.from_urdf(request.urdf, spheres, locked=locked)
+    return RobotResult(model=model, locked=locked, lost_meshes=_lost_meshes(urdf, request.packages))
+
+
+def coverage_summary(report: CoverageReport) -> str:
+    """What a set of spheres leaves outside, and how far it sticks out, in one sentence."""
+    share = f"{100 * report.uncovered_share:.1f} % of the surface outside"
+    out = f"sticking out by at most {1e3 * report.max_protrusion:.1f} mm"
+    if report.worst is None or report.max_deficit is None:
+        return f"{report.num_spheres} spheres: {share}, {out}"
+    if report.max_deficit == 0:
+        return f"{report.num_spheres} spheres cover all of the collision surface (proven), {out}"
+    return (
+        f"{report.num_spheres} spheres: {share}, by at most {1e3 * report.max_deficit:.2f} mm (proven; at "
+        f"{report.worst.link}), {out}"
+    )
+
+
+def bare_links(report: CoverageReport) -> str:
+    """What is not known of links without a sphere; empty where there is none."""
+    bare = ", ".join(report.bare_links)
+    return f"no sphere stands for {bare}: nothing is said of these links" if bare else ""
+
+
+def _verdict(
+    report: CoverageReport,
+    urdf: UrdfFile,
+    solids: Mapping[str, tuple[Solid, ...]],
+    command: str,
+    require: Sequence[str],
+    allowed: float,
+) -> Verdict:
+    """The verdict on a set of spheres: what they leave uncovered, links without any, and each ``--require``.
+
+    A surface farther than `allowed` [m] outside fails, and a link that moves without a sphere; a gate on max_deficit
+    takes the place of that.
+    """
+    num, bare = len(report.links), bare_links(report)
+    counts = dict.fromkeys(METRICS, num) | dict.fromkeys(("max_protrusion", "num_stray_spheres"), report.num_spheres)
+    covered = Reason(
+        criterion="coverage",
+        outcome=Outcome.PASSED,
+        sentence=coverage_summary(report),
+        value=report.max_deficit,
+        threshold=allowed,
+        unit="m",
+        count=num,
+    )
+    faults = _uncovered(report, urdf, allowed)
+    if faults and not any(parse_gate(requirement)[0] == "max_deficit" for requirement in require):
+        covered = replace(
+            covered,
+            outcome=Outcome.FAILED,
+            sentence=f"{', '.join(faults[:3])}{', ...' * (len(faults) > 3)}: {len(faults)} of {num} links, allowed"
+            f" {1e3 * allowed:g} mm",
+            remedy="fit a set with 'splatctrl robot spheres', or give --require 'max_deficit<=...' [m]",
+        )
+    ignored = dict.fromkeys(part.surface.note for parts in solids.values() for part in parts if part.surface.note)
+    gates = gate_reasons(require, {name: of(report) for name, of in METRICS.items()}, counts)
+    return verdict_of(
+        command,
+        [covered, *([noted("coverage", bare)] if bare else []), *gates],
+        scope=f"{report.num_spheres} spheres on {num} links",
+        notes=ignored,
+        counts=counts,
+    )
+
+
+def _uncovered(report: CoverageReport, urdf: UrdfFile, allowed: float) -> list[str]:
+    """The links whose surface is farther than `allowed` [m] outside, the worst first, and how far."""
+    bodies, root = urdf.rigid_bodies(), urdf.root
+    bare = [f"{link} moves and has no sphere" for link in report.bare_links if bodies[link][0] != root]
+    far = [(link.deficit.proven, link.link) for link in report.links if link.deficit is not None]
+    return bare + [f"{link} is up to {1e3 * far:.1f} mm outside" for far, link in sorted(far)[::-1] if far > allowed]
+
+
+def _lost_meshes(urdf: UrdfFile, packages: Sequence[Path]) -> tuple[str, ...]:
+    """What is wrong with each mesh of a URDF that is not there."""
+    lost = []
+    for mesh in urdf.meshes:
+        try:
+            mesh_path(urdf.path, mesh, packages)
+        except InputError as error:
+            lost.append(str(error))
+    return tuple(lost)
+
+
+def _comments(urdf: Path, report: CoverageReport) -> list[str]:
+    """What a person should know of a written set, first lines of its file."""
+    deficit, protrusion = report.max_deficit, 1e3 * report.max_protrusion
+    covered = "cover all of it" if deficit == 0 else f"leave at most {1e3 * (deficit or 0.0):.2f} mm of it outside"
+    return [
+        f"Collision spheres for {urdf.name}, fitted by: splatctrl robot spheres. In metres, in each link's frame.",
+        f"{report.num_spheres} spheres {covered} (proven); they stick out by {protrusion:.1f} mm at most.",
+    ]
+
+
+def _draw(path: Path, urdf: UrdfFile, solids: Mapping[str, tuple[Solid, ...]], spheres: SphereSet) -> None:
+    model = RobotModel.from_urdf(urdf.path, spheres)
+    poses = {link: model.frame_pose(model.middle, link) for link in {*solids, *spheres.links}}
+    triangles = [
+        transform_points(poses[link], part.surface.corners) for link, parts in solids.items() for part in parts
+    ]
+    robot_picture(path, triangles, model.sphere_centers(model.middle), model.sphere_set.radii)
+
+
+def _plain_link(link: LinkCoverage) -> dict[str, Any]:
+    deficit = link.deficit
+    return {
+        "link": link.link,
+        "num_spheres": link.num_spheres,
+        "area": link.area,
+        "uncovered_share": link.uncovered_share,
+        "uncovered_bounds": [bound / link.area for bound in link.uncovered_bounds],
+        "deficit": None if deficit is None else max(0.0, deficit.proven),
+        "deficit_found": None if deficit is None else max(0.0, deficit.found),
+        "place": None if deficit is None else deficit.place.tolist(),
+        "protrusion": link.protrusion,
+        "worst_sphere": link.worst_sphere,
+        "is_closed": link.is_closed,
+    }

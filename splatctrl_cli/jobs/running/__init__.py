@@ -1,0 +1,1 @@
+"""How a job runs: what it says, where it computes, how an interrupted one continues."""

@@ -1,0 +1,177 @@
+"""Where a fit or a bake computes: on the processor, or on a CUDA card that is there, usable and worth its start."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.jobs.running.progress import Progress
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import CARD_LEAST_WORK
+from splatctrl_cli.errors import DeviceFault, DeviceFull, UsageError
+from splatctrl_cli.kernels.cuda.driver import Card, usable_card
+from splatctrl_cli.kernels.cuda.fit import DeviceFit, bytes_needed
+from splatctrl_cli.kernels.cuda.memory import FIELD, FIT, DeviceError, Memory, OutOfMemory
+from splatctrl_cli.libraries import is_installed
+from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.scene.fitter import SceneFitter
+
+AUTO, CPU, CUDA = "auto", "cpu", "cuda"
+EXTRA = ("cuda.core", "cuda.bindings")
+TO_CPU = "give --device cpu"
+INSTALL = "pip install 'splatctrl-cli[cuda]'"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """How a job runs. force: replace the output; threads: 0 for one per core; device: as of --device."""
+
+    config: Config = field(default_factory=Config)
+    force: bool = False
+    threads: int = 0
+    device: str = "auto"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Device:
+    """cpu, or cuda:N with its card, and the memory of it."""
+
+    name: str = CPU
+    card: Card | None = None
+    memory: Memory | None = field(default=None, repr=False)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For ``run.json``."""
+        known = {} if self.card is None else {"card": self.card.name, "driver": self.card.driver}
+        return {"device": self.name, **known}
+
+
+def opened(name: str, source: str = FIT) -> Device:
+    """That of ``cuda`` or ``cuda:N``, for the kernels of a source. Raises DeviceError, with a remedy, if it fails."""
+    if missing := [module for module in EXTRA if not is_installed(module)]:
+        raise DeviceError(f"the extra [cuda] is not installed ({missing[0]})", remedy=INSTALL)
+    index = int(name.partition(":")[2] or 0)
+    card = usable_card(index)
+    try:
+        from splatctrl_cli.kernels.cuda.card import CudaDevice
+
+        memory = CudaDevice(card, source=source)
+    except ImportError as error:
+        raise DeviceError(f"the extra [cuda] cannot be used: {error}", remedy=INSTALL) from error
+    return Device(name=f"{CUDA}:{index}", card=card, memory=memory)
+
+
+def demanded(name: str, source: str = FIT) -> Device | None:
+    """The device of a --device; None for auto. Raises UsageError where that one cannot be used."""
+    if name in (AUTO, CPU):
+        return None if name == AUTO else Device()
+    try:
+        return opened(name, source)
+    except DeviceError as error:
+        remedy = f"{error.remedy}, or {TO_CPU}" if error.remedy else TO_CPU
+        raise UsageError(f"--device {name}: {error}", remedy=remedy) from error
+
+
+def automatic(
+    progress: Progress, too_little: str = "", *, name: str = CUDA, source: str = FIT, needed: int = 0
+) -> Device:
+    """Where auto computes, and why is said: a card that is usable and has `needed` bytes, if the work is enough."""
+    try:
+        if too_little:
+            raise DeviceError(too_little)
+        device = opened(name, source)
+        assert device.memory is not None
+        if needed > device.memory.available():
+            raise DeviceError("too little memory is free on the card")
+    except DeviceError as error:
+        progress.log(f"computes on cpu: {error}")
+        return Device()
+    progress.log(f"computes on {shown(device.as_dict())}")
+    return device
+
+
+def chosen(name: str, is_enough: bool, progress: Progress) -> Device:
+    """The device of a --device that fields are computed on; auto asks for a card where the work is enough.
+
+    Raises UsageError where it cannot be used.
+    """
+    device = demanded(name, FIELD)
+    if device is None:
+        device = automatic(progress, source=FIELD) if is_enough else Device()
+    return device
+
+
+class FitDevice:
+    """The device that a fit computes on, of a --device, and those that it has computed on.
+
+    history: of each, as ``run.json`` has it, with the number of the iteration from which on. With auto a fit begins
+    where its work is worth it, and goes on where it was. Raises UsageError for a device that cannot be used.
+    """
+
+    def __init__(self, name: str = CPU) -> None:
+        self._device = demanded(name)
+        self._fit: DeviceFit | None = None
+        self.history: list[dict[str, Any]] = []
+
+    def give(self, fitter: SceneFitter, frames: Sequence[RgbdFrame], progress: Progress) -> None:
+        """Let a fitter compute there; `frames` are those of its first time step, keyframes come to them."""
+        num_splats, window = fitter.config.max_splats, fitter.config.window
+        sizes = [(frame.intrinsics.height, frame.intrinsics.width) for frame in frames]
+        sizes += [max(sizes)] * window
+        if self._device is None:
+            self._device = self._chosen(num_splats, sizes, progress)
+        device, last = self._device, self.history[-1] if self.history else None
+        if last is None or any(last.get(name) != device.as_dict().get(name) for name in ("device", "card")):
+            begins = fitter.descent.num_iterations
+            self.history.append({**device.as_dict(), "from_iteration": begins})
+            if last is not None:
+                progress.log(
+                    f"warning: computed on {shown(last)} before iteration {begins}, on {shown(device.as_dict())} from"
+                    " there; for the bytes of one of them alone start over"
+                )
+        if device.memory is not None:
+            self._fit = fitter.descent.device = DeviceFit(device.memory, num_splats, sizes)
+
+    def _chosen(self, num_splats: int, sizes: Sequence[tuple[int, int]], progress: Progress) -> Device:
+        """Where auto computes; why is said."""
+        last = self.history[-1]["device"] if self.history else ""
+        if last == CPU:
+            return Device()
+        num_pixels, too_little = max(height * width for height, width in sizes), ""
+        if not last and num_splats * num_pixels < CARD_LEAST_WORK:
+            too_little = f"{num_splats} splats on {num_pixels} pixels are too little work for a card"
+        return automatic(progress, too_little, name=last or CUDA, needed=bytes_needed(num_splats, sizes))
+
+    def close(self) -> None:
+        """Give the card's memory back."""
+        if self._fit is not None:
+            with suppress(DeviceError):  # a card that failed has been told of
+                self._fit.close()
+
+    @contextmanager
+    def told_how_to_go_on(self, checkpoint: Path) -> Iterator[None]:
+        """Names what fails on the device, and how to go on from `checkpoint` where it is there."""
+        try:
+            yield
+        except DeviceError as error:
+            raise named(error, self._device, checkpoint) from error
+
+
+def named(error: DeviceError, device: Device | None, checkpoint: Path | None = None) -> DeviceFault:
+    """What failed on a device, and how to go on, from `checkpoint` where it is there."""
+    kind = DeviceFull if isinstance(error, OutOfMemory) else DeviceFault
+    remedies = [error.remedy] if error.remedy else []
+    if checkpoint is not None and checkpoint.is_file():
+        kept = checkpoint.parent.parent
+        remedies.append(f"{kept} is kept: go on with --resume, and --device cpu if it fails again")
+    else:
+        remedies.append("start over, with --device cpu if it fails again")
+    return kind(f"{'device' if device is None else shown(device.as_dict())}: {error}", remedy="; ".join(remedies))
+
+
+def shown(device: dict[str, Any]) -> str:
+    """A device of the history in words."""
+    card = f" ({device['card']}, driver {device['driver']})" if "card" in device else ""
+    return f"{device['device']}{card}"

@@ -1,0 +1,105 @@
+"""Going on with an interrupted run: what has to be the same, and what differs."""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.formats.scene.scene_writer import Checkpoint, read_checkpoint
+
+from splatctrl_cli import __version__
+from splatctrl_cli.config import Config
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.kernels import arithmetic
+
+DECIDING_OPTIONS: Mapping[str, object] = {  # what decides the bytes of a scene beside its configuration, if not given
+    **{"cameras": None, "camera": [], "camera_pose": [], "world_frame": None, "depth_scale": None},
+    **{
+        "pairing_tolerance": 0.02,
+        "joint_topic": None,
+        "holdout": None,
+        "scan": None,
+        "box": None,
+        "refine_poses": False,
+        "refine_exposure": False,
+    },
+}
+DECIDING_PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin")  # their versions may change a bit
+
+
+def identity(
+    options: Mapping[str, object], files: Mapping[str, Path | None], config: Config, inputs: Mapping[str, str]
+) -> dict[str, Any]:
+    """Everything that decides the bytes of a run, as plain values; not the number of threads, which does not.
+
+    options: values by the names of their options; files: likewise, whose contents count; inputs: sha256 of the
+    recording's files, by name.
+    """
+    values = {
+        **deciding_versions(),
+        **{f"--{name.replace('_', '-')}": value for name, value in options.items()},
+        **{f"--{name}": sha256(path) for name, path in files.items() if path is not None},
+        "sha256": dict(inputs),
+        **config.as_dict(),
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(values, default=str))
+    return plain
+
+
+def deciding_versions() -> dict[str, str]:
+    """What of this program, its kernels and its packages may change a bit."""
+    return {
+        "splatctrl": __version__,
+        "kernels": arithmetic(),
+        **{name: metadata.version(name) for name in DECIDING_PACKAGES},
+    }
+
+
+@contextmanager
+def told_how_to_go_on(checkpoint: Path, kept: Path | None = None) -> Iterator[None]:
+    """Says after Ctrl-C what was kept (by default the folder above that of the checkpoint)."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not checkpoint.is_file():
+            raise KeyboardInterrupt("interrupted before its first checkpoint; run the same command again") from None
+        kept = kept or checkpoint.parent.parent
+        raise KeyboardInterrupt(
+            f"interrupted: {kept} is kept; continue it with the same command and --resume"
+        ) from None
+
+
+def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> Checkpoint:
+    """The checkpoint in a partial folder. Raises UsageError naming what differs `now` from when it was written."""
+    checkpoint = read_checkpoint(folder)
+    check_same_run(folder, checkpoint.progress["run"], now)
+    return checkpoint
+
+
+def check_same_run(folder: Path, run: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise UsageError naming what differs `now` from what decided the bytes of an interrupted run."""
+    before, after = dict(_flat(run)), dict(_flat(now))
+    differing = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    if differing:
+        said = ", ".join(f"{n} was {_shown(before.get(n))}, is {_shown(after.get(n))}" for n in differing[:3])
+        more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+        raise UsageError(
+            f"{folder}: --resume: the interrupted run differs: {said}{more}",
+            remedy="give the same options, or start over without --resume",
+        )
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}{' of ' if name == 'sha256' else '.'}")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _shown(value: object) -> str:
+    text = "not given" if value is None or value == [] else str(value)
+    return text if len(text) <= 40 else f"{text[:12]}..."

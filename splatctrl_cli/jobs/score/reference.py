@@ -1,0 +1,217 @@
+"""What `score` compares with: the recording, which of its views are scored by which protocol, and their masks."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder
+from splatctrl_cli.jobs.recordings.open_recording import (
+    RecordingRequest,
+    open_dtu,
+    open_held_out,
+    refuse_scan_options,
+)
+from splatctrl_cli.jobs.recordings.same_recording import changed_files, differences
+from splatctrl_cli.jobs.running.progress import Progress
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
+from splatctrl_cli.recording.folder.dtu_source import DtuSource
+from splatctrl_cli.recording.source import lacks_depth, open_session, open_source
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import Bool, RecordSource, RgbdFrame
+
+Mask = Callable[[RgbdFrame], Bool | None]
+"""A frame -> the pixels (H, W) that the mask rule selects."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """source: the recording `where` with all its cameras. scan: its name in a data set of several. protocol and split
+    where one was named; training_stamps_ns: of the views that it trains on. mask_rule says in words what `mask`
+    selects. Without depth, nothing says what a training camera saw. stamps_ns: of each camera's frames, where several
+    logs are one session. doubts: what speaks against the scores, in words.
+    """
+
+    where: Path
+    source: RecordSource
+    layout: str = ""
+    scan: str | None = None
+    protocol: ScoreProtocol | None = None
+    split: Split | None = None
+    training_stamps_ns: frozenset[int] = frozenset()
+    mask: Mask | None = None
+    mask_rule: str = "none"
+    numbered_by_stamp: bool = False
+    has_depth: bool = True
+    stamps_ns: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def scores_training(self) -> bool:
+        """Whether the protocol scores the views that trained."""
+        return self.protocol is not None and self.protocol.scores_training
+
+
+def open_reference(recording: RecordingRequest, progress: Progress) -> Reference:
+    """The recording with all its cameras: those chosen are scored, the others say what was seen."""
+    if recording.is_dtu:
+        return _dtu_reference(recording, progress)
+    refuse_scan_options(recording)
+    where = recording.path
+    if recording.beside:
+        return _session_reference((where, *recording.beside), replace(recording.options, cameras=None))
+    if recording.protocol is None:
+        source = open_source(where, replace(recording.options, cameras=None), needs_depth=False)
+        return Reference(where=where, source=source, has_depth=lacks_depth(source) is None)
+    source, protocol, split = open_held_out(recording)
+    stamps = [stamp for stamp, _, _ in source.poses()]
+    return Reference(
+        where=where,
+        source=source,
+        layout="image folder",
+        protocol=protocol,
+        split=split,
+        training_stamps_ns=frozenset(stamps[n] for n in split.training),
+        has_depth=lacks_depth(source) is None,
+    )
+
+
+def _session_reference(paths: Sequence[Path], options: SourceOptions) -> Reference:
+    """Several logs as one: in one tree of frames, or InputError is raised."""
+    source = open_session(paths, options)
+    stamps_ns: dict[str, list[int]] = {}
+    for stamp, camera, _ in source.poses():
+        stamps_ns.setdefault(camera, []).append(stamp)
+    return Reference(where=Path(" + ".join(map(str, paths))), source=source, stamps_ns=stamps_ns)
+
+
+def _dtu_reference(recording: RecordingRequest, progress: Progress) -> Reference:
+    source = open_dtu(recording)
+    protocol = None if recording.protocol is None else score_protocol(recording.protocol)
+    mask, rule = _mask_of(source, "given" if protocol is None else protocol.mask)
+    if protocol is not None and protocol.mask == "object" and mask is None:
+        progress.log(
+            f"warning: {protocol.name}: its published figures are over the object alone, and there is no mask: every"
+            " pixel counts here; --masks DIR gives the masks"
+        )
+    return Reference(
+        where=recording.path,
+        source=source,
+        layout=f"{source.layout}'s",
+        scan=source.scan,
+        protocol=protocol,
+        split=source.split,
+        training_stamps_ns=frozenset(source.split.training) if protocol else frozenset(),
+        mask=mask,
+        mask_rule=rule,
+        numbered_by_stamp=True,
+        has_depth=source.has_depth,
+        doubts=tuple(missing_views(source, protocol)),
+    )
+
+
+def missing_views(source: DtuSource, protocol: ScoreProtocol | None) -> Iterator[str]:
+    """In words, which views of the scan are not there, where that changes which are scored, or that lack depth."""
+    numbers = sorted({*source.split.training, *source.split.scored, *source.split.left_out})
+    missing = sorted(set(range(numbers[-1] + 1)) - set(numbers))
+    if missing and protocol is not None and protocol.every:
+        listed = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
+        yield (
+            f"{source.name}: views {listed} are not there: '{protocol.name}' counts those that are, and scores others"
+            " than of a whole scan; add the views, or name those to score as holdout:0,8"
+        )
+    if source.has_depth and source.loss.notes:
+        more = len(source.loss.notes) - 1
+        yield source.loss.notes[0] + (f" (and {more} more)" if more else "")
+
+
+def _mask_of(source: DtuSource, wanted: str) -> tuple[Mask | None, str]:
+    if wanted == "depth":
+        return (lambda frame: frame.depth > 0), "pixels with a reference depth"
+    if any(source.mask(number) is not None for number in source.split.scored or source.split.training):
+        return (lambda frame: source.mask(frame.stamp_ns)), "object mask"
+    return None, "none"
+
+
+def cameras_to_score(
+    wanted: Sequence[str] | None, reference: Reference, training: Sequence[str], *, allow_training: bool
+) -> tuple[str, ...]:
+    """The cameras that are scored: by default those that did not train. Raises UsageError where there is none."""
+    recorded = reference.source.cameras
+    if reference.scores_training:
+        return recorded
+    if wanted is None:
+        cameras = tuple(name for name in recorded if name not in training)
+        if cameras or (allow_training and recorded):
+            return cameras or recorded
+        raise UsageError(
+            f"{reference.where}: each camera has the name of one that trained the scene ({', '.join(recorded)})",
+            remedy="give the views that reconstruct left out as --holdout or --protocol, or --allow-training",
+        )
+    cameras = tuple(dict.fromkeys(wanted))
+    unknown = [name for name in cameras if name not in recorded]
+    if unknown:
+        raise InputError(f"{reference.where}: no camera {unknown[0]!r}", remedy=f"use one of: {', '.join(recorded)}")
+    trained = [name for name in cameras if name in training]
+    if trained and not allow_training:
+        raise UsageError(
+            f"--cameras {','.join(wanted)}: {trained[0]} trained the scene, its score says nothing about other views",
+            remedy="give a camera that was held out, or --allow-training",
+        )
+    return cameras
+
+
+def check_times(reference: Reference, scoring: Sequence[str], training: Sequence[str]) -> None:
+    """Raise InputError for a camera of a session whose frames all lie before or after those of training cameras."""
+    trained = [stamp for camera in training for stamp in reference.stamps_ns.get(camera, ())]
+    for camera in scoring if trained else ():
+        stamps = reference.stamps_ns[camera]
+        if stamps[0] > max(trained) or stamps[-1] < min(trained):
+            raise InputError(
+                f"{reference.where}: camera {camera}: expected frames between those that trained, {min(trained)} to"
+                f" {max(trained)} ns, got {stamps[0]} to {stamps[-1]} ns",
+                remedy="give logs of the same time and clock, or other --cameras",
+            )
+
+
+def check_training(path: Path, scene: SceneFolder, reference: Reference) -> None:
+    """Raise UsageError where the scene at `path` was not trained on the views that the protocol trains on."""
+    if reference.protocol is None or reference.split is None or not scene.names_its_views:
+        return
+    trained, expected = scene.training_stamps_ns, reference.training_stamps_ns
+    if trained == expected:
+        return
+    lacks, others = len(expected - trained), len(trained - expected)
+    raise UsageError(
+        f"{path}: protocol {reference.protocol.name} trains on {len(expected)} views"
+        f" ({reference.split.words()}), of which {lacks} did not train the scene, and {others} others did",
+        remedy=f"reconstruct with --protocol {reference.protocol.name}",
+    )
+
+
+def recording_check(
+    path: Path, scene: SceneFolder, reference: Reference, digests: Mapping[str, str], *, allow_other: bool
+) -> dict[str, Any]:
+    """What the recording has in common with the one that made the scene at `path`. Raises InputError where they
+    differ, unless that is allowed.
+
+    By the first frame of each camera that trained (not kept by an older version), and the digests of files of the
+    same names.
+    """
+    recorded = scene.run.get("metrics", {}).get("first_frames")
+    then = scene.run.get("inputs", {})
+    compared = [name for name in then if name in digests]
+    basis = [f"digests of {len(compared)} files of the same names"] if compared else []
+    lines = changed_files(then, digests)
+    if recorded:
+        basis.append("intrinsics, stamp, pose and picture of each training camera's first frame")
+        lines += differences(recorded, reference.source.records())
+    if lines and not allow_other:
+        raise InputError(
+            f"{reference.where}: not the recording that {path} was made from: {'; '.join(lines)}",
+            remedy="give that recording, or --allow-other-recording to score against this one; for a camera of"
+            " another log of its session give both, each as --reference",
+        )
+    return {"basis": basis, "differences": lines}

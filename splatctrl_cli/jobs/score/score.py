@@ -1,0 +1,319 @@
+"""A scene against recorded views that did not train it, from the request to the result: one scan, or several."""
+
+import csv
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from math import nan
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_splats, run_value
+from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.jobs.score.reference import (
+    Reference,
+    cameras_to_score,
+    check_times,
+    check_training,
+    open_reference,
+    recording_check,
+)
+from splatctrl_cli.jobs.score.views import CloudSettings, Scorer, Scores, cloud_figures
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.gates import check_gate_names
+from splatctrl_cli.evaluate.score import PROTOCOL, as_json, free_mass, total_score
+from splatctrl_cli.evaluate.score_report import (
+    AVERAGING,
+    NAMES,
+    NAMES_WITH_CHANGES,
+    PREFIX,
+    changes,
+    read_baseline,
+    report_of_scans,
+    score_verdict,
+)
+from splatctrl_cli.evaluate.verdict import Verdict, brief
+from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
+from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
+from splatctrl_cli.records import Label
+from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, view_picture
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreRequest:
+    """One scene, or a folder of scenes named like the scans of the recording's data set, and how views are scored.
+
+    recording: what is compared with; its options' cameras are those scored. baseline: score.json of an earlier score,
+    whose figures are compared. out: folder for scores and pictures. newest: render a view from the newest snapshot
+    not later than it, else from the final splats. images: pictures of ``all`` views, of each camera's ``best-worst``,
+    or ``none``. require: gates on the metrics. Raises UsageError for pictures of all views without a folder.
+    """
+
+    scene: Path
+    recording: RecordingRequest
+    baseline: Path | None = None
+    out: Path | None = None
+    force: bool = False
+    newest: bool = True
+    images: str = "best-worst"
+    cloud: CloudSettings | None = None
+    allow_training: bool = False
+    allow_other_recording: bool = False
+    require: tuple[str, ...] = ()
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        if self.images == "all" and self.out is None:
+            raise UsageError("--images all: expected a folder for them", remedy="give -o")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreResult:
+    """report: everything that ``score.json`` holds; the folder `out` where one was asked for."""
+
+    __repr__ = brief
+
+    report: Mapping[str, Any]
+    verdict: Verdict
+    out: Path | None = None
+
+    @property
+    def metrics(self) -> Mapping[str, float | None]:
+        """The mean figures by flat name, None where a figure has no value."""
+        return dict(self.report["metrics"])
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """How many views each figure rests on."""
+        return self.verdict.counts
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """What speaks against the figures, in words."""
+        return tuple(self.report["warnings"])
+
+
+def score(request: ScoreRequest, progress: Progress = SILENT) -> ScoreResult:
+    """Score a scene, or the scenes of several scans and their mean.
+
+    Raises SplatCtrlError for a scene or a recording that cannot be compared.
+    """
+    if request.baseline is not None:
+        read_baseline(request.baseline)  # better refused now than after the views
+    names = NAMES if request.baseline is None else NAMES_WITH_CHANGES
+    check_gate_names(request.require, names, {"--baseline": NAMES_WITH_CHANGES})
+    scenes = _scenes_of_scans(request)
+    with output_path(request.out, force=request.force, is_folder=True) if request.out else nullcontext() as folder:
+        if scenes:
+            return _score_scans(request, scenes, folder, progress)
+        return _score_scene(request, folder, progress)
+
+
+def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) -> ScoreResult:
+    """Score one scene, and write what is asked for into `folder`, where there is one."""
+    stopwatch, recording = Stopwatch(), request.recording
+    if folder:
+        folder.mkdir(exist_ok=True)
+    scene = open_splats(request.scene)
+    if scene.is_anisotropic:
+        scene.gaussians()  # either raises where there is none to compare
+    else:
+        field_splats(scene.splats())
+    reference = open_reference(recording, progress)
+    if request.cloud is not None and not scene.names_its_views:
+        raise UsageError(
+            f"--cloud: the surface is looked at from the views that trained, which {request.scene} does not name",
+            remedy="leave it out, or give a folder that reconstruct wrote",
+        )
+    cloud = None if request.cloud is None else request.cloud.of_scan(reference.scan)
+    wanted, allow_training = recording.options.cameras, request.allow_training
+    scorer = Scorer(
+        scene=scene,
+        reference=reference,
+        cameras=cameras_to_score(wanted, reference, scene.cameras, allow_training=allow_training),
+        draw=_view_drawer(folder / "views") if folder and request.images == "all" else None,
+        newest=request.newest,
+        allow_training=allow_training,
+        threads=request.threads,
+    )
+    check_times(reference, scorer.cameras, scene.cameras)
+    check_training(request.scene, scene, reference)
+    digests = reference.source.digests()
+    same = recording_check(request.scene, scene, reference, digests, allow_other=request.allow_other_recording)
+    scores = scorer.run(progress, stopwatch)
+    surface: dict[str, float] = {}
+    if cloud is not None:
+        with stopwatch.stage("cloud"):
+            surface = cloud_figures(cloud, scene, scores.training, request.threads)
+    protocol = _protocol(reference, scene, scores)
+    definitions = PROTOCOL | ({} if cloud is None else {"cloud": cloud.words()})
+    metrics = total_score(scores.views) | surface
+    metrics |= {"free_mass": _free_mass(request.scene, scene), "num_skipped": len(scores.skipped)}
+    metrics["num_warnings"] = len(scores.doubts) + len(same["differences"])
+    report = _report(request, scorer, scores, same, protocol | {"definitions": definitions}, as_json(metrics))
+    result = _concluded(request, report, is_damaged=bool(reference.source.loss.damaged))
+    if folder:
+        _write_table(folder / "views.csv", report["views"])
+        with stopwatch.stage("pictures"):
+            for (_, best), (_, worst) in scores.extremes.values() if request.images != "none" else ():
+                comparison = [best] if worst.title == best.title else [best, worst]
+                comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
+        config = {"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol}
+        made = request.scene if request.scene.is_file() else request.scene / "splats.ply"
+        inputs = {**digests, f"scene/{made.name}": sha256(made)}
+        _write_result(folder, result, config=config, inputs=inputs, stopwatch=stopwatch)
+    return result
+
+
+def _report(
+    request: ScoreRequest,
+    scorer: Scorer,
+    scores: Scores,
+    recording: dict[str, Any],
+    protocol: dict[str, Any],
+    metrics: dict[str, Any],
+) -> dict[str, Any]:
+    other = [f"another recording: {line}" for line in recording["differences"]]
+    views = scores.views
+    return {
+        "scene": str(request.scene),
+        "reference": str(scorer.reference.where),
+        "cameras": list(scorer.cameras),
+        "training_cameras": list(scorer.scene.cameras),
+        "has_clock": scores.has_clock,
+        "snapshots": "newest" if scores.has_clock and request.newest else "final",
+        "recording": recording,
+        "protocol": protocol,
+        "metrics": metrics,
+        "warnings": [*other, *scores.doubts],
+        "skipped_views": scores.skipped,
+        "views": [
+            {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in views
+        ],
+    }
+
+
+def _protocol(reference: Reference, scene: SceneFolder, scores: Scores) -> dict[str, Any]:
+    """What a figure has to be printed with to be compared with another."""
+    named, split = reference.protocol, reference.split
+    sizes = sorted({view.size for view in scores.views})
+    return {
+        "name": "none" if named is None else named.name,
+        "source": "none" if named is None else named.source,
+        "layout": reference.layout,
+        "training_views": None if split is None else list(split.training),
+        "scored_views": None if split is None else list(split.scored),
+        "left_out_views": None if split is None else list(split.left_out),
+        "split": "by camera" if split is None else split.words(),
+        "mask_rule": reference.mask_rule,
+        "resolution": [f"{width}x{height}" for width, height in sizes],
+        "published_resolution": None if named is None or named.size is None else "{}x{}".format(*named.size),
+        "published_scans": None if named is None or not named.scans else list(named.scans),
+        "background": [round(value, 4) for value in scene.background],
+        "averaging": AVERAGING,
+    }
+
+
+def _free_mass(path: Path, scene: SceneFolder) -> float:
+    """nan where the scene has no occupancy grid."""
+    if not (path / "occupancy.npz").is_file():
+        return nan
+    keys = ("config", "occupancy", "free_below")
+    free_below = run_value(scene.run, keys, float, where=str(path / "run.json"))
+    spheres = obstacle_spheres(scene.splats(), scene.unrepresented_at(None), frozenset(Label))
+    return free_mass(spheres.splats, scene.occupancy(), free_below)
+
+
+def _concluded(request: ScoreRequest, report: dict[str, Any], *, is_damaged: bool) -> ScoreResult:
+    """The result of a report, to whose metrics the changes since a baseline are added."""
+    if request.baseline is not None:
+        report["metrics"] |= changes(report, request.baseline)
+    verdict = score_verdict(report, request.require, is_damaged=is_damaged)
+    return ScoreResult(report=report, verdict=verdict, out=request.out)
+
+
+def _view_drawer(folder: Path) -> Callable[[ComparisonRow], None]:
+    """Writes the pictures of each view into `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return lambda row: view_picture(folder / f"{row.title}.png", row)
+
+
+def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        table = csv.DictWriter(stream, fieldnames=list(rows[0]), lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+
+
+def _write_result(
+    folder: Path,
+    result: ScoreResult,
+    *,
+    config: Mapping[str, Any],
+    inputs: Mapping[str, str] | None = None,
+    stopwatch: Stopwatch | None = None,
+) -> None:
+    """``score.json`` and ``run.json``."""
+    write_json(folder / "score.json", result.report)
+    write_run(
+        folder,
+        command="score",
+        config=config,
+        inputs=inputs or {},
+        metrics=result.metrics,
+        stopwatch=stopwatch or Stopwatch(),
+        verdict=result.verdict.as_dict(),
+    )
+
+
+def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
+    """The scenes by scan where the request's is a folder of them; empty where it is one, or of no data set.
+
+    Raises InputError for a scan that has none.
+    """
+    folder, recording = request.scene, request.recording
+    if not recording.is_dtu or not folder.is_dir() or (folder / "splats.ply").is_file():
+        return {}
+    found = {path.name: path for path in sorted(folder.iterdir()) if (path / "splats.ply").is_file()}
+    if not found or recording.scan is None:
+        return found
+    wanted = [name.strip() for name in recording.scan.split(",") if name.strip()]
+    unknown = [name for name in wanted if name not in found]
+    if unknown:
+        raise InputError(f"{folder}: no scene {unknown[0]!r}", remedy=f"scenes: {', '.join(found)}")
+    return {name: found[name] for name in wanted}
+
+
+def _score_scans(
+    request: ScoreRequest, scenes: Mapping[str, Path], folder: Path | None, progress: Progress
+) -> ScoreResult:
+    """Score every scene against its scan, and the means. `folder` gets a folder for each scan."""
+    results: dict[str, ScoreResult] = {}
+    for scan, scene in scenes.items():
+        progress.log(f"{scan}: scores {scene}")
+        recording = of_scan(request.recording, scan)
+        # the means alone are held to gates and a baseline
+        alone = replace(request, scene=scene, recording=recording, require=(), baseline=None)
+        results[scan] = _score_scene(alone, folder and folder / scan, progress)
+    report = {"scenes": str(request.scene), "reference": str(request.recording.path)}
+    report |= report_of_scans({scan: result.report for scan, result in results.items()})
+    result = _concluded(request, report, is_damaged=any(one.verdict.is_damaged for one in results.values()))
+    if folder is not None:
+        names = [name for name in result.metrics if name != "num_scans" and not name.startswith(PREFIX)]
+        rows = [{"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items()]
+        _write_table(folder / "scans.csv", rows)
+        _write_result(folder, result, config={"scans": report["scans"]})
+    return result
+
+
+def of_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
+    """One scan of the recording's data set, with its masks: those in a folder DIR/SCAN.
+
+    Raises InputError where there is none: the masks of one scan fit no other.
+    """
+    masks = None if recording.masks is None else recording.masks / scan
+    if masks is not None and not masks.is_dir():
+        raise InputError(f"{recording.masks}: expected a folder {scan} with this scan's masks, got none")
+    return replace(recording, scan=scan, masks=masks)

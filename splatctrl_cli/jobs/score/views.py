@@ -1,0 +1,268 @@
+"""Renders the views that are scored, from the splats of their time, and scores them one by one; and a scene's surface
+against reference points or a mesh.
+"""
+
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from math import isnan
+from operator import itemgetter
+from pathlib import Path
+
+import numpy as np
+from splatctrl_cli.formats.mesh import load_mesh
+from splatctrl_cli.formats.ply import is_mesh, read_positions
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder
+from splatctrl_cli.jobs.reconstruct.correct_views import corrected, corrected_among
+from splatctrl_cli.jobs.running.progress import Progress, Wait
+from splatctrl_cli.jobs.score.reference import Reference
+
+from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
+from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, spaced, thinned
+from splatctrl_cli.evaluate.protocols import ObservedSpace, cloud_of_scan, read_observed
+from splatctrl_cli.evaluate.score import ViewScore, score_view
+from splatctrl_cli.evaluate.score_report import Doubts
+from splatctrl_cli.evaluate.views import View, seen_by, seen_pixels, surface_points, views_to_score
+from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, Label, RgbdFrame, SplatSet
+from splatctrl_cli.report.pictures import ComparisonRow
+from splatctrl_cli.scene.gaussians import render_gaussians
+from splatctrl_cli.scene.render import Rendering, render
+
+Ranked = tuple[float, ComparisonRow]
+"""PSNR [dB] over what was seen, or over all, and the view."""
+
+
+@dataclass(kw_only=True)
+class Scores:
+    """What scoring gathers: the views, the names of those before the first snapshot, the pictures of each camera's
+    best and worst.
+
+    training: the frames that count as known at the last view; doubts: what speaks against the scores, in words.
+    """
+
+    has_clock: bool
+    views: list[ViewScore] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    extremes: dict[str, tuple[Ranked, Ranked]] = field(default_factory=dict)
+    training: tuple[RgbdFrame, ...] = ()
+    doubts: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scorer:
+    """Scores views of `reference`; every view's row of pictures goes to `draw`, where there is one.
+
+    newest: a view is rendered from the newest snapshot not later than it, else from the final splats.
+    """
+
+    scene: SceneFolder
+    reference: Reference
+    cameras: tuple[str, ...]
+    draw: Callable[[ComparisonRow], None] | None = None
+    newest: bool = True
+    allow_training: bool = False
+    threads: int = 0
+
+    def run(self, progress: Progress, stopwatch: Stopwatch) -> Scores:
+        """Score every view. Raises NotEvaluableError where there is none, or not one pixel of any was seen."""
+        scene, source = self.scene, self.reference.source
+        has_clock = scene.has_clock and source.has_clock
+        stamps = sorted(snapshot.stamp_ns for snapshot in scene.snapshots) if has_clock else []
+
+        @lru_cache(maxsize=1)  # a snapshot is read once for all the views it serves
+        def splats_at(stamp_ns: int | None) -> tuple[SplatSet | GaussianSet, SplatSet | None]:
+            splats = final_splats(scene) if stamp_ns is None else scene.splats_at(stamp_ns)
+            return splats, scene.shell_at(stamp_ns)
+
+        scores = Scores(has_clock=has_clock)
+        views = views_to_score(
+            source,
+            scoring=self.cameras,
+            training=scene.cameras,
+            has_clock=has_clock,
+            numbered_by_stamp=self.reference.numbered_by_stamp,
+            corrected=lambda frame: corrected(frame, scene.corrections),
+        )
+        may_train = self.allow_training or self.reference.scores_training
+        wait = Wait(progress, f"scores {', '.join(self.cameras)}", "views").announce()
+        doubts = Doubts(is_still=not has_clock, may_train=may_train, mask_rule=self.reference.mask_rule)
+        for view in views:
+            if view.frame.stamp_ns in scene.training_stamps_ns and not may_train:
+                raise UsageError(
+                    f"{view.name}: trained the scene, its score says nothing about other views",
+                    remedy="give the --holdout or --protocol that reconstruct was given, or --allow-training",
+                )
+            num_known = bisect_right(stamps, view.frame.stamp_ns)
+            if has_clock and not num_known:
+                scores.skipped.append(view.name)
+                continue
+            with stopwatch.stage("score"):
+                shown = splats_at(stamps[num_known - 1] if has_clock and self.newest else None)
+                self._score_one(scores, doubts, view, *shown)
+            wait.at(len(scores.views))
+        self._check(scores)
+        scores.doubts += [*self.reference.doubts, *doubts.lines()]
+        if not scene.names_its_views:
+            scores.doubts.append(
+                f"{scene.path}: does not say which views trained it, and figures of training views say nothing about"
+                " others; give the --cameras that did not train"
+            )
+        return scores
+
+    def _check(self, scores: Scores) -> None:
+        where, cameras = self.reference.where, ", ".join(self.cameras)
+        if not scores.views:
+            raise NotEvaluableError(
+                f"{where}: no view of {cameras} to score; {len(scores.skipped)} lie before the first snapshot of the"
+                " scene",
+                remedy="give the recording that the scene was reconstructed from, or other --cameras",
+            )
+        has_training = self.scene.names_its_views
+        if has_training and self.reference.has_depth and not any(view.seen.share for view in scores.views):
+            raise NotEvaluableError(
+                f"{where}: no pixel of {cameras} was seen by a training camera ({', '.join(self.scene.cameras)})",
+                remedy="is it the same world and the same scene? give the recording that reconstruct was given",
+            )
+
+    def _score_one(
+        self, scores: Scores, doubts: Doubts, view: View, splats: SplatSet | GaussianSet, shell: SplatSet | None
+    ) -> None:
+        frame = view.frame
+        score, row = self._compared(view, frame, splats, shell)
+        doubts.look(view, row.render, row.mask)
+        if self.scene.corrections:
+            there = corrected_among(frame, view.training, self.scene.corrections)
+            score = replace(score, corrected=self._compared(view, there, splats, shell)[0])
+        scores.views.append(score)
+        scores.training = view.training
+        rank = score.all.psnr if isnan(score.seen.psnr) else score.seen.psnr
+        if self.draw is not None:
+            self.draw(row)
+        best, worst = scores.extremes.get(frame.camera, ((rank, row), (rank, row)))
+        ends = max(best, (rank, row), key=itemgetter(0)), min(worst, (rank, row), key=itemgetter(0))
+        scores.extremes[frame.camera] = ends
+
+    def _compared(
+        self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet, shell: SplatSet | None
+    ) -> tuple[ViewScore, ComparisonRow]:
+        """What a view comes to where `frame` stands for it."""
+        protocol = self.reference.protocol
+        camera = frame.intrinsics, frame.T_world_camera
+        rendering = rendered(splats, *camera, self.threads)
+        depth = rendering.normalised_depth()
+        if isinstance(splats, SplatSet) and shell is not None:  # which has colour and no depth
+            rendering = rendered(splats.joined(shell), *camera, self.threads)
+        rendering = rendering.before(self.scene.background)
+        mask = None if self.reference.mask is None else self.reference.mask(frame)
+        score = score_view(
+            view=view.name,
+            color=rendering.color,
+            depth=depth,
+            frame=frame,
+            seen=seen_pixels(frame, view.training),
+            mask=mask,
+            fill=0.0 if protocol is None else protocol.fill,
+            is_zero_padded=protocol is not None and protocol.is_zero_padded,
+        )
+        return score, ComparisonRow(
+            title=view.name,
+            figures=_figures(score),
+            photo=frame.color,
+            render=rendering.color,
+            photo_depth=frame.depth,
+            render_depth=depth,
+            mask=mask,
+        )
+
+
+def _figures(score: ViewScore) -> str:
+    parts = [] if isnan(score.seen.psnr) else [f"{score.seen.psnr:.1f} seen"]
+    parts += [f"{score.masked.psnr:.1f} masked"] if score.masked is not None else []
+    return "dB: " + ", ".join([*parts, f"{score.all.psnr:.1f} all"])
+
+
+def rendered(
+    splats: SplatSet | GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, threads: int
+) -> Rendering:
+    """What a camera sees of splats of either kind."""
+    if isinstance(splats, GaussianSet):
+        return render_gaussians(splats, intrinsics, T_world_camera, threads=threads)
+    return render(splats, intrinsics, T_world_camera, threads=threads)
+
+
+def final_splats(scene: SceneFolder) -> SplatSet | GaussianSet:
+    """The splats of either kind that a scene ended with."""
+    return scene.gaussians() if scene.is_anisotropic else scene.splats()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudSettings:
+    """path: reference points or a mesh, or a folder of them by scan; unit: metres per unit of the file. Points
+    farther than `max_distance` [m] count in a share, not in a mean; both sides are thinned to `spacing` [m]. masks:
+    DTU's folder of what it observed, of one scan read into `space`.
+    """
+
+    path: Path
+    unit: float = 1.0
+    max_distance: float = CLOUD_DISTANCE
+    spacing: float = CLOUD_SPACING
+    masks: Path | None = None
+    space: ObservedSpace | None = None
+
+    def of_scan(self, scan: str | None) -> "CloudSettings":
+        """The same with the files of one scan, where folders of several were given.
+
+        Raises InputError naming the files looked for.
+        """
+        path = cloud_of_scan(self.path, scan or "") if self.path.is_dir() else self.path
+        return replace(self, path=path, space=None if self.masks is None else read_observed(self.masks, scan or ""))
+
+    def words(self) -> str:
+        """How the figures come about."""
+        within = "" if self.masks is None else f"; within the masks and above the planes of {self.masks}"
+        return (
+            f"{self.path}, 1 unit = {self.unit:g} m; points {1e3 * self.spacing:g} mm apart; means below"
+            f" {1e3 * self.max_distance:g} mm{within}"
+        )
+
+
+def cloud_figures(
+    settings: CloudSettings, scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int
+) -> dict[str, float]:
+    """The figures by flat name. `frames`: the training views that the surface is looked at from."""
+    reference, space, counts = spaced(_reference(settings), settings.spacing), settings.space, None
+    points = _surface(scene, frames, threads, settings.spacing)
+    if space is not None:
+        reference, points = reference[space.above(reference)], points[space.near(points)]
+        counts = space.observed(points)
+    score = cloud_score(
+        points,
+        reference,
+        seen_by(reference, frames),
+        max_distance=settings.max_distance,
+        counts=counts,
+        unit=settings.unit,
+        threads=threads or -1,
+    )
+    return score.figures()
+
+
+def _reference(settings: CloudSettings) -> Float64:
+    if not is_mesh(settings.path):
+        return settings.unit * read_positions(settings.path)
+    mesh = load_mesh(settings.path)
+    return points_on(replace(mesh, vertices=settings.unit * mesh.vertices), settings.spacing)
+
+
+def _surface(scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int, spacing: float) -> Float64:
+    """World points (P, 3) [m] of the final splats' rendered depth at the poses of `frames`, the robot left out,
+    `spacing` [m] apart."""
+    splats = final_splats(scene)
+    splats = splats.select(splats.labels != Label.ROBOT)
+    shown = (rendered(splats, frame.intrinsics, frame.T_world_camera, threads) for frame in frames)
+    seen = (replace(f, depth=image.normalised_depth()) for f, image in zip(frames, shown, strict=True))
+    parts = [thinned(surface_points(frame)[0], spacing / 2) for frame in seen]
+    return spaced(np.concatenate(parts), spacing) if parts else np.empty((0, 3))

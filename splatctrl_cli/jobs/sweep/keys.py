@@ -1,0 +1,255 @@
+"""What a sweep may vary, and the jobs of a recorded run with a value of it."""
+
+import difflib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.jobs.batch.graph import CommandLine
+from splatctrl_cli.jobs.batch.suite import Job
+from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, open_run
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.config.ranges import Within
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB
+from splatctrl_cli.simulate.tabletop import VISITOR
+
+SIMULATE, FIT, BAKE = "simulate", "reconstruct", "sdf-bake"
+MADE_BEFORE = {REPLAY: ("scene", "field"), BAKE: ("scene",)}  # options of a command that name what another wrote
+FITTED = ("scene", "occupancy", "human")  # sections of the configuration that the map is made with
+PLACES = ("obstacle-x", "obstacle-y", "obstacle-radius")  # in the order of simulate --visitor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Key:
+    """What is varied: its unit, and which option of which command takes the value (as a batch's matrix names it).
+
+    lockstep: instead, of a run that makes its map itself. is_monotone: more of it can turn the verdict only once, for
+    which few values between the ends are tried.
+    """
+
+    name: str
+    unit: str
+    options: Mapping[str, str]
+    lockstep: Mapping[str, str] = field(default_factory=dict)
+    is_whole: bool = False
+    is_monotone: bool = False
+
+
+_BOTH = (FIT, REPLAY)
+KEYS = {
+    key.name: key
+    for key in (
+        Key(
+            name="splats",
+            unit="splats",
+            options={FIT: "max-splats"},
+            lockstep={REPLAY: "set.scene.max_splats"},
+            is_whole=True,
+        ),
+        Key(
+            name="cameras-out", unit="cameras", options={FIT: "cameras"}, lockstep={REPLAY: "cameras"}, is_whole=True
+        ),
+        Key(name="depth-noise", unit="m at 1 m", options=dict.fromkeys(_BOTH, "perturb.depth-noise")),
+        Key(name="pose-error", unit="m", options=dict.fromkeys(_BOTH, "perturb.pose-error")),
+        Key(name="pose-turn", unit="degrees", options=dict.fromkeys(_BOTH, "perturb.pose-turn")),
+        Key(name="latency", unit="s", options={REPLAY: "latency"}),
+        Key(name="max-map-age", unit="s", options={REPLAY: "max-map-age"}, is_monotone=True),
+        Key(name="max-unknown", unit="", options={REPLAY: "max-unknown"}, is_monotone=True),
+        Key(name="margin", unit="m", options={REPLAY: "set.control.margin"}, is_monotone=True),
+        Key(name="speed", unit="m/s", options={REPLAY: "set.control.max_linear_speed"}),
+        *(Key(name=name, unit="m", options={SIMULATE: "visitor"}) for name in PLACES),
+    )
+}
+
+
+def key_of(name: str) -> Key:
+    """A key by its name, which may also be that of a setting that is a number, ``SECTION.KEY``.
+
+    Raises UsageError for another name.
+    """
+    if name in KEYS:
+        return KEYS[name]
+    section, _, setting = name.partition(".")
+    table = getattr(Config(), section, None)
+    declared = None if table is None else table.declared.get(setting)
+    if not isinstance(declared, Within):
+        settings = [f"{kind}.{each}" for kind, values in Config().as_dict().items() for each in values]
+        near = difflib.get_close_matches(name, [*KEYS, *settings], n=1)
+        known = f"did you mean {near[0]}?" if near else f"known here: {', '.join(KEYS)}, and settings SECTION.KEY"
+        what = "a setting that is no number" if declared is not None else "unknown key"
+        raise UsageError(f"--over {name}: {what}", remedy=known)
+    at, whole = {REPLAY: f"set.{name}"}, type(getattr(table, setting)) is int
+    is_of_map = section in FITTED
+    options = {FIT: f"set.{name}"} if is_of_map else {BAKE: f"set.{name}", **at} if section == "field" else at
+    return Key(name=name, unit=declared.unit, options=options, lockstep=at if is_of_map else {}, is_whole=whole)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A command that a run rests on, or the run itself: its options by name, and the cameras that trained, if any."""
+
+    command: str
+    options: Mapping[str, Any]
+    cameras: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chain:
+    """The commands of a run from the first that a key varies on, the replay last."""
+
+    stages: tuple[Stage, ...]
+    keys: Mapping[str, Key]
+
+    def jobs(self, values: Mapping[str, float]) -> tuple[Job, ...]:
+        """The jobs of a batch that make the run with values of all keys."""
+        return tuple(self._job(stage, values) for stage in self.stages)
+
+    def _job(self, stage: Stage, values: Mapping[str, float]) -> Job:
+        chosen: dict[str, list[Any]] = {}
+        for name, key in self.keys.items():
+            options = options_for(key, is_lockstep="lockstep" in self.stages[-1].options)
+            option = options.get(stage.command)
+            if option is not None:
+                value = int(values[name]) if key.is_whole else values[name]
+                chosen[option] = [self._given(stage, option, values, value)]
+        return Job(name=stage.command, command=stage.command, options=stage.options, matrix=chosen)
+
+    def _given(self, stage: Stage, option: str, values: Mapping[str, float], value: float) -> Any:
+        if option == "cameras":
+            return list(stage.cameras[: len(stage.cameras) - int(value)])
+        if option == "visitor":
+            before = stage.options.get(option, VISITOR)
+            return [values.get(name, given) for name, given in zip(PLACES, before, strict=True)]
+        return value
+
+
+def options_for(key: Key, *, is_lockstep: bool) -> Mapping[str, str]:
+    """Which option of which command takes the value in such a run."""
+    return key.lockstep if is_lockstep and key.lockstep else key.options
+
+
+def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine) -> Chain:
+    """The commands behind a replay, as far back as the keys reach.
+
+    Raises InputError for what the run read that is not where it was, or not as it was; UsageError for a key that
+    means nothing for it.
+    """
+    stages = [_stage(run, command_line)]
+    is_lockstep = "lockstep" in stages[0].options
+    wanted = {command for key in keys.values() for command in options_for(key, is_lockstep=is_lockstep)}
+    is_driven = stages[0].options.get("mode") == "closed-loop"
+    if "speed" in keys and not is_driven:
+        raise UsageError(
+            "--over speed: the arm moves as it was recorded", remedy="sweep a replay of --mode closed-loop"
+        )
+    simulation = _simulation_of(stages[0]) if SIMULATE in wanted else None
+    while wanted & {FIT, BAKE, SIMULATE} and (option := _made_before(stages[0])) is not None:
+        before = open_run(Path(stages[0].options[option]))
+        if before.command not in (FIT, BAKE):
+            raise UsageError(
+                f"{before.path}: was written by {before.command}, expected {FIT}",
+                remedy="sweep a replay of another scene",
+            )
+        stages[0] = replace(stages[0], options={**stages[0].options, option: f"{{{before.command}}}"})
+        stages.insert(0, _stage(before, command_line))
+    if simulation is not None:
+        stages = _simulated(simulation, stages, command_line)
+    made = {stage.command for stage in stages}
+    for name, key in keys.items():
+        options = options_for(key, is_lockstep=is_lockstep)
+        if not made & options.keys():
+            raise UsageError(
+                f"--over {name}: the run has no {' or '.join(options)} that it could change",
+                remedy="sweep a replay with --scene or --lockstep",
+            )
+        if "cameras" in options.values() and not all(stage.cameras for stage in stages if stage.command in options):
+            raise UsageError(f"--over {name}: the run does not say which cameras trained", remedy="reconstruct again")
+    searched = {name: replace(key, is_monotone=key.is_monotone and not is_driven) for name, key in keys.items()}
+    return Chain(stages=tuple(stages), keys=searched)  # an arm that is driven moves otherwise with another value
+
+
+def _made_before(stage: Stage) -> str | None:
+    return next((option for option in MADE_BEFORE.get(stage.command, ()) if option in stage.options), None)
+
+
+def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
+    """A command with its options, their paths as they lie now. Raises InputError where something moved or changed."""
+    options = command_line.options_of(run.arguments)
+    found: list[Path] = []
+
+    def placed(value: Any) -> Any:
+        if isinstance(value, list):
+            return [placed(each) for each in value]
+        if not isinstance(value, Path):
+            return value
+        place = run.place_of(str(value), ())
+        if place is None:
+            raise InputError(
+                f"{value}: is not there any more, and {run.path} was made from it",
+                remedy="put it back, or make the run again and sweep that",
+            )
+        found.append(place.absolute())
+        return str(place.absolute())
+
+    options = {name: placed(value) for name, value in options.items()}
+    _check_inputs(run, found)
+    of_map = run.path / "scene" / "run.json"
+    metrics = json.loads(of_map.read_text())["metrics"] if "lockstep" in options and of_map.is_file() else run.metrics
+    return Stage(command=run.command, options=options, cameras=tuple(metrics.get("cameras") or ()))
+
+
+def _check_inputs(run: RunFolder, places: Sequence[Path]) -> None:
+    """Raise InputError where a file that the run read is not to be found, or has other contents."""
+    for name, digest in run.run.get("inputs", {}).items():
+        if name.startswith(PERTURB):
+            continue
+        files = [file for place in places for file in _named(place, name.removeprefix(CALIBRATION)) if file.is_file()]
+        if not any(sha256(file) == digest for file in files):
+            what = f"{files[0]}: has changed since {run.path} was made" if files else f"{run.path}: {name} has moved"
+            raise InputError(what, remedy="put it back as it was, or make the run again and sweep that")
+
+
+def _named(place: Path, name: str) -> Iterator[Path]:
+    """Where a file of that name, as a recording's digests have it, may lie: the place itself, in it, beside it."""
+    yield from (place,) if place.name == name else ()
+    yield from (place / name, place.parent / name)
+
+
+def _simulation_of(replayed: Stage) -> RunFolder:
+    """The simulation whose truth a replay was given. Raises UsageError where there is none."""
+    folder = Path(replayed.options.get("truth", "")).parent
+    simulation = open_run(folder) if (folder / "run.json").is_file() else None
+    if simulation is None or simulation.command != SIMULATE:
+        raise UsageError(
+            "--over obstacle-...: only of a simulated recording, by the folder that its --truth is in",
+            remedy="make one with splatctrl simulate, and replay that with --truth DIR/truth.json",
+        )
+    return simulation
+
+
+def _simulated(simulation: RunFolder, stages: Sequence[Stage], command_line: CommandLine) -> list[Stage]:
+    """With the simulation before them. Raises UsageError where they do not read its recording."""
+    folder = simulation.path
+    log, made = folder / "log.mcap", _stage(simulation, command_line)
+    for stage in stages:
+        for option in ("log", "source", "seen-by"):
+            given = stage.options.get(option)
+            if given is not None and sha256(log) not in _digests_behind(Path(given)):
+                raise UsageError(f"{given}: is not the recording of {folder}", remedy=f"replay {log}")
+    kept: dict[str, Any] = dict.fromkeys(("log", "source", "seen-by"), f"{{{SIMULATE}}}/log.mcap")
+    kept["truth"] = f"{{{SIMULATE}}}/truth.json"
+    return [
+        made,
+        *(replace(s, options={**s.options, **{k: kept[k] for k in kept if k in s.options}}) for s in stages),
+    ]
+
+
+def _digests_behind(recording: Path) -> Iterable[str]:
+    """sha256 of a log, or of the logs that a capture was made of."""
+    header = recording / "capture.json"
+    return json.loads(header.read_text())["sources"].values() if header.is_file() else (sha256(recording),)

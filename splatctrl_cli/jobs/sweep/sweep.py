@@ -1,0 +1,366 @@
+"""A sweep from its request to its result: a replay made again with other values until its verdict is another."""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.jobs.batch.batch import check_same_asked, scheduling, write_batch
+from splatctrl_cli.jobs.batch.graph import CommandLine, Node, nodes_of
+from splatctrl_cli.jobs.batch.ledger import Ledger, Run
+from splatctrl_cli.jobs.batch.run import ERROR, SKIPPED, Scheduler
+from splatctrl_cli.jobs.batch.suite import Recording, Suite
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, open_run
+from splatctrl_cli.jobs.sweep.keys import Chain, Key, chain_of, key_of
+from splatctrl_cli.jobs.sweep.search import Flip, find_flip, find_least
+
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.evaluate.verdict import EXIT_CODES, Outcome
+from splatctrl_cli.files.output import check_can_be_written, write_durably, write_json
+
+FORMAT, VERSION = "splatctrl-sweep", 1
+TOLERANCE = 1 / 64  # of a range
+FILE = "sweep.json"
+REFUSED, BY_ITS_VALUES = "refused", (2, 4)  # an outcome, and the exit codes of a command that it stands for
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepRequest:
+    """Make the replay of a folder again, over ranges from A to B by the names of what is varied.
+
+    tolerance: how near the two sides of a flip are to lie, as a share of the range. out: folder in which the sweep
+    goes on; workers: runs at once; dask: the address of a Dask scheduler that makes them instead.
+    """
+
+    replay: Path
+    over: Sequence[str]
+    out: Path = Path("sweep")
+    tolerance: float = TOLERANCE
+    workers: int = 1
+    dask: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tried:
+    """A run of the sweep: the values by key, what it came to, and its folder within the sweep's.
+
+    outcome: of its verdict, or REFUSED where a command did not take the values or what they make of the recording.
+    """
+
+    values: Mapping[str, float]
+    outcome: str
+    label: str
+    sentence: str
+    folder: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeyFlip:
+    """What one key alone does, the others at their start: the runs at both ends and at both sides of the flip."""
+
+    key: Key
+    start: Tried
+    end: Tried
+    last: Tried | None
+    first: Tried | None
+    tried: Sequence[Tried]
+    is_monotone: bool
+    spacing: float
+
+    @property
+    def sentence(self) -> str:
+        """What flips into what, and where."""
+        unit = f" {self.key.unit}" if self.key.unit else ""
+        name, num = self.key.name, len(self.tried)
+        a, b = self.start.values[name], self.end.values[name]
+        if self.last is None or self.first is None:
+            all_labels = " or ".join(dict.fromkeys(each.label.upper() for each in self.tried))
+            return f"{name}: no flip between {a:g} and {b:g}{unit}: {all_labels} at all {num} values tried"
+        last, first = self.last.values[name], self.first.values[name]
+        way, labels = "up" if b > a else "down", (self.last.label.upper(), self.first.label.upper())
+        found = f"{name}: {labels[0]} {way} to {last:.6g}{unit}, {labels[1]} at {first:.6g}"
+        later = [each.label.upper() for each in self.tried if abs(each.values[name] - a) > abs(first - a)]
+        others = [label for label in dict.fromkeys(later) if label != self.first.label.upper()]
+        return found + (f"; beyond it also {', '.join(others)}" if others else "")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeastFlip:
+    """The least change of all keys together found; length: in shares of the ranges, root of summed squares."""
+
+    length: float
+    last: Tried
+    first: Tried
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepResult:
+    """What was found, all of it in ``sweep.json``. before: the verdict that the run itself came to."""
+
+    out: Path
+    before: Mapping[str, Any]
+    flips: Sequence[KeyFlip]
+    least: LeastFlip | None = None
+    num_runs: int = 0
+    num_new: int = 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, the same of every sweep with these settings."""
+        return {
+            "before": {name: self.before[name] for name in ("outcome", "label", "sentence")},
+            "keys": {flip.key.name: _plain(flip) for flip in self.flips},
+            "least": None if self.least is None else asdict(self.least),
+        }
+
+
+def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress = SILENT) -> SweepResult:
+    """Find the flips, going on with what is done already.
+
+    Raises UsageError for ranges that are none and an output of another sweep, InputError for a run that is none or
+    whose inputs are not as they were, NotEvaluableError where there is no verdict to flip.
+    """
+    run, ranges = _judged(request.replay), ranges_of(request.over)
+    keys = {name: key_of(name) for name in ranges}
+    for name, (a, b) in ranges.items():
+        if keys[name].is_whole and not (a.is_integer() and b.is_integer()):
+            raise UsageError(f"--over {name}: expected whole numbers, got {a:g}:{b:g}")
+    chain, out = chain_of(run, keys, command_line), request.out.absolute()
+    asked = {
+        "run": run.path.absolute().name,
+        "arguments": run.arguments,
+        "inputs": dict(run.run.get("inputs", {})),
+        "over": {name: list(ends) for name, ends in ranges.items()},
+        "tolerance": request.tolerance,
+    }
+    check_can_be_written(out)
+    check_same_asked(out, FILE, asked, what="sweep")
+    runs = Runs(run=run, chain=chain, out=out, command_line=command_line)
+    starts = {name: a for name, (a, _) in ranges.items()}
+    runs.nodes_at(starts | {name: b for name, (_, b) in ranges.items()})  # refuses what an option does not take
+    with (
+        Ledger(out) as ledger,
+        scheduling(ledger, command_line.entry, progress, workers=request.workers, dask=request.dask) as scheduler,
+    ):
+        _write(out, asked, None)
+        runs.scheduler = scheduler
+        try:
+            result = _found(request, run, ranges, runs)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("interrupted; run the same again to go on") from None
+        _write(out, asked, result)
+        write_batch(out, runs.suite(starts), [*runs.nodes.values()], ledger.latest(), runs.keys)
+    return result
+
+
+def ranges_of(over: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """The two ends by name of each ``KEY=A:B``. Raises UsageError for what is none."""
+    ranges: dict[str, tuple[float, float]] = {}
+    for text in over:
+        name, _, span = text.partition("=")
+        try:
+            start, end = (float(f"{float(each):.6g}") for each in span.split(":"))
+        except ValueError:
+            start = end = math.nan
+        if not name or not (math.isfinite(start) and math.isfinite(end)):
+            raise UsageError(f"--over {text}: expected KEY=A:B", remedy="write it like --over margin=0.02:0.08")
+        if start == end:
+            raise UsageError(f"--over {text}: both ends are {start:g}", remedy="give two values")
+        if name in ranges:
+            raise UsageError(f"--over {text}: {name} is given twice", remedy="leave one out")
+        ranges[name] = start, end
+    if not ranges:
+        raise UsageError("sweep: expected --over KEY=A:B, got none", remedy="say what is varied")
+    return ranges
+
+
+def _judged(path: Path) -> RunFolder:
+    """A replay that came to a verdict which can flip."""
+    run = open_run(path)
+    if run.command != REPLAY:
+        raise UsageError(f"{path}: a run of {run.command}, expected one of replay", remedy="sweep the replay of it")
+    if run.verdict.get("outcome") == Outcome.NOT_EVALUABLE:
+        raise _not_evaluable(str(path), str(run.verdict["sentence"]))
+    return run
+
+
+def _not_evaluable(what: str, sentence: str) -> NotEvaluableError:
+    return NotEvaluableError(
+        f"{what}: there is no verdict to flip: {sentence}", remedy="give it the evidence that it lacks first"
+    )
+
+
+@dataclass(kw_only=True)
+class Runs:
+    """The runs of a sweep as nodes of a batch, each made once."""
+
+    run: RunFolder
+    chain: Chain
+    out: Path
+    command_line: CommandLine
+    scheduler: Scheduler | None = None
+    nodes: dict[str, Node] = field(default_factory=dict)
+    keys: dict[str, str] = field(default_factory=dict)
+    tried: dict[tuple[float, ...], Tried] = field(default_factory=dict)
+
+    def suite(self, values: Mapping[str, float]) -> Suite:
+        """The run with these values, as a batch has it."""
+        name = f"{self.run.path.absolute().name}-swept"
+        recording = Recording(name=name, paths=(self.run.path,))
+        return Suite(
+            name=name, folder=Path.cwd(), out=self.out, recordings=(recording,), jobs=self.chain.jobs(values)
+        )
+
+    def nodes_at(self, values: Mapping[str, float]) -> list[Node]:
+        """Its nodes, the replay last. Raises UsageError for a value that an option does not take."""
+        return nodes_of(self.suite(values), self.out, self.command_line)
+
+    def at(self, points: Sequence[Mapping[str, float]]) -> list[Tried]:
+        """What the run comes to at points, made side by side. Raises InputError where one could not be made."""
+        new = {tuple(point.values()): point for point in points if tuple(point.values()) not in self.tried}
+        made = {values: self.nodes_at(point) for values, point in new.items()}
+        nodes: dict[str, Node] = {}
+        for node in (node for each in made.values() for node in each):
+            other = nodes.setdefault(node.name, self.nodes.get(node.name, node))
+            if other.words != node.words:
+                raise UsageError(f"two runs are called {node.name}", remedy="vary fewer keys at once")
+        assert self.scheduler is not None
+        found = self.scheduler.run(list(nodes.values())) if nodes else {}
+        self.nodes |= nodes
+        self.keys |= self.scheduler.keys
+        for values, each in made.items():
+            self.tried[values] = self._tried(new[values], [found[node.name] for node in each])
+        return [self.tried[tuple(point.values())] for point in points]
+
+    def _tried(self, values: Mapping[str, float], runs: Sequence[Run]) -> Tried:
+        """What a run came to. Raises InputError where it ended for another reason than its values."""
+        last = runs[-1]
+        outcome = next(
+            (o for o, code in EXIT_CODES.items() if not last.outcome and code and code == last.exit_code), ""
+        )
+        if outcome != Outcome.NOT_EVALUABLE and (last.state in (ERROR, SKIPPED) or not last.outcome):
+            wrong = next(run for run in runs if run.state in (ERROR, SKIPPED) or run is last)
+            if not wrong.cause and wrong.exit_code in BY_ITS_VALUES:
+                said = f"{wrong.job}: {wrong.sentence}"
+                return Tried(values=dict(values), outcome=REFUSED, label=REFUSED, sentence=said, folder="")
+            raise InputError(
+                f"{_told(values)}: {wrong.job} came to no verdict: {wrong.cause or wrong.sentence}",
+                remedy=f"see {self.out / wrong.log}",
+            )
+        return Tried(
+            values=dict(values),
+            outcome=last.outcome or str(outcome),
+            label=last.label if last.outcome else str(outcome),
+            sentence=last.sentence,
+            folder=last.out,
+        )
+
+
+def _found(
+    request: SweepRequest, run: RunFolder, ranges: Mapping[str, tuple[float, float]], runs: Runs
+) -> SweepResult:
+    began, starts = time.time(), {name: a for name, (a, _) in ranges.items()}
+    start = runs.at([starts])[0]
+    if start.outcome == Outcome.NOT_EVALUABLE:
+        raise _not_evaluable(_told(starts), start.sentence)
+    if start.outcome == REFUSED:
+        raise InputError(f"{_told(starts)}: is refused: {start.sentence}", remedy="begin at a value that is not")
+    _check_settings(run, open_run(runs.out / start.folder), runs.chain)
+    flips = [_alone(name, starts, b, runs, request.tolerance) for name, (_, b) in ranges.items()]
+    least = _together(flips, ranges, runs, request.tolerance) if len(flips) > 1 else None
+    return SweepResult(
+        out=request.out,
+        before=run.verdict,
+        flips=flips,
+        least=least,
+        num_runs=len(runs.nodes),
+        num_new=sum(each.started >= began for each in runs.scheduler.runs.values()) if runs.scheduler else 0,
+    )
+
+
+def _check_settings(run: RunFolder, again: RunFolder, chain: Chain) -> None:
+    """Raise InputError where the run made again has settings that are neither those of then nor varied."""
+    options = (
+        option for key in chain.keys.values() for each in (key.options, key.lockstep) for option in each.values()
+    )
+    varied = {option.removeprefix("set.") for option in options}
+    differs = [
+        f"{section}.{name}"
+        for section, values in run.run.get("config", {}).items()
+        for name, value in values.items()
+        if f"{section}.{name}" not in varied and again.run["config"].get(section, {}).get(name) != value
+    ]
+    if differs:
+        raise InputError(
+            f"{run.path}: made again it has other settings: {', '.join(differs[:5])}",
+            remedy="its --config or the program has changed: make the run again and sweep that",
+        )
+
+
+def _told(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name}={value:g}" for name, value in values.items())
+
+
+def _alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, tolerance: float) -> KeyFlip:
+    """The flip of one key, the others at their start."""
+    key = runs.chain.keys[name]
+
+    def at(value: float) -> Tried:
+        return runs.at([{**starts, name: value}])[0]
+
+    found: Flip = find_flip(
+        lambda values: [each.outcome for each in runs.at([{**starts, name: value} for value in values])],
+        starts[name],
+        end,
+        tolerance=tolerance * abs(end - starts[name]),
+        is_whole=key.is_whole,
+        is_monotone=key.is_monotone,
+    )
+    return KeyFlip(
+        key=key,
+        start=at(starts[name]),
+        end=at(end),
+        last=None if found.last is None else at(found.last),
+        first=None if found.first is None else at(found.first),
+        tried=[at(value) for value in found.outcomes],
+        is_monotone=found.is_monotone,
+        spacing=found.spacing,
+    )
+
+
+def _together(
+    flips: Sequence[KeyFlip], ranges: Mapping[str, tuple[float, float]], runs: Runs, tolerance: float
+) -> LeastFlip | None:
+    """The least change of all keys together."""
+
+    def values_at(shares: Sequence[float]) -> dict[str, float]:
+        values = {n: a + (b - a) * s for (n, (a, b)), s in zip(ranges.items(), shares, strict=True)}
+        return {n: float(round(v)) if runs.chain.keys[n].is_whole else float(f"{v:.6g}") for n, v in values.items()}
+
+    def share(flip: KeyFlip) -> float | None:
+        a, b = ranges[flip.key.name]
+        return None if flip.first is None else (flip.first.values[flip.key.name] - a) / (b - a)
+
+    found = find_least(
+        lambda points: [each.outcome for each in runs.at([values_at(point) for point in points])],
+        [share(flip) for flip in flips],
+        tolerance=tolerance,
+    )
+    if found is None:
+        return None
+    last, first = runs.at([values_at(found.last), values_at(found.first)])
+    return LeastFlip(length=float(f"{found.length:.6g}"), last=last, first=first)
+
+
+def _plain(flip: KeyFlip) -> dict[str, Any]:
+    first = {"unit": flip.key.unit, "is_declared_monotone": flip.key.is_monotone, "sentence": flip.sentence}
+    return first | {name: value for name, value in asdict(flip).items() if name != "key"}
+
+
+def _write(out: Path, asked: Mapping[str, Any], result: SweepResult | None) -> None:
+    """sweep.json; without a result while the sweep runs."""
+    found = {} if result is None else result.as_dict()
+    document = {"format": FORMAT, "version": VERSION, "is_done": result is not None, "asked": asked, **found}
+    write_durably(out / FILE, lambda path: write_json(path, document))

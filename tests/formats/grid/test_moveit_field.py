@@ -1,0 +1,107 @@
+"""`read_from_stream` follows MoveIt's PropagationDistanceField::readFromStream and VoxelGrid::resize line by line
+(moveit_core, distance_field; the same in MoveIt 1 and 2). MoveIt itself was not run."""
+
+import io
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from splatctrl_cli.formats.grid import planner_grids
+from splatctrl_cli.formats.grid.planner_grids import read_moveit_head, write_moveit
+from tests.formats.grid.make_grid import HEADER, ball_grid, centers, random_grid, with_unknown
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Bool, DistanceGrid, Float64
+
+
+def read_from_stream(path: Path) -> tuple[Float64, float, Bool]:
+    """Origin, resolution, and (X, Y, Z) which cells are obstacles."""
+    stream = io.BytesIO(path.read_bytes())
+    words: list[bytes] = []
+
+    def word() -> bytes:  # operator>>: skips white space, stops before the next
+        while (byte := stream.read(1)).isspace():
+            pass
+        found = b""
+        while byte and not byte.isspace():
+            found, byte = found + byte, stream.read(1)
+        stream.seek(-1, io.SEEK_CUR)
+        return found
+
+    for name in ("resolution", "size_x", "size_y", "size_z", "origin_x", "origin_y", "origin_z"):
+        assert word() == name.encode() + b":"
+        words.append(word())
+    resolution, *rest = map(float, words)
+    per_metre = 1.0 / resolution
+    x_cells, y_cells, z_cells = (int(size * per_metre) for size in rest[:3])
+    assert stream.read(1) == b"\n"
+    content = io.BytesIO(zlib.decompress(stream.read()))
+    cells = np.zeros((x_cells, y_cells, z_cells), bool)
+    for x in range(x_cells):
+        for y in range(y_cells):
+            for z in range(0, z_cells, 8):
+                byte = content.read(1)[0]
+                for zi in range(min(8, z_cells - z)):
+                    cells[x, y, z + zi] = byte >> zi & 1
+    assert content.read() == b""
+    return np.array(rest[3:]), resolution, cells
+
+
+def touched(grid: DistanceGrid, radius: float) -> Bool:
+    """Cells whose cube, seen as the ball around it, a ball around (0.1, 0, 0) reaches."""
+    distance = np.linalg.norm(centers(grid) - (0.1, 0.0, 0.0), axis=-1) - radius
+    return distance <= np.sqrt(0.75) * grid.voxel + 1e-6
+
+
+@pytest.mark.parametrize("channels", [("sdf", "bound"), ("sdf", "hard"), ("sdf", "hard", "bound")])
+def test_the_cells_that_a_splat_may_reach_into_are_occupied(
+    tmp_path: Path, channels: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(planner_grids, "CHUNK", 4 * 22 * 23 * 2)
+    grid = ball_grid()
+    kept = {name: grid.channels[name] for name in channels}
+    write_moveit(
+        tmp_path / "field.moveit",
+        DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=kept, header=grid.header),
+    )
+    origin, resolution, cells = read_from_stream(tmp_path / "field.moveit")
+    assert (origin.tolist(), resolution) == (grid.origin.tolist(), grid.voxel)
+    np.testing.assert_array_equal(cells, touched(grid, 0.3))
+    assert 0.05 < cells.mean() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("voxel", "shape"), [(0.02, (9, 10, 11)), (0.1, (3, 29, 57)), (0.7, (7, 8, 9)), (1 / 3, (3, 1, 2))]
+)
+def test_no_rounding_loses_a_cell(tmp_path: Path, voxel: float, shape: tuple[int, int, int]) -> None:
+    grid = random_grid(shape=shape)
+    grid = DistanceGrid(origin=np.array([1e-5, -2.3, 0.0]), voxel=voxel, channels=grid.channels, header=dict(HEADER))
+    write_moveit(tmp_path / "field.moveit", grid)
+    origin, _, cells = read_from_stream(tmp_path / "field.moveit")
+    assert origin.tolist() == grid.origin.tolist()
+    np.testing.assert_array_equal(cells, (grid.channels["bound"] <= 0) | (grid.channels["sdf"] <= 0))
+
+
+def test_cells_without_a_distance_are_occupied(tmp_path: Path) -> None:
+    grid = with_unknown(random_grid())
+    grid.channels["bound"] = np.ones_like(grid.channels["bound"])
+    write_moveit(tmp_path / "field.moveit", grid)
+    cells = read_from_stream(tmp_path / "field.moveit")[2]
+    assert cells[np.isnan(grid.channels["sdf"])].all()
+    assert not cells[grid.channels["sdf"] > 0].any()
+
+
+def test_the_head_is_read_by_itself(tmp_path: Path) -> None:
+    write_moveit(tmp_path / "a", random_grid())
+    numbers, start = read_moveit_head(tmp_path / "a")
+    assert numbers["resolution"] == 0.02
+    assert len(zlib.decompress((tmp_path / "a").read_bytes()[start:])) == 5 * 4 * 2
+
+
+def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected the channel bound or hard, got sdf; bake it with one of them"):
+        write_moveit(tmp_path / "field.moveit", random_grid("sdf"))
+    (tmp_path / "x").write_bytes(b"resolution: 0.1\nsize_x: inf\n")
+    with pytest.raises(InputError, match=r"expected 'size_x: NUMBER', got b'size_x: inf"):
+        read_moveit_head(tmp_path / "x")

@@ -1,0 +1,178 @@
+"""What every format of splat files keeps: written, read back within its bound, described, refused where damaged."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from splatctrl_cli.formats.splat import usd
+from splatctrl_cli.formats.splat.gaussian_ply import REFERENCE_PLY, write_gaussian_ply
+from splatctrl_cli.formats.splat.splat_format import SplatFormat, differences
+from splatctrl_cli.formats.splat.splats import (
+    FORMATS,
+    as_gaussians,
+    as_splats,
+    describe_splats,
+    format_of,
+    nearest_splats,
+    read_splats,
+    write_ply,
+)
+from tests.formats.splat.test_gaussian_ply import gaussian_set
+from tests.formats.splat.test_splats import splat_set
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.recording.source import describe
+from splatctrl_cli.records import GaussianSet, SplatSet
+
+
+@pytest.fixture(params=FORMATS.values(), ids=FORMATS)
+def kind(request: pytest.FixtureRequest) -> SplatFormat:
+    """Each format whose library is installed."""
+    found: SplatFormat = request.param
+    try:
+        found.check()
+    except UsageError as error:
+        pytest.skip(str(error))
+    return found
+
+
+def labelled(num: int, degree: int) -> GaussianSet:
+    return replace(gaussian_set(num, degree=degree), labels=(np.arange(num) % 3).astype(np.uint8))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_what_is_written_reads_back_within_the_bound(tmp_path: Path, kind: SplatFormat, degree: int) -> None:
+    gaussians, path = labelled(3000, degree), tmp_path / f"a{kind.suffix}"
+    kind.write(path, gaussians, {"scene": "made up"})
+    back, comments = kind.read(path)
+    held = kind.held(gaussians)
+    assert not differences(held, back).beyond(kind.bound(gaussians))
+    assert np.array_equal(back.labels, held.labels)
+    assert isinstance(read_splats(path)[0], GaussianSet)
+    if not kind.is_rounded:
+        assert held is gaussians
+        assert comments["scene"] == "made up"
+        assert back.harmonics.shape[1] == (degree + 1) ** 2
+        kind.write(tmp_path / "again", back, {"scene": "made up"})
+        assert (tmp_path / "again").read_bytes() == path.read_bytes()
+
+
+def test_the_bound_is_not_loose(tmp_path: Path, kind: SplatFormat) -> None:
+    gaussians, path = gaussian_set(3000), tmp_path / f"a{kind.suffix}"
+    kind.write(path, gaussians, {})
+    measured, bound = asdict(differences(kind.held(gaussians), kind.read(path)[0])), asdict(kind.bound(gaussians))
+    if kind.is_rounded:
+        assert all(measured[name] >= 0.7 * bound[name] for name in bound), measured
+    else:
+        assert max(bound.values()) <= 1e-4
+
+
+def test_the_same_set_gives_the_same_bytes_and_is_described(tmp_path: Path, kind: SplatFormat) -> None:
+    gaussians = gaussian_set(30, degree=0)
+    paths = [tmp_path / f"{name}{kind.suffix}" for name in ("a", "b")]
+    for path in paths:
+        kind.write(path, gaussians, {"k": "v"})
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    assert sorted(tmp_path.iterdir()) == paths
+    for summary in (describe(paths[0]), describe_splats(paths[0], b"")):
+        assert summary.kind == "splats"
+        assert 30 in (summary.facts.get("splats"), summary.facts.get("vertex"))
+    facts = {"format": kind.name, "shape": "anisotropic", "degree_of_harmonics": 0}
+    assert facts.items() <= summary.facts.items()
+    np.testing.assert_allclose(np.array(summary.facts["lower_m"]), gaussians.centers.min(axis=0), atol=1e-3)
+
+
+def test_isotropic_splats_are_read_as_that_from_every_format(tmp_path: Path, kind: SplatFormat) -> None:
+    splats = replace(splat_set(200), colors=np.full((200, 3), 0.25, np.float32))
+    path, gaussians = tmp_path / f"a{kind.suffix}", as_gaussians(splats)
+    kind.write(path, gaussians, {})
+    back, _ = read_splats(path)
+    assert isinstance(back, SplatSet)
+    bound = kind.bound(gaussians)
+    np.testing.assert_allclose(back.radii, splats.radii, rtol=bound.sigma + 1e-6)
+    np.testing.assert_allclose(back.colors, splats.colors, atol=bound.color + 1e-6)
+
+
+def test_what_is_no_gaussian_or_no_whole_file_is_refused_in_one_line(tmp_path: Path, kind: SplatFormat) -> None:
+    gaussians, path = gaussian_set(5), tmp_path / f"a{kind.suffix}"
+    gaussians.centers[3, 1] = np.nan
+    with pytest.raises(InputError, match="splat 3: center: expected finite, got"):
+        kind.write(path, gaussians, {})
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match="cannot be read"):
+        read_splats(path)
+    kind.write(path, gaussian_set(), {})
+    content = path.read_bytes()
+    for length, read in ((len(content) // 2 - 3, read_splats), (20, read_splats), (20, describe)):
+        path.write_bytes(content[:length])
+        with pytest.raises(InputError, match=rf"a\{kind.suffix}: ") as refused:
+            read(path)
+        assert "\n" not in str(refused.value)
+
+
+def test_the_reference_layout_has_62_properties_whatever_the_labels(tmp_path: Path) -> None:
+    REFERENCE_PLY.write(tmp_path / "a.ply", labelled(10, 1), {})
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode()
+    assert header.count("property float") == header.count("property") == 62
+
+
+def test_what_lies_outside_a_formats_range_is_held_at_its_edge(tmp_path: Path) -> None:
+    gaussians = gaussian_set(2)
+    gaussians.scales[0, 1] = 1e-6
+    gaussians.harmonics[1, 0, 2] = 50.0
+    gaussians.harmonics[1, 5, 0] = -3.0
+    for suffix in (".splat", ".spz"):
+        found = FORMATS[suffix]
+        found.write(tmp_path / f"a{suffix}", gaussians, {})
+        held, back = found.held(gaussians), found.read(tmp_path / f"a{suffix}")[0]
+        assert not differences(held, back).beyond(found.bound(gaussians))
+        assert differences(held, gaussians).color > 5
+    assert back.scales[0, 1] == pytest.approx(np.exp(-10), rel=1e-5)
+    assert back.harmonics[1, 5, 0] == -1.0
+
+
+def test_a_difference_beyond_the_bound_is_named() -> None:
+    gaussians, bound = gaussian_set(4), FORMATS[".splat"].bound(gaussian_set(4))
+    turned = replace(gaussians, quats_wxyz=np.roll(gaussians.quats_wxyz, 1, axis=0))
+    assert [line.split()[0] for line in differences(gaussians, turned).beyond(bound)] == ["rotation"]
+    assert not differences(gaussians, replace(gaussians, quats_wxyz=-gaussians.quats_wxyz)).beyond(bound)
+    broken = replace(gaussians, opacities=np.full(4, np.nan, np.float32))
+    assert [line.split()[0] for line in differences(gaussians, broken).beyond(bound)] == ["opacity"]
+
+
+def test_the_nearest_isotropic_set_keeps_volume_mean_colour_and_opacity() -> None:
+    gaussians = replace(
+        gaussian_set(1), scales=np.array([[0.01, 0.02, 0.04]], np.float32), opacities=np.array([0.3], np.float32)
+    )
+    splats = nearest_splats(gaussians)
+    assert splats.radii[0] == pytest.approx(0.02, rel=1e-6)
+    np.testing.assert_allclose(splats.colors, 0.5 + 0.28209479 * gaussians.harmonics[:, 0], rtol=1e-6)
+    assert splats.opacities[0] == np.float32(0.3)
+    with pytest.raises(InputError, match="got 1 of 1 whose scales differ and 1 whose colour depends on the view; "):
+        as_splats(gaussians, "a.ply")
+
+
+def test_a_ply_without_rotation_is_read_where_it_is_round_and_refused_where_not(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", splat_set(3), {})
+    without = (tmp_path / "a.ply").read_bytes().replace(b"float rot_", b"float was_")
+    (tmp_path / "a.ply").write_bytes(without)
+    assert isinstance(read_splats(tmp_path / "a.ply")[0], SplatSet)
+    write_gaussian_ply(tmp_path / "b.ply", gaussian_set(3), {})
+    (tmp_path / "b.ply").write_bytes((tmp_path / "b.ply").read_bytes().replace(b"float rot_", b"float was_"))
+    with pytest.raises(InputError, match="missing properties rot_0 rot_1 rot_2 rot_3"):
+        read_splats(tmp_path / "b.ply")
+
+
+def test_an_unknown_suffix_names_the_known() -> None:
+    with pytest.raises(UsageError, match=r"a\.stl: expected a suffix of \.ply, \.splat, \.spz, .*, got \.stl"):
+        format_of(Path("a.stl"))
+    with pytest.raises(InputError, match=r"a\.txt: expected a suffix of \.ply, .*, got \.txt"):
+        read_splats(Path("a.txt"))
+    assert format_of(Path("a")) is FORMATS[".ply"]
+
+
+def test_without_the_usd_library_the_remedy_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pxr", None)
+    with pytest.raises(UsageError, match=r"usd-core is not installed; pip install 'splatctrl-cli\[usd\]'"):
+        usd.write_usd(tmp_path / "a.usdc", gaussian_set(1), {}, suffix=".usdc")

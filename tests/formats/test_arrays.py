@@ -1,0 +1,97 @@
+"""Arrays that hold gigabytes in a small file are refused by what may be meant, before they are read."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from splatctrl_cli.formats.arrays import DAMAGE, NpzFile, read_arrays, savez
+from splatctrl_cli.formats.grid.npz_grid import MOST_PACKED, read_npz
+from splatctrl_cli.formats.scene.scene_writer import CHECKPOINT, read_checkpoint
+from splatctrl_cli.formats.scene.voxel_file import read_occupancy, read_states
+from tests.formats.make_npz import write_zeros
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.recording.folder.idr import read_idr
+from splatctrl_cli.recording.source import describe
+
+GIB4 = (1 << 14, 1 << 9, 1 << 9)  # of bytes
+
+
+def read_columns(path: Path) -> object:
+    return NpzFile(path).rows("position")
+
+
+def read_scan(path: Path) -> object:
+    path.rename(path.with_name("cameras.npz"))
+    return read_idr(path.parent)
+
+
+def read_state(path: Path) -> object:
+    (path.parent / CHECKPOINT).parent.mkdir()
+    path.rename(path.parent / CHECKPOINT)
+    return read_checkpoint(path.parent)
+
+
+@pytest.mark.parametrize(
+    ("read", "name", "dtype", "said"),
+    [
+        (read_occupancy, "log_odds", "<f4", "17179869184 bytes, expected at most 28"),
+        (read_states, "states", "|u1", "4294967296 bytes, expected at most 40"),
+        (read_columns, "position", "<f8", "34359738368 bytes unpacked, over 100 times the size of the file"),
+        (read_npz, "sdf", "<f4", f"bytes in compressed arrays, expected at most {MOST_PACKED}"),
+        (read_scan, "world_mat_0", "<f8", "34359738368 bytes, expected at most 167771"),
+        (read_state, "alive", "<f4", "17179869184 bytes, expected at most 429"),
+    ],
+)
+def test_gigabytes_of_zeros_in_a_small_file_are_refused_unread(
+    tmp_path: Path, read: Callable[[Path], object], name: str, dtype: str, said: str
+) -> None:
+    path = write_zeros(tmp_path / "x.npz", {name: (GIB4, dtype)}, header="{}", origin=np.zeros(3), voxel=0.1)
+    assert path.stat().st_size < 40_000_000
+    with pytest.raises(InputError, match=said):
+        read(path)
+
+
+@pytest.mark.parametrize("name", ["sdf", "features"])
+def test_a_zip_of_a_later_version_is_no_fault_of_the_program(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "x.npz"
+    savez(path, {name: np.zeros(3)})
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\x01\x02") + 6] = 255
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"x.npz: not a readable .npz: zip file version 25.5"):
+        describe(path)
+
+
+def test_arrays_are_read_as_numpy_reads_them(tmp_path: Path) -> None:
+    arrays = {
+        "a": np.arange(6.0).reshape(2, 3),
+        "by columns": np.asfortranarray(np.arange(6).reshape(2, 3)),
+        "none": np.zeros((0, 4)),
+        "number": np.array(2.5),
+        "text": np.array("héllo"),
+    }
+    np.savez_compressed(tmp_path / "x.npz", **arrays)  # type: ignore[arg-type]
+    found = read_arrays(tmp_path / "x.npz", most=1000)
+    with np.load(tmp_path / "x.npz") as whole:
+        assert list(found) == list(whole.files)
+        for name in whole.files:
+            assert (found[name].dtype, found[name].tolist()) == (whole[name].dtype, whole[name].tolist())
+    assert list(read_arrays(tmp_path / "x.npz", ["number"], most=8)) == ["number"]
+
+
+def test_arrays_that_are_missing_too_large_or_not_whole_raise(tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    savez(path, {"a": np.arange(100.0), "b": np.arange(100.0)})
+    with pytest.raises(ValueError, match=r"b: 800 bytes, expected at most 799"):
+        read_arrays(path, most=1599)
+    assert len(read_arrays(path, most=1600)) == 2
+    with pytest.raises(KeyError):
+        read_arrays(path, ["c"], most=1600)
+    np.savez(path, a=np.array([{}], dtype=object))
+    with pytest.raises(ValueError, match="objects"):
+        read_arrays(path, most=1600)
+    write_zeros(path, {"a": ((1 << 20,), "|u1")})
+    with pytest.raises(DAMAGE, match="Bad CRC-32"):
+        read_arrays(path, most=1 << 20)

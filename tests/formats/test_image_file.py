@@ -1,0 +1,103 @@
+"""Heads of JPEG and PNG files against what OpenCV decodes, files that are not whole or not plain, and float maps."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from splatctrl_cli.formats.image_file import ImageHead, decode_file, image_head, read_pfm
+
+from splatctrl_cli.errors import InputError
+
+RNG = np.random.default_rng(3)
+COLOR = RNG.integers(0, 256, (7, 11, 3), dtype=np.uint8)
+GREY, DEPTH = COLOR[..., 0], RNG.integers(0, 65536, (7, 11), dtype=np.uint16)
+
+
+def encoded(suffix: str, pixels: np.ndarray, *options: int) -> bytes:
+    return bytes(cv2.imencode(suffix, pixels, list(options))[1])
+
+
+def chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+@pytest.mark.parametrize(
+    ("data", "channels", "bits"),
+    [
+        (encoded(".jpg", COLOR), 3, 8),
+        (encoded(".jpg", COLOR, cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 1), 3, 8),
+        (encoded(".jpg", GREY), 1, 8),
+        (encoded(".jpg", COLOR) + bytes(8), 3, 8),
+        (encoded(".png", COLOR), 3, 8),
+        (encoded(".png", GREY), 1, 8),
+        (encoded(".png", DEPTH), 1, 16),
+    ],
+)
+def test_the_head_of_a_plain_file_is_that_of_its_pixels(data: bytes, channels: int, bits: int) -> None:
+    assert image_head(data) == ImageHead(width=11, height=7, channels=channels, bits=bits)
+    pixels = decode_file(data, color=channels == 3)
+    assert pixels is not None and pixels.shape == ((7, 11, 3) if channels == 3 else (7, 11))
+    assert pixels.itemsize * 8 == bits
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_file_cut_anywhere_is_not_whole(suffix: str) -> None:
+    data = encoded(suffix, COLOR)
+    end = 2 if suffix == ".jpg" else 4  # a PNG's last checksum is that of an empty chunk
+    assert all(image_head(data[:length]) is None for length in range(len(data) - end + 1))
+
+
+def test_a_png_with_any_byte_changed_is_not_whole() -> None:
+    data = encoded(".png", DEPTH)
+    for at in range(len(data)):
+        assert image_head(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]) is None, at
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xff\xd8\xff",
+        encoded(".webp", COLOR),
+        encoded(".png", np.dstack([COLOR, GREY])),
+        encoded(".png", COLOR).replace(b"IEND", b"iEND"),
+        encoded(".jpg", COLOR).replace(b"\xff\xc0\x00\x11\x08", b"\xff\xc0\x00\x11\x0c"),
+        encoded(".jpg", COLOR).replace(b"\xff\xc0", b"\xff\xc9"),
+    ],
+    ids=["nothing", "a mark", "WebP", "alpha", "no end", "12 bits", "arithmetic"],
+)
+def test_what_is_not_plain_is_left_to_the_decoder(data: bytes) -> None:
+    assert image_head(data) is None
+
+
+def test_a_png_of_no_or_of_absurd_size_is_left_to_the_decoder() -> None:
+    pixels = chunk(b"IDAT", zlib.compress(bytes(8)))
+    for width, height in ((0, 4), (1 << 20, 1 << 20)):
+        head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+        assert image_head(b"\x89PNG\r\n\x1a\n" + head + pixels + chunk(b"IEND", b"")) is None
+
+
+@pytest.mark.parametrize("is_little", [True, False])
+def test_pfm_of_either_byte_order_starts_at_the_bottom_row(tmp_path: Path, is_little: bool) -> None:
+    rows = np.array([[3, 4], [1, 2]], dtype="<f4" if is_little else ">f4")
+    (tmp_path / "a.pfm").write_bytes(f"Pf\n2 2\n{'-1.0' if is_little else '1'}\n".encode() + rows.tobytes())
+    np.testing.assert_array_equal(read_pfm(tmp_path / "a.pfm"), [[1, 2], [3, 4]])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"P6\n2 2\n255\n", "expected a PFM image"),
+        (b"PF\n2 2\n-1.0\n", "expected one channel"),
+        (b"Pf\n2 2\n-2.5\n" + b"\0" * 16, "of scale 1, got Pf of scale -2.5"),
+        (b"Pf\n2 2\n-1.0\n" + b"\0" * 15, "expected 16 bytes for 2x2, got 15"),
+        (b"Pf\n0 " + b"8" * 55 + b"\n-1.0\n", "expected pixels, got 0x888"),
+    ],
+)
+def test_damaged_pfm_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "a.pfm").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_pfm(tmp_path / "a.pfm")

@@ -1,0 +1,204 @@
+"""What a suite's file may say, and the graph that it makes."""
+
+from pathlib import Path
+
+import pytest
+from splatctrl_cli.jobs.batch.graph import COMMANDS, Node, columns_of, nodes_of, of_shard
+from splatctrl_cli.jobs.batch.suite import Limits, read_suite
+
+from splatctrl_cli.cli.batch import OfThisProgram
+from splatctrl_cli.errors import InputError, UsageError
+
+RECORDINGS = '[[recordings]]\npaths = ["*.mcap"]\n'
+ROBOT = 'urdf = "arm.urdf"\n'
+
+
+def nodes(folder: Path, text: str, shard: tuple[int, int] = (1, 1)) -> list[Node]:
+    """The graph of a suite's text beside two logs."""
+    for name in ("a.mcap", "b.mcap", "arm.urdf"):
+        (folder / name).touch()
+    (folder / "suite.toml").write_text(text)
+    suite = read_suite(folder / "suite.toml", COMMANDS)
+    return of_shard(nodes_of(suite, folder / "out", OfThisProgram(threads=1)), shard)
+
+
+def options(node: Node) -> dict[str, str]:
+    pairs = (word.partition("=") for word in node.words if word.startswith("--"))
+    return {name: value for name, _, value in pairs}
+
+
+def test_each_recording_goes_through_each_job_with_what_the_jobs_before_made(tmp_path: Path) -> None:
+    jobs = f"[jobs.ingest]\n[jobs.scene]\ncommand = 'reconstruct'\n{ROBOT}[jobs.check]\n"
+    jobs += f"[jobs.audit]\ncommand = 'replay'\n{ROBOT}"
+    found = {node.name: node for node in nodes(tmp_path, RECORDINGS + jobs)}
+    assert set(found) == {f"{name}/{job}" for name in "ab" for job in ("ingest", "scene", "check", "audit")}
+    audit, out = found["a/audit"], tmp_path / "out/a"
+    assert set(audit.needs) == {"a/ingest", "a/scene"}
+    assert options(audit)["--scene"] == str(out / "scene") and audit.words[-1] == str(out / "ingest.capture")
+    assert audit.inputs == (tmp_path / "arm.urdf",)
+    assert found["b/check"].words[-1] == str(tmp_path / "b.mcap") and found["b/check"].out is None
+    names = list(found)
+    assert all(names.index(need) < names.index(name) for name, node in found.items() for need in node.needs)
+
+
+def test_a_matrix_makes_variants_that_go_on_in_what_needs_them(tmp_path: Path) -> None:
+    jobs = (
+        "[jobs.reconstruct]\nmatrix = { max-splats = [100, 200], 'set.scene.window' = [2, 4] }\n"
+        f"[jobs.sdf-bake]\n[jobs.replay]\n{ROBOT}scene = '{{reconstruct}}'\nlog = '{{recording}}'\n"
+        "matrix = { field = ['{sdf-bake}'] }\n"
+    )
+    found = nodes(tmp_path, RECORDINGS + jobs.replace("scene = '{reconstruct}'\n", ""), shard=(1, 2))
+    of = {job: [node for node in found if node.job == job] for job in ("reconstruct", "sdf-bake", "replay")}
+    assert [len(each) for each in of.values()] == [4, 4, 4]
+    assert {(options(n)["--max-splats"], options(n)["--set"]) for n in of["reconstruct"]} == {
+        (splats, f"scene.window={window}") for splats in ("100", "200") for window in (2, 4)
+    }
+    bake = next(
+        n
+        for n in of["sdf-bake"]
+        if dict(n.variant) == {"reconstruct.max-splats": 100, "reconstruct.set.scene.window": 4}
+    )
+    assert bake.name == "a/sdf-bake+max-splats=100+scene.window=4"
+    assert options(of["replay"][0])["--field"].endswith(of["replay"][0].needs[0])
+    assert "--scene" not in options(of["replay"][0])
+
+
+def test_a_replay_in_lockstep_needs_no_scene_and_errors_of_its_frames_vary(tmp_path: Path) -> None:
+    jobs = f"[jobs.simulate]\n[jobs.replay]\nlog = '{{simulate}}/log.mcap'\nlockstep = true\n{ROBOT}"
+    errors = "perturb = { pose-error = 0.01 }\nmatrix = { 'perturb.depth-noise' = [0.0, 0.004] }\n"
+    found = nodes(tmp_path, RECORDINGS + jobs + errors, shard=(1, 2))
+    assert [node.name for node in found] == [
+        "a/simulate",
+        *(f"a/replay+perturb.depth-noise={v}" for v in (0.0, 0.004)),
+    ]
+    assert found[2].needs == ("a/simulate",) and found[2].words[-1] == f"{found[0].out}/log.mcap"
+    assert {"--perturb=pose-error=0.01", "--perturb=depth-noise=0.004"} <= set(found[2].words)
+
+
+def test_nodes_and_columns_come_in_the_order_of_the_suite(tmp_path: Path) -> None:
+    jobs = f"[jobs.audit]\ncommand = 'replay'\n{ROBOT}[jobs.scene]\ncommand = 'reconstruct'\n"
+    found = nodes(tmp_path, RECORDINGS + jobs + "[jobs.ingest]\n[jobs.check]\n")
+    assert [node.name for node in found[:4]] == ["a/ingest", "a/scene", "a/audit", "a/check"]
+    few = "[[recordings]]\npaths = ['a.mcap']\nonly = ['check']\n[[recordings]]\npaths = ['b.mcap']\n"
+    found = nodes(tmp_path, few + "[jobs.ingest]\n[jobs.check]\nmatrix = { quick = [10, 9] }\n")
+    columns = columns_of(((node.job, node.name.split("/")[1]) for node in found), ["ingest", "check"])
+    assert columns == ["ingest", "check+quick=10", "check+quick=9"]
+
+
+def test_the_names_of_variants_say_only_what_differs(tmp_path: Path) -> None:
+    (tmp_path / "arms/b").mkdir(parents=True)
+    (tmp_path / "arms/a").mkdir()
+    for place in ("a/panda.urdf", "b/panda.urdf", "a/wrist.yaml", "b/coarse.yaml"):
+        (tmp_path / "arms" / place).touch()
+    jobs = """
+[jobs.scene]
+command = "reconstruct"
+matrix = { cameras = [["cam0"], ["cam0", "cam1"]], "set.scene.max_splats" = [100] }
+[jobs.audit]
+command = "replay"
+matrix = { urdf = ["arms/a/panda.urdf", "arms/b/panda.urdf"], spheres = ["arms/a/wrist.yaml", "arms/b/coarse.yaml"] }
+"""
+    found = [n.name for n in nodes(tmp_path, "[[recordings]]\npaths = ['a.mcap']\n" + jobs) if n.job == "audit"]
+    assert found[0] == "a/audit+cameras=cam0+scene.max_splats=100+urdf=a+spheres=a_wrist.yaml"
+    assert found[-1] == "a/audit+cameras=cam0_cam1+scene.max_splats=100+urdf=b+spheres=b_coarse.yaml"
+    seeds = "matrix = { seed = [1, 2] }\n"
+    both = f"[jobs.scene]\ncommand = 'reconstruct'\n{seeds}[jobs.sdf-bake]\n{seeds}"
+    found = [n.name for n in nodes(tmp_path, RECORDINGS + both)]
+    assert "a/scene+seed=1" in found and "a/sdf-bake+scene.seed=1+sdf-bake.seed=2" in found
+
+
+def test_a_recording_may_have_a_job_otherwise_or_not_at_all(tmp_path: Path) -> None:
+    own = (
+        "[[recordings]]\npaths = ['a.mcap']\n[recordings.jobs.check]\nfail-on = 'warning'\nexpect = 'exit 1'\n"
+        "[[recordings]]\nname = 'both'\nsession = ['*.mcap']\nonly = ['check']\n"
+    )
+    found = {
+        n.name: n for n in nodes(tmp_path, own + "[jobs.check]\ntimeout = '2 min'\nmemory = '1 GiB'\n[jobs.ingest]\n")
+    }
+    assert set(found) == {"a/check", "a/ingest", "both/check"}
+    assert (options(found["a/check"])["--fail-on"], found["a/check"].expect) == ("warning", "exit 1")
+    assert found["both/check"].words[-2:] == (str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap"))
+    assert found["both/check"].expect == "passed"
+    assert found["a/check"].limits == Limits(timeout=120.0, memory=2**30)
+
+
+def test_recordings_of_one_file_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    for place in (
+        "a/2025/log.mcap",
+        "b/2025/log.mcap",
+        "b/2025/arm.bag",
+        "c/arm.mcap",
+        "c/wrist.mcap",
+        "c/wrist.bag",
+    ):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).touch()
+    text = "[[recordings]]\npaths = ['**/*.mcap', '**/*.bag']\n[[recordings]]\nname = 'arm'\npaths = ['a.mcap']\n"
+    found = [node.recording for node in nodes(tmp_path, text + "[jobs.check]\n".replace("'a.mcap'", "'c/arm.mcap'"))]
+    assert found == ["2025-arm", "a", "a-2025-log", "arm", "b", "b-2025-log", "c-arm", "wrist.bag", "wrist.mcap"]
+
+
+def test_shards_hold_every_recording_once(tmp_path: Path) -> None:
+    found = [[node.name for node in nodes(tmp_path, RECORDINGS + "[jobs.check]\n", (k, 3))] for k in (1, 2, 3)]
+    assert found == [["a/check"], ["b/check"], []]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[jobs.check\n", "is not TOML"),
+        (RECORDINGS, "expected [[recordings]] and [jobs.NAME], got none of the second"),
+        ("[jobs.check]\n", "got none of the first"),
+        (RECORDINGS + "[job.check]\n", "unknown key 'job'; did you mean jobs?"),
+        (RECORDINGS + "[jobs.chek]\n", "no job is called 'chek'; did you mean check?"),
+        (
+            RECORDINGS + "[jobs.check]\nfail_on = 'error'\n",
+            "[jobs.check] of a: check has no option 'fail_on'; did you mean fail-on?",
+        ),
+        (RECORDINGS + "[jobs.check]\nfail-on = 'all'\n", "invalid choice: 'all'"),
+        (RECORDINGS + "[jobs.check]\nquick = true\n", "expected a number of images"),
+        (RECORDINGS + "[jobs.check]\nout = 'x'\n", "a batch gives out itself; leave it out"),
+        (RECORDINGS + "[jobs.ingest]\nset = { scene.window = 2 }\n", "has no option 'set'"),
+        (RECORDINGS + "[jobs.map]\ncommand = 'reconstruct'\nset = { scene.windw = 2 }\n", "[jobs.map] of a: --set"),
+        (
+            RECORDINGS + "[jobs.check]\ntimeout = '2 weeks'\n",
+            "timeout: expected a number, 0 or more or with one of s,",
+        ),
+        (RECORDINGS + "[jobs.check]\nexpect = 'saf'\n", "expect: no verdict is called 'saf'; did you mean safe?"),
+        (RECORDINGS + "[jobs.check]\nmemory = -1\n", "memory: expected a number, 0 or more"),
+        (RECORDINGS + "[jobs.check]\nmatrix = { fail-on = 'error' }\n", "matrix: expected OPTION = [VALUE, ...]"),
+        (RECORDINGS + "[jobs.check]\nurdf = '{arm}'\n", "{arm} is no job; known here: recording, name, check"),
+        (RECORDINGS + "[jobs.replay]\nurdf = 'arm.urdf'\n", "expected a job of reconstruct before it; or give scene"),
+        (
+            RECORDINGS + "[jobs.one]\ncommand='reconstruct'\n[jobs.two]\ncommand='reconstruct'\n[jobs.export]\n",
+            "2 jobs of reconstruct come before it; say '{one}' or '{two}'",
+        ),
+        (
+            RECORDINGS + "[jobs.x]\ncommand='check'\nurdf='{y}'\n[jobs.y]\ncommand='check'\nurdf='{x}'\n",
+            "needs x; break the circle",
+        ),
+        ("[[recordings]]\npaths = ['none*.mcap']\n[jobs.check]\n", "nothing matches 'none*.mcap'"),
+        ("[[recordings]]\npaths = []\n[jobs.check]\n", "paths: expected a list, got []"),
+        ("[[recordings]]\nname = 'x'\n[jobs.check]\n", "expected paths or session, and not both"),
+        ("[[recordings]]\nname = 'x'\npaths = ['*.mcap']\n[jobs.check]\n", "name = 'x': 2 recordings match"),
+        ("[[recordings]]\nname = '../x'\npaths = ['a.mcap']\n[jobs.check]\n", "'../x' is no name of a folder"),
+        (RECORDINGS * 2 + "[jobs.check]\n", "two recordings are called 'a'"),
+        (RECORDINGS + "jobs.chek.quick = 3\n[jobs.check]\n", "[recordings.jobs.chek]: no job has this name; did you"),
+        (
+            RECORDINGS + "only = ['info']\njobs.check.quick = 3\n[jobs.check]\n[jobs.info]\n",
+            "[recordings.jobs.check]: no job has this name",
+        ),
+        (RECORDINGS + "only = ['chek']\n[jobs.check]\n", "only: no job is called 'chek'; did you mean check?"),
+        (RECORDINGS + "only = []\n[jobs.check]\n", "only: expected a list, got []"),
+        ("recordings = ['*.mcap']\n[jobs.check]\n", "[[recordings]]: expected a table, got '*.mcap'; give it paths"),
+        (
+            RECORDINGS + "[jobs.check]\nmatrix = { fail-on = ['error', 'error'] }\n",
+            "two outputs are called a/check+fail-on=error",
+        ),
+    ],
+)
+def test_what_makes_no_graph_is_refused_in_a_line(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises((UsageError, InputError)) as refused:
+        nodes(tmp_path, text)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)

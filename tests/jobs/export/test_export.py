@@ -1,0 +1,207 @@
+"""An export as a function, and what the command prints of it."""
+
+import json
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from splatctrl_cli.formats.splat.gaussian_ply import write_gaussian_ply
+from splatctrl_cli.formats.splat.splats import FORMATS, as_gaussians, read_ply, write_ply
+from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult
+from splatctrl_cli.jobs.export.export import export as job
+from tests.jobs.export.export_scene import ball, written
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.errors import InputError, UsageError, WriteError
+from splatctrl_cli.records import Float64, Intrinsics, Label, SplatSet
+from splatctrl_cli.scene.render import Rendering
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    return written(tmp_path / "scene", ball())
+
+
+def export(scene: Path, name: str, **options: Any) -> ExportResult:
+    return job.export(ExportRequest(scene=scene, out=scene.parent / name, **options))
+
+
+def test_scene_is_exported_and_renders_the_same(scene: Path) -> None:
+    result = export(scene, "out.ply")
+    assert result.largest_pixel_difference <= 3 / 255
+    assert result.covered_share > 0.1
+    assert result.num_splats == 400
+    splats, comments = read_ply(scene.parent / "out.ply")
+    assert len(splats) == 400
+    assert comments["scene"] == "ball"
+    assert comments["exported_from"].startswith("splats.ply sha256 ")
+
+
+@pytest.mark.parametrize(("place", "given"), [("elsewhere", "../scene"), ("scene", "."), ("scene/below", "..")])
+def test_without_out_the_file_lies_beside_the_scene(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, place: str, given: str
+) -> None:
+    (scene.parent / place).mkdir(parents=True, exist_ok=True)
+    monkeypatch.chdir(scene.parent / place)
+    job.export(ExportRequest(scene=Path(given)))
+    assert len(read_ply(scene.parent / "scene.ply")[0]) == 400
+
+
+@pytest.mark.parametrize("value", [-1e37, -1e6, 2e4, 1e37])
+@pytest.mark.parametrize("is_round", [True, False])
+def test_a_colour_that_no_picture_has_is_the_fault_of_the_input(scene: Path, value: float, is_round: bool) -> None:
+    file, splats = scene / "splats.ply", ball(20)
+    splats.colors[3, 1] = value
+    if is_round:
+        write_ply(file, splats, {})
+    else:
+        gaussians = as_gaussians(ball(20))
+        gaussians.scales[:, 0] *= 2
+        gaussians.harmonics[3, 0, 1] = value
+        write_gaussian_ply(file, gaussians, {})
+    with pytest.raises(InputError, match="splat 3: colour: expected at most 10000"):
+        export(scene, "out.ply", isotropic=True)
+    assert not (scene.parent / "out.ply").exists()
+
+
+def test_the_same_scene_gives_the_same_bytes(scene: Path) -> None:
+    for name in ("a.ply", "b.ply"):
+        export(scene, name)
+    assert (scene.parent / "a.ply").read_bytes() == (scene.parent / "b.ply").read_bytes()
+
+
+def test_a_file_that_renders_differently_is_not_left_behind(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def write_darker(path: Path, splats: SplatSet, comments: dict[str, str]) -> None:
+        write_ply(path, replace(splats, colors=splats.colors * np.float32(0.999)), comments)
+
+    monkeypatch.setattr(job, "write_ply", write_darker)
+    with pytest.raises(WriteError, match=r"out.ply: differs from its source: color 0.000"):
+        export(scene, "out.ply")
+    assert not list(scene.parent.glob("out.ply*"))
+
+
+def test_an_exact_format_whose_rendering_differs_is_not_left_behind(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    render, calls = job._render, []
+
+    def darker_every_second_time(splats: SplatSet, intrinsics: Intrinsics, T_world_camera: Float64) -> Rendering:
+        calls.append(1)
+        seen = render(splats, intrinsics, T_world_camera)
+        return seen if len(calls) % 2 else replace(seen, color=seen.color * np.float32(0.9995))
+
+    monkeypatch.setattr(job, "_render", darker_every_second_time)
+    with pytest.raises(WriteError, match="does not render as its source: PSNR "):
+        export(scene, "out.glb")
+    assert not list(scene.parent.glob("out.*"))
+
+
+SUFFIXES = [
+    pytest.param(
+        suffix,
+        marks=pytest.mark.skipif(
+            suffix.startswith(".usd") and find_spec("pxr") is None, reason="usd-core is not installed: no USD written"
+        ),
+    )
+    for suffix in FORMATS
+]
+ROUNDED = {".splat", ".spz"}
+
+
+@pytest.fixture
+def gaussians(tmp_path: Path) -> Path:
+    """A scene folder of anisotropic Gaussians: a ball of discs that look different from every side."""
+    folder, splats, rng = tmp_path / "discs", ball(), np.random.default_rng(1)
+    folder.mkdir()
+    flat = as_gaussians(replace(splats, labels=np.zeros(len(splats), np.uint8)))
+    harmonics = np.concatenate([flat.harmonics, rng.uniform(-0.1, 0.1, (len(splats), 8, 3))], axis=1)
+    quats = rng.normal(size=(len(splats), 4))
+    discs = replace(
+        flat,
+        scales=flat.scales * np.array([1.5, 1.0, 0.3], np.float32),
+        quats_wxyz=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        harmonics=harmonics.astype(np.float32),
+    )
+    write_gaussian_ply(folder / "splats.ply", discs, {"method": "3dgs"})
+    return folder
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".glb"])
+def test_isotropic_splats_go_to_another_format_and_from_there_back_to_ply(scene: Path, suffix: str) -> None:
+    there = export(scene, f"there{suffix}")
+    assert there.num_outside == 0
+    assert not there.differences.beyond(there.allowed)
+    assert there.psnr is None or there.psnr > (35 if suffix in ROUNDED else 100)
+    assert there.not_kept == (("labels",) if suffix in ROUNDED else ())
+    export(scene.parent / f"there{suffix}", "back.ply")
+    back = read_ply(scene.parent / "back.ply")[0]
+    np.testing.assert_allclose(back.centers, ball().centers, atol=1.3e-4 if suffix == ".spz" else 0)
+    np.testing.assert_allclose(back.radii, ball().radii, rtol=0.033 if suffix == ".spz" else 1e-5)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_anisotropic_gaussians_go_to_every_format(gaussians: Path, suffix: str) -> None:
+    result = export(gaussians, f"out{suffix}")
+    assert result.covered_share > 0.1
+    assert result.not_kept == (("view-dependent colour",) if suffix == ".splat" else ())
+    if suffix in ROUNDED:
+        assert result.psnr is not None and 25 < result.psnr < 60
+    else:
+        assert result.psnr is None or result.psnr > 100
+        assert result.largest_pixel_difference <= 3 / 255
+
+
+def test_the_full_layout_has_the_62_properties_and_says_what_it_leaves_out(scene: Path) -> None:
+    out = scene.parent / "out.ply"
+    write_ply(scene / "splats.ply", replace(ball(), density=np.ones(400, np.float32)), {})
+    assert export(scene, "out.ply", layout="full").not_kept == ("labels", "density")
+    header = out.read_bytes().split(b"end_header")[0].decode()
+    assert header.count("property float") == header.count("property ") == 62
+    assert "comment exported_from: splats.ply sha256 " in header
+    assert "comment splat: anisotropic" in header, "the comments on the source's layout are left out"
+
+
+def test_anisotropic_gaussians_are_made_isotropic_on_request_alone(gaussians: Path) -> None:
+    out = gaussians.parent / "out.ply"
+    with pytest.raises(UsageError, match="expected isotropic splats"):
+        export(gaussians, "out.ply", layout="short")
+    export(gaussians, "out.ply")
+    with pytest.raises(InputError, match=r"got 400 of 400 whose scales differ; .*--isotropic"):
+        read_ply(out)
+    result = export(gaussians, "out.ply", isotropic=True, force=True)
+    assert result.was_rounded and result.isotropic_psnr is not None and 15 < result.isotropic_psnr < 60
+    np.testing.assert_allclose(read_ply(out)[0].radii, 0.02 * 0.45 ** (1 / 3), rtol=1e-5)
+
+
+def run_export(*arguments: object) -> int:
+    return main(["export", *map(str, arguments)])
+
+
+def test_json_has_what_was_written_and_how_it_looks(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = scene.parent / "out.ply"
+    assert run_export(scene, "-o", out, "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["file"] == str(out)
+    assert result["bytes"] == out.stat().st_size
+    assert result["num_views_compared"] == 4
+    assert result["largest_pixel_difference"] <= 3 / 255
+
+
+def test_labels_choose_splats(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = scene.parent / "out.ply"
+    assert run_export(scene / "splats.ply", "--labels", "object,human", "-o", out) == 0
+    assert set(read_ply(out)[0].labels) == {Label.OBJECT, Label.HUMAN}
+    assert "267 splats, 133 left out by label" in capsys.readouterr().out
+
+
+def test_what_a_format_has_no_room_for_is_said(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bright = ball()
+    bright.colors[:7] = 1.8
+    write_ply(scene / "splats.ply", bright, {})
+    assert run_export(scene, "-o", scene.parent / "out.splat") == 0
+    said = capsys.readouterr().out
+    assert "not kept: labels" in said
+    assert "7 splats have a size or colour beyond the format's range: put at its edge" in said

@@ -1,0 +1,145 @@
+"""``--refine-poses`` and ``--refine-exposure`` from the recording to the score."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder, ViewCorrection
+from splatctrl_cli.jobs.reconstruct.correct_views import Corrections, corrected, corrected_among
+from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
+from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
+from splatctrl_cli.jobs.score import reference as score_reference
+from splatctrl_cli.jobs.score.score import ScoreRequest, score
+from tests.jobs.score.wall import FakeSource
+
+from splatctrl_cli.calibration.gray_views import exposed
+from splatctrl_cli.calibration.pose_refinement import unbent
+from splatctrl_cli.config import load_config
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.records import RgbdFrame
+from tests.calibration.scan import a_bend, bent, disturbed, gains_of, robot_in, views_of
+
+SMALL = [
+    "scene.max_splats=1500",
+    "scene.first_iterations=60",
+    "scene.refine_iterations=200",
+]
+HELD_OUT = 3
+POSES, EXPOSURE = Corrections(poses=True), Corrections(exposure=True)
+
+
+@pytest.fixture(scope="module")
+def views(sample_data: Path) -> list[RgbdFrame]:
+    return views_of(sample_data)
+
+
+def held_out(views: list[RgbdFrame]) -> list[RgbdFrame]:
+    return [replace(view, camera="holdout") if k == HELD_OUT else view for k, view in enumerate(views)]
+
+
+def request(
+    views: list[RgbdFrame], out: Path, *, corrections: Corrections = POSES, has_clock: bool = False
+) -> ReconstructRequest:
+    return ReconstructRequest(
+        source=FakeSource(frames=[view for view in views if view.camera != "holdout"], has_clock=has_clock),
+        out=out,
+        config=load_config(None, SMALL),
+        corrections=corrections,
+        allow_disagreement=True,
+    )
+
+
+def test_a_view_held_out_is_scored_where_it_was_recorded_and_where_it_belongs(
+    views: list[RgbdFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    off = held_out(disturbed(views, 15.0, 1.0))
+    result = reconstruct(request(off, tmp_path / "scene"))
+    assert result.metrics["pose_residual"] < 0.1 * result.metrics["poses"]["residual_before"]
+    assert len(SceneFolder(tmp_path / "scene").corrections) == len(views) - 1
+    monkeypatch.setattr(score_reference, "open_source", lambda *_, **__: FakeSource(frames=off, has_clock=False))
+    scored = score(ScoreRequest(scene=tmp_path / "scene", recording=RecordingRequest(path=tmp_path)))
+    assert scored.metrics["psnr_all_corrected"] > scored.metrics["psnr_all"] + 2.0  # type: ignore[operator]
+    assert scored.metrics["depth_median_all_corrected"] < 0.5 * scored.metrics["depth_median_all"]  # type: ignore[operator]
+
+
+def test_a_bent_depth_is_freed_in_the_map_and_in_the_corrected_figures_alone(
+    views: list[RgbdFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    off = held_out(bent(views, a_bend(0.05)))
+    result = reconstruct(request(off, tmp_path / "scene"))
+    bend = result.metrics["depth_bends"]["camera"]
+    assert result.metrics["depth_bend"] == bend["largest"] > 0.02
+    assert bend["residual_after"] < 0.1 * bend["residual_before"]
+    assert any("freed of a bend of at most" in reason.sentence for reason in result.verdict.reasons)
+    scene = SceneFolder(tmp_path / "scene")
+    assert scene.made_from["depth_bend"] == bend["largest"]
+    for frame in off:
+        if frame.camera != "holdout":
+            free = corrected(frame, scene.corrections)
+            assert np.array_equal(free.depth, unbent(frame, np.array(bend["offsets"])).depth)
+    monkeypatch.setattr(score_reference, "open_source", lambda *_, **__: FakeSource(frames=off, has_clock=False))
+    scored = score(ScoreRequest(scene=tmp_path / "scene", recording=RecordingRequest(path=tmp_path)))
+    assert scored.metrics["depth_median_all_corrected"] < 0.5 * scored.metrics["depth_median_all"]  # type: ignore[operator]
+
+
+def test_where_a_robot_is_judged_depth_stays_as_it_was_recorded(
+    views: list[RgbdFrame], tmp_path: Path, plain_arm: Path
+) -> None:
+    asked = request(bent(views, a_bend(0.05)), tmp_path / "scene")
+    result = reconstruct(replace(asked, **robot_in(plain_arm)))
+    assert result.metrics["pose_residual"] > 0
+    assert result.metrics["depth_bend"] is None
+    assert "depth_bends" not in result.metrics
+
+
+def test_of_a_camera_that_did_not_train_no_bend_is_known(views: list[RgbdFrame]) -> None:
+    other = replace(views[0], camera="other")
+    bend = ViewCorrection(T_world_camera=None, gain=None, bend=a_bend(0.05))
+    known = {(view.camera, view.stamp_ns): bend for view in views[1:]}
+    assert np.array_equal(corrected_among(other, views[1:], known).depth, other.depth)
+    held = replace(other, camera="holdout")
+    assert np.array_equal(corrected_among(held, views[1:], known).depth, unbent(held, a_bend(0.05)).depth)
+    rig = [replace(view, camera=f"cam{k % 2}") for k, view in enumerate(views[1:])]
+    of_rig = {(view.camera, view.stamp_ns): bend for view in rig}
+    assert np.array_equal(corrected_among(held, rig, of_rig).depth, held.depth)
+
+
+def test_right_views_give_the_same_splats_with_and_without(views: list[RgbdFrame], tmp_path: Path) -> None:
+    right = held_out(views)
+    both, none = Corrections(poses=True, exposure=True), Corrections()
+    with_, without = (reconstruct(request(right, tmp_path / str(bool(c)), corrections=c)) for c in (both, none))
+    assert (with_.out / "splats.ply").read_bytes() == (without.out / "splats.ply").read_bytes()
+    assert without.metrics["pose_residual"] is None
+    assert without.metrics["exposure_spread"] is None
+
+
+def test_a_view_held_out_is_scored_at_its_own_exposure_and_at_that_of_the_others(
+    views: list[RgbdFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gains = gains_of(len(views))
+    gains[HELD_OUT] = [1.3, 1.2, 1.1]
+    off = held_out([exposed(view, 1 / gain) for view, gain in zip(views, gains, strict=True)])
+    result = reconstruct(request(off, tmp_path / "scene", corrections=EXPOSURE))
+    assert result.metrics["exposure_spread"] > 0.1
+    monkeypatch.setattr(score_reference, "open_source", lambda *_, **__: FakeSource(frames=off, has_clock=False))
+    scored = score(ScoreRequest(scene=tmp_path / "scene", recording=RecordingRequest(path=tmp_path)))
+    assert scored.metrics["psnr_all_corrected"] > scored.metrics["psnr_all"] + 1.0  # type: ignore[operator]
+
+
+def test_a_view_that_cannot_be_put_right_is_named(views: list[RgbdFrame], tmp_path: Path) -> None:
+    off = disturbed(views, 15.0, 1.0)
+    away = off[2].T_world_camera.copy()
+    away[:3, 3] += [30.0, 0.0, 0.0]
+    off[2] = replace(off[2], T_world_camera=away)
+    notes = [reason.sentence for reason in reconstruct(request(off, tmp_path / "scene")).verdict.reasons]
+    assert any("not put right" in note and f"at {off[2].stamp_ns}" in note for note in notes)
+
+
+def test_what_nothing_tells_is_refused(views: list[RgbdFrame], tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="recorded over time"):
+        reconstruct(request(views, tmp_path / "scene", has_clock=True))
+    bare = [replace(view, depth=np.zeros_like(view.depth)) for view in views]
+    with pytest.raises(InputError, match="depth"):
+        reconstruct(request(bare, tmp_path / "scene"))

@@ -1,0 +1,229 @@
+"""Criteria of a replay's verdict on made-up figures: those that a whole run seldom breaks alone."""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from splatctrl_cli.jobs.replay.control_criteria import controller
+from splatctrl_cli.jobs.replay.motion_criteria import surface_clearance
+from splatctrl_cli.jobs.replay.replay import evidence_criteria as evidence
+from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.events import EventKind
+from splatctrl_cli.evaluate.conformal import ConformalBound
+from splatctrl_cli.evaluate.verdict import Outcome, Reason
+from splatctrl_cli.voxels import EvidenceClass
+
+NUM = 11
+UNKNOWN = np.full(NUM, np.nan)
+NOTHING_NEAR = {name: np.full((NUM, *shape), np.nan) for name, shape in NEAR_COLUMNS.items()}
+
+
+def judged(**replay: Any) -> Any:
+    """What the criteria look at, of a run with nothing broken but `replay`."""
+    stamps = np.arange(NUM, dtype=np.int64) * 100_000_000
+    run = {
+        "outside": None,
+        "audit": SimpleNamespace(stamp_ns=stamps, clearance={}, unknown_share=np.zeros(NUM)),
+        "between": {"unbounded": np.zeros(NUM - 1), "surface": np.full(NUM, 0.1)},
+        "margin": 0.02,
+        "near": NOTHING_NEAR,
+        "unwatched": (),
+        "overtaken": (),
+        "map_age_s": np.zeros(NUM),
+        "events": [],
+        "lead_in_s": 0.0,
+        "num_before_scene": 0,
+        "map_error": None,
+        "closed_loop": None,
+    }
+    return SimpleNamespace(
+        replay=SimpleNamespace(**run | replay),
+        request=SimpleNamespace(
+            max_map_age=1.0,
+            max_unknown=0.05,
+            require_proof=False,
+            unseen="judge",
+            config=Config(),
+            field=None,
+            follow=True,
+            twist_topic=None,
+        ),
+        inputs=SimpleNamespace(source=SimpleNamespace(loss=SimpleNamespace(conflicting_states=0), has_clock=True)),
+        metrics={"unknown_share": 0.0, "num_scene_hits": 0},
+        num_states=NUM,
+        past_end_s=0.0,
+    )
+
+
+def outcomes(criterion: Callable[[Any], Iterator[Reason]], of: Any) -> list[Outcome]:
+    return [reason.outcome for reason in criterion(of)]
+
+
+def event(kind: EventKind) -> SimpleNamespace:
+    return SimpleNamespace(
+        kind=kind, source="", first_ns=0, start_s=0.2, end_s=0.4, worst_s=0.3, worst=1.5, worst_name="", obstacle=None
+    )
+
+
+@pytest.mark.parametrize(("residual", "outcome"), [(4.9, Outcome.PASSED), (5.1, Outcome.NOT_EVALUABLE)])
+def test_a_robot_seen_off_where_its_joints_put_it_is_no_evidence(residual: float, outcome: Outcome) -> None:
+    run = judged()
+    links = {"hand": {"median_mm": -residual, "sign": -1, "num_pixels": 500}}
+    run.inputs.scene = SimpleNamespace(figures=lambda: {"self_mask_residual_mm": residual, "self_mask": links})
+    (reason,) = evidence.calibration(run)
+    assert reason.outcome is outcome
+    assert outcome is Outcome.PASSED or (reason.who, reason.count) == ("hand", 500)
+
+
+@pytest.mark.parametrize("what", ["relaxed", "minimum_violation", "hold"])
+def test_a_step_of_any_kind_that_is_not_solved_fails_the_controller(what: str) -> None:
+    run = judged(closed_loop=SimpleNamespace(steps=[None] * 5), events=[event(EventKind(what.replace("_", "-")))])
+    run.metrics |= {f"num_{name}": 0 for name in ("relaxed", "minimum_violation", "hold")} | {f"num_{what}": 2}
+    (reason,) = controller(run)
+    assert reason.outcome is Outcome.FAILED
+    assert f"at 2 {what.replace('_', ' ')} of 5 steps" in reason.sentence
+
+
+def bodied(deficit: tuple[float, float], surface: float) -> Any:
+    """A run whose spheres keep 30 mm and whose surface keeps less, by two spheres of which each leaves something."""
+    model = SimpleNamespace(
+        moving_spheres=np.array([True, True]),
+        sphere_deficit=np.array(deficit),
+        coverage=None,
+        coverage_unknown="no meshes",
+    )
+    between = {"surface": np.full(NUM, surface), "lower": np.full(NUM - 1, surface)}
+    run = judged(model=model, margin=0.02, between=between)
+    run.replay.audit.clearance = {"exact": SimpleNamespace(distance=np.full(NUM, 0.03))}
+    run.threshold = 0.019
+    return run
+
+
+@pytest.mark.parametrize(("surface", "outcome"), [(0.015, Outcome.NOT_EVALUABLE), (0.025, Outcome.PASSED)])
+def test_what_the_spheres_leave_uncovered_must_keep_the_margin_too(surface: float, outcome: Outcome) -> None:
+    (reason,) = surface_clearance(bodied((0.0, 0.005), surface))
+    assert reason.outcome is outcome
+
+
+def test_one_sphere_of_unknown_cover_is_enough_to_know_nothing() -> None:
+    (reason,) = surface_clearance(bodied((0.0, np.nan), 0.025))
+    assert reason.outcome is Outcome.NOT_EVALUABLE
+    assert "is not known: no meshes" in reason.sentence
+
+
+def test_one_state_judged_by_an_old_map_is_enough() -> None:
+    ages = np.array([0.1] * 10 + [1.5])
+    assert outcomes(evidence.map_age, judged(map_age_s=ages, events=[event(EventKind.STALE_MAP)])) == [
+        Outcome.NOT_EVALUABLE
+    ]
+
+
+def test_old_evidence_about_the_arm_counts_under_a_new_map() -> None:
+    near = NOTHING_NEAR | {"age": np.full(NUM, 1.5)}
+    assert outcomes(evidence.evidence_age, judged(near=near)) == [Outcome.NOT_EVALUABLE]
+
+
+def test_a_state_without_a_distance_in_one_field_is_not_judged() -> None:
+    run = judged()
+    there, blank = np.full(NUM, 0.2), np.full(NUM, 0.2)
+    blank[3] = np.nan
+    for fields in ((there, blank), (blank, there)):
+        run.replay.audit.clearance = {
+            name: SimpleNamespace(distance=of) for name, of in zip("ab", fields, strict=True)
+        }
+        (reason,) = evidence.judged_time(run)
+        assert (reason.outcome, reason.time_s) == (Outcome.NOT_EVALUABLE, pytest.approx(0.3))
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_a_lead_in_longer_than_is_allowed_is_not_judged(share: float) -> None:
+    run = judged(lead_in_s=share * Config().verdict.lead_in)
+    assert outcomes(evidence.judged_time, run) == ([Outcome.NOT_EVALUABLE] if share > 1 else [])
+
+
+def test_space_that_was_not_recorded_is_not_known() -> None:
+    run = judged()
+    run.metrics["unknown_share"] = None
+    assert outcomes(evidence.known_space, run) == [Outcome.NOT_EVALUABLE]
+
+
+@pytest.mark.parametrize(("miss", "outcome"), [(0.09, Outcome.PASSED), (0.11, Outcome.NOT_EVALUABLE)])
+def test_the_surface_must_keep_the_whole_map_error(miss: float, outcome: Outcome) -> None:
+    bound = ConformalBound(bound=miss, confidence=0.9, num_stretches=9, length=1, at=0)
+    found = SimpleNamespace(bound=bound, num_points=5, time_s=0.1, place=None, source="cam3")
+    assert outcomes(evidence.map_error, judged(map_error=found)) == [outcome]
+
+
+EVIDENCE = EvidenceClass
+STRICT = (EVIDENCE.UNANSWERED, EVIDENCE.CONTRADICTED, EVIDENCE.DEPTH_EDGE, EVIDENCE.OUTSIDE)
+
+
+def near_a(kind: EvidenceClass, distance: float) -> dict[str, Any]:
+    """At one state a place of a class is so far [m] from the arm."""
+    nearest, places = np.full((NUM, len(EVIDENCE)), np.inf), np.zeros((NUM, 3 * len(EVIDENCE)))
+    nearest[4, kind] = distance
+    places[4, 3 * kind : 3 * kind + 3] = 0.25
+    return NOTHING_NEAR | {"nearest": nearest, "places": places}
+
+
+def from_a_surface(column: str, distance: float) -> dict[str, Any]:
+    """At one state unseen space is so far [m] from a surface of the map."""
+    near = np.where(np.arange(NUM) == 4, distance, np.inf)
+    place = {f"{column}_to_surface_place": np.full((NUM, 3), 0.25)}
+    return NOTHING_NEAR | {f"{column}_to_surface": near} | place
+
+
+@pytest.mark.parametrize(
+    ("near", "distance", "count"),
+    [
+        (partial(from_a_surface, "unseen"), 0.031, 0),
+        (partial(from_a_surface, "unseen"), 0.029, 1),
+        (partial(from_a_surface, "blind"), 0.101, 0),
+        (partial(from_a_surface, "blind"), 0.099, 1),
+        *((partial(near_a, kind), distance, int(distance < 0.02)) for kind in STRICT for distance in (0.021, 0.019)),
+        *((partial(near_a, kind), 0.0, 0) for kind in EVIDENCE if kind not in STRICT),
+    ],
+)
+def test_a_place_of_which_too_little_is_known_near_the_arm_is_no_evidence(
+    near: Callable[[float], dict[str, Any]], distance: float, count: int
+) -> None:
+    run = judged(near=near(distance))
+    found = [r for r in evidence.known_space(run) if r.outcome is Outcome.NOT_EVALUABLE]
+    assert [r.count for r in found] == [1] * count
+    assert not found or (found[0].time_s, found[0].place) == (pytest.approx(0.4), (0.25, 0.25, 0.25))
+    assert not found or f"{1e3 * distance:.1f} mm" in found[0].sentence
+
+
+@pytest.mark.parametrize("kind", STRICT)
+def test_the_arm_in_such_a_place_is_no_evidence_without_a_margin_either(kind: EvidenceClass) -> None:
+    run = judged(margin=0.0, near=near_a(kind, 0.0))
+    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == 1
+
+
+@pytest.mark.parametrize(("column", "allowed"), [("unseen", evidence.UNSEEN)])
+@pytest.mark.parametrize(("more", "count"), [(-0.01, 0), (0.01, 1)])
+def test_more_that_no_camera_saw_is_no_evidence(column: str, allowed: float, more: float, count: int) -> None:
+    share = np.where(np.arange(NUM) == 4, allowed + more, 0.1)
+    run = judged(near=NOTHING_NEAR | {column: share})
+    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
+
+
+@pytest.mark.parametrize("kind", [kind for kind in EvidenceClass if kind not in STRICT])
+@pytest.mark.parametrize(("option", "broken"), [("require_proof", Outcome.NOT_EVALUABLE), ("unseen", Outcome.FAILED)])
+def test_only_free_space_about_the_arm_is_proof(option: str, broken: Outcome, kind: EvidenceClass) -> None:
+    run = judged(near=near_a(kind, 0.01) | {"assumed": np.zeros(NUM)})
+    assert set(outcomes(evidence.known_space, run)) == {Outcome.PASSED}
+    setattr(run.request, option, "occupied")
+    assert (broken in outcomes(evidence.known_space, run)) == (kind is not EvidenceClass.FREE)
+
+
+@pytest.mark.parametrize("option", ["require_proof", "unseen"])
+def test_what_is_not_recorded_is_no_proof(option: str) -> None:
+    run = judged(near=near_a(EvidenceClass.FREE, 0.01))
+    setattr(run.request, option, "occupied")
+    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == 1

@@ -1,0 +1,175 @@
+"""What a replay may know of the scene at a time, and of space."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from splatctrl_cli.formats.grid.npz_grid import read_npz, write_npz
+from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene, fields_at, known_space
+from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
+
+from experiments.problems import simulated_arm
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.audit import BallDistance
+from splatctrl_cli.control.events import Obstacle
+from splatctrl_cli.control.near_space import Seen
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.field.distance import SphereField
+from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.self_model import ALWAYS
+from splatctrl_cli.scene.posture import posture_of
+from splatctrl_cli.voxels import SWEPT, EvidenceClass, VoxelState
+from tests.cli.replay_desk import SECOND
+from tests.jobs.stage import FAR, Stage, decisive, passing
+from tests.plain import plain_grid
+from tests.robot.shapes import held_part
+
+
+def test_a_scene_is_known_from_its_latency_on_until_the_next_is() -> None:
+    at = fields_at((100, 200), 50, lambda index: index, lambda index: index)  # type: ignore[arg-type, return-value]
+    assert [at(stamp) for stamp in (150, 249, 250, 10_000)] == [0, 0, 1, 1]
+    with pytest.raises(NotEvaluableError, match="no scene is known at stamp 149 ns"):
+        at(149)
+
+
+@pytest.mark.parametrize(("stamp_ns", "age_s"), [(1 * SECOND, 2.0), (3 * SECOND, 0.0), (7 * SECOND, 4.0)])
+def test_a_field_of_one_moment_is_as_old_as_it_is_far_off(stamp_ns: int, age_s: float) -> None:
+    scene = KnownScene(
+        at=lambda _: None,  # type: ignore[arg-type, return-value]
+        observed=lambda points: np.ones(len(points), np.uint8),
+        first_ns=None,
+        cameras=None,
+        digests={},
+        moment_ns=3 * SECOND,
+    )
+    assert scene.age_s(stamp_ns) == pytest.approx(age_s)
+
+
+def test_space_that_a_camera_saw_or_the_robot_was_in_is_known() -> None:
+    shape = (3, 1, 1)
+    seen, entity = np.reshape([4, 0, 0], shape), np.reshape([0, SWEPT, 0], shape)
+    grid = plain_grid(shape, 0.1, 0.0, log_odds=0.0, num_updates=seen, entity=entity)
+    points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [9.0, 0, 0]])
+    assert known_space(grid)(points).tolist() == [1, 1, 0, 0]
+
+
+@pytest.mark.parametrize("is_continuous", [True, False])
+def test_the_space_about_the_arm_is_asked_between_states_that_are_far_apart(is_continuous: bool) -> None:
+    """A tenth of a second in which the hand sweeps through a lost edge that neither state is near."""
+    model, q, turn = simulated_arm(), np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785]), 0.3 * np.eye(7)[0]
+    edge = model.sphere_centers(q)[-1]
+    nothing = Obstacle(distance=1.0, position=(np.nan, np.nan, np.nan))
+    fields = KnownFields(
+        barrier=Away(),
+        distances={"exact": away, "barrier": away},
+        median_radius=0.01,
+        obstacles=lambda points: (nothing,) * len(points),
+    )
+    seen = Seen(
+        look=lambda points: (np.zeros(len(points), np.int64), np.zeros(len(points), np.uint8)),
+        edges=np.array([[*edge, 1e-3]]),
+    )
+    scene = KnownScene(
+        at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={}, seen_at=lambda _: seen
+    )
+    record = ReplayRecord(model, scene, config=Config(), max_map_age=1.0, is_continuous=is_continuous)
+    record.measured(np.array([0, SECOND // 10]), np.array([q - turn, q + turn]), np.zeros((2, 7)))
+    first, second = record.near["nearest"][:, EvidenceClass.DEPTH_EDGE]
+    assert first > 0.02
+    assert (second == 0.0) if is_continuous else (second > 0.02)
+    place = record.near["places"][1].reshape(-1, 3)[EvidenceClass.DEPTH_EDGE]
+    assert np.isinf(second) or place == pytest.approx(edge)
+
+
+def test_what_spheres_leave_uncovered_is_not_taken_from_a_surface_that_is_measured() -> None:
+    """A ball 30 cm before the hand of an arm that triangles draw, whose spheres leave 5 cm uncovered."""
+    arm, q = simulated_arm(), np.array([[0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785]])
+    link = arm.sphere_set.links[-1]
+    ball_at_hand = np.asarray(trimesh.creation.icosphere(radius=0.02).triangles)
+    drawn = arm.with_self_model(held_part(link, ball_at_hand, *ALWAYS))
+    model = drawn._changed(sphere_deficit=np.where(np.array(arm.sphere_set.links) == link, 0.05, 0.0))
+    center = model.sphere_centers(q[0])[-1] + [0.0, 0.0, -0.3]
+    ball = SphereField(center[None], np.array([0.01]))
+    scene = BallDistance(of_points=lambda points: ball.query(points)[0], centers=center[None], radii=np.array([0.01]))
+    nothing = Obstacle(distance=1.0, position=(np.nan, np.nan, np.nan))
+    fields = KnownFields(
+        barrier=ball,
+        distances={"exact": scene, "barrier": scene},
+        median_radius=0.01,
+        obstacles=lambda points: (nothing,) * len(points),
+    )
+    known = KnownScene(at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={})
+    record = ReplayRecord(model, known, config=Config(), max_map_age=1.0)
+    record.measured(np.array([0]), q, np.zeros((1, 7)))
+    gap = model.surface_gaps(q, scene.centers, scene.radii)[link][0]
+    assert record.audit.clearance["exact"].distance[0] == pytest.approx(gap)
+    assert record.between["surface"][0] == pytest.approx(gap)
+
+
+def test_a_thing_that_the_hand_holds_for_a_time_counts_while_it_is_held() -> None:
+    """A ball 30 cm below the hand; from 0.25 to 0.55 s the hand holds one of 2 cm, 10 cm below its own."""
+    arm, q = simulated_arm(), np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785])
+    link = arm.sphere_set.links[-1]
+    hand = arm.sphere_centers(q)[-1]
+    place = np.linalg.inv(arm.frame_pose(q, link)) @ [*hand - [0.0, 0.0, 0.1], 1.0]
+    ball = trimesh.creation.icosphere(radius=0.02)
+    base = arm.with_self_model(held_part(link, np.asarray(ball.triangles), *ALWAYS))
+    model = base.with_self_model(held_part(link, ball.triangles + place[:3], SECOND // 4, 55 * SECOND // 100))
+    center = (hand - [0.0, 0.0, 0.3])[None]
+    scene = BallDistance(of_points=away, centers=center, radii=np.array([0.01]))
+    fields = KnownFields(
+        barrier=Away(),
+        distances={"exact": scene, "barrier": scene},
+        median_radius=0.01,
+        obstacles=lambda points: (Obstacle(distance=1.0, position=(np.nan, np.nan, np.nan)),) * len(points),
+    )
+    known = KnownScene(at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={})
+    stamps = np.arange(8) * SECOND // 10
+    record = ReplayRecord(model, known, config=Config(), max_map_age=1.0)
+    assert [*record.blocks(stamps)] == [(0, 3), (3, 6), (6, 8)]
+    for first, last in record.blocks(stamps):
+        record.measured(stamps[first:last], np.tile(q, (last - first, 1)), np.zeros((last - first, 7)))
+    robots = (base, model.at(SECOND // 2))
+    alone, holding = (robot.surface_gaps(q[None], scene.centers, scene.radii)[link][0] for robot in robots)
+    assert holding == pytest.approx(0.17, abs=2e-3) and alone > 0.2
+    assert record.audit.clearance["exact"].distance == pytest.approx([alone] * 3 + [holding] * 3 + [alone] * 2)
+    posture = posture_of(model, q, dict.fromkeys(stamps.tolist(), q))
+    counts = [len(posture.seen_at(stamp)[0].triangles) for stamp in stamps.tolist()]
+    faces = len(ball.triangles)
+    assert counts == [faces] * 3 + [2 * faces] * 3 + [faces] * 2
+    assert posture.seen_at(int(stamps[3]))[0] is posture.seen_at(int(stamps[5]))[0]
+    assert not posture_of(base, q, {0: q}).surfaces and base.at(0) is base
+
+
+class Away:
+    """One metre from everything."""
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        return away(points), np.zeros_like(points)
+
+
+def away(points: Float64) -> Float64:
+    return np.full(len(points), 1.0)
+
+
+@pytest.mark.usefixtures("without_plots")
+def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_said_not_to_be(stage: Stage) -> None:
+    stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
+    code, verdict = stage.judged_by_field(FAR, moment_ns=SECOND)
+    assert (code, decisive(verdict)) == (0, {})
+    assert "age of the evidence about the arm not judged" in verdict["sentence"] and verdict["how"] == ""
+    code, asked = stage.replayed("--field", str(stage.desk.folder / "field"), "--require-proof")
+    assert (code, decisive(asked)) == (5, {"known space": "not evaluable"})
+    field = stage.desk.folder / "field"
+    grid = read_npz(field / "field.npz")
+    for state, channels in (
+        (VoxelState.SWEPT_BY_ROBOT, {"observed": np.full_like(grid.channels["observed"], VoxelState.SWEPT_BY_ROBOT)}),
+        (None, {}),
+    ):
+        kept = {name: values for name, values in grid.channels.items() if name != "observed"} | channels
+        write_npz(field / "field.npz", replace(grid, channels=kept))
+        code, verdict = stage.replayed("--field", str(field))
+        assert (code, decisive(verdict)) == (5, {"known space": "not evaluable"})
+        words = "what cameras saw is not recorded" if state is None else "100 % of the space within the margin"
+        assert words in verdict["sentence"]

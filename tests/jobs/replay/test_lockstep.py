@@ -1,0 +1,220 @@
+"""``splatctrl replay --lockstep`` and ``--latency``: what is known of the scene at each time, and since when."""
+
+import csv
+import re
+import weakref
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from splatctrl_cli.jobs.replay.known_scene import KnownFields, from_splats
+from splatctrl_cli.jobs.replay.lockstep import check_lockstep, from_log
+from splatctrl_cli.jobs.replay.replay import known_scene
+from splatctrl_cli.jobs.replay.replay import replay as job
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from tests.jobs.bake.baked import Said
+from tests.jobs.running.test_device import cards, run_of
+
+from splatctrl_cli.checks.clock_offset import ImageMotion
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.recording.container.mcap_log import McapLog
+from splatctrl_cli.recording.container.raw_log import Damage, RawMessage
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.robot.model import RobotModel
+from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene
+from tests.kernels.cuda.emulator import EmulatedDevice
+
+SETTINGS = ["scene.max_splats=600", "scene.first_iterations=15", "scene.iterations_per_step=3"]
+pytestmark = pytest.mark.usefixtures("coverage_once", "without_plots")
+FAST = ["--threads", "1", "-q", *(word for setting in SETTINGS for word in ("--set", setting))]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recording") / "small"
+    size = ["--duration", "1.0", "--width", "96", "--height", "72"]
+    assert main(["simulate", "-o", str(folder), *size, "-q"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def replayed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[dict[str, str]]]:
+    """The steps of a replay of the recording, in lockstep or (with `scene`) after `reconstruct`."""
+    folder = tmp_path_factory.mktemp("replays")
+    robot = ["--urdf", str(recording / "robot.urdf"), "--spheres", str(recording / "robot_spheres.yaml")]
+    log = [str(recording / "log.mcap"), *robot, "--cameras", "cam0,cam1", *FAST]
+
+    def replay(*options: str, every: int = 1, has_folder: bool = False) -> list[dict[str, str]]:
+        number = len(list(folder.iterdir()))
+        out, scene = folder / f"{number}", folder / f"scene_{every}"
+        every_set = ["--set", f"scene.snapshot_every={every}"]
+        known = ["--lockstep", *every_set]
+        if has_folder:
+            if not scene.exists():
+                assert main(["reconstruct", *log, *every_set, "-o", str(scene)]) == 0
+            known = ["--scene", str(scene)]
+        assert main(["replay", *log, *known, "-o", str(out), "--max-unknown", "1", "--report-only", *options]) in (
+            0,
+            3,
+        )
+        with (out / "steps.csv").open() as stream:
+            return list(csv.DictReader(stream))
+
+    return replay
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_a_lockstep_says_what_a_reconstruction_with_snapshots_would(
+    replayed: Callable[..., list[dict[str, str]]], every: int
+) -> None:
+    rows = replayed(every=every)
+    assert rows == replayed(every=every, has_folder=True)
+    ages = np.array([float(row["map_age_s"]) for row in rows])
+    assert (ages >= 0).all() and ages.max() == pytest.approx(0.2 * every - 0.02, abs=0.021)
+
+
+def test_a_closed_loop_in_lockstep_drives_as_in_the_reconstruction(
+    replayed: Callable[..., list[dict[str, str]]],
+) -> None:
+    drive = ["--mode", "closed-loop", "--latency", "0.3", "--set", "control.max_time=0.2"]
+    rows, expected = replayed(*drive), replayed(*drive, has_folder=True)
+    for row in (*rows, *expected):
+        del row["unknown_share"]  # known space is what was seen until the arm stopped, there in the whole log
+    assert rows == expected
+    assert {float(row["map_age_s"]) >= 0.3 - 1e-9 for row in rows} == {True}
+
+
+def test_frame_sets_are_taken_in_only_when_the_clock_has_passed_them(
+    recording: Path, tmp_path: Path, arm: RobotModel
+) -> None:
+    scene = opened(recording, tmp_path, arm, latency=0.25)
+    assert len(scene.stamps_ns) == 1
+    first = scene.stamps_ns[0]
+    assert scene.first_ns == first + SECOND // 4
+    with pytest.raises(NotEvaluableError, match="no scene is known"):
+        scene.at(first)
+    for num, seconds in ((1, 0.44), (2, 0.46), (3, 0.66), (3, 0.5)):
+        scene.at(first + round(seconds * SECOND))
+        assert len(scene.stamps_ns) == num
+    assert scene.age_s(first + SECOND // 2) == pytest.approx(0.3, abs=1e-6)
+    step = scene.step_at(first + round(0.66 * SECOND))
+    assert step is not None and step.seconds == pytest.approx(0.2, abs=1e-3)
+    scene.finish()
+    assert {"splats.ply", "run.json", "snapshots.csv", "occupancy.npz"} <= {
+        path.name for path in (tmp_path / "scene").iterdir()
+    }
+
+
+def test_the_log_is_read_four_times(
+    replayed: Callable[..., list[dict[str, str]]], recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For its survey, the checks that can stop it, in lockstep with the clock, and for the truth and worst frames."""
+    passes: list[object] = []
+    messages = McapLog.messages
+
+    def counted(log: McapLog, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        yield from messages(log, damage, names)
+        passes.append(names)
+
+    monkeypatch.setattr(McapLog, "messages", counted)
+    assert replayed("--truth", str(recording / "truth.json"))
+    assert len(passes) == 4 and passes[0] is None
+
+
+def test_the_clock_is_estimated_from_every_frame_also_where_the_arm_stops_before(
+    replayed: Callable[..., list[dict[str, str]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[ImageMotion] = []
+    monkeypatch.setattr(job, "clock_of", lambda _model, _logged, motion: seen.append(motion))
+    for drive in ([], ["--mode", "closed-loop", "--set", "control.max_time=0.1"]):
+        replayed(*drive)
+        replayed(*drive, has_folder=True)
+    stamps = [{name: camera.stamps_ns for name, camera in motion.cameras.items()} for motion in seen]
+    assert all(found == stamps[0] for found in stamps) and {len(s) for s in stamps[0].values()} == {5}
+
+
+def test_the_fit_of_a_lockstep_computes_where_it_is_told_to(
+    recording: Path, tmp_path: Path, arm: RobotModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = EmulatedDevice()
+    cards(monkeypatch, memory)
+    scene = opened(recording, tmp_path, arm, latency=0.0, device="cuda")
+    scene.finish()
+    assert [each["device"] for each in run_of(tmp_path / "scene")["metrics"]["devices"]] == ["cuda:0"]
+    assert not memory.sizes  # given back
+    with pytest.raises(UsageError, match="--device cuda: expected --lockstep"):
+        check_lockstep(ReplayRequest(log=recording, out=tmp_path, scene=tmp_path, device="cuda"))
+
+
+def test_it_says_how_long_a_frame_set_took(recording: Path, tmp_path: Path, arm: RobotModel) -> None:
+    said = Said()
+    scene = opened(recording, tmp_path, arm, latency=0.0, console=said)
+    scene.advance(scene.stamps_ns[0] + SECOND)
+    scene.finish()
+    found = re.search(
+        r"lockstep: 5 frame sets, recorded 200 ms apart, took (\d+) ms each in the median, (\d+) ms at",
+        said.lines[-1],
+    )
+    assert found is not None and 0 < int(found[1]) <= int(found[2])
+
+
+def opened(
+    recording: Path,
+    folder: Path,
+    arm: RobotModel,
+    *,
+    latency: float,
+    device: str = "auto",
+    console: Progress = SILENT,
+) -> known_scene.KnownScene:
+    request = ReplayRequest(
+        log=recording / "log.mcap",
+        urdf=recording / "robot.urdf",
+        out=folder,
+        options=SourceOptions(cameras=("cam0", "cam1")),
+        lockstep=True,
+        device=device,
+        latency=latency,
+        mode="closed-loop",
+        threads=1,
+        config=load_config(None, SETTINGS),
+    )
+    return from_log(request, arm, folder, console)
+
+
+def test_a_map_is_known_only_after_the_latency(desk: Desk, arm: RobotModel) -> None:
+    small = (BALL[0], 0.02)
+    snapshots = ((0, splats_of(small)), (SECOND // 2, splats_of(BALL)))
+    scene = str(write_scene(desk.folder / "scene", *snapshots))
+    assert desk.replay("--scene", scene, "-q", "--latency", "0.2") == 0
+    rows = desk.rows()
+    assert desk.metrics()["num_before_scene"] == 2
+    expected = [clearance(arm, START, small)] * 5 + [clearance(arm, START, BALL)] * 4
+    np.testing.assert_allclose([float(row["clearance_exact"]) for row in rows], expected, atol=1e-6)
+    ages = [0.2, 0.3, 0.4, 0.5, 0.6, 0.2, 0.3, 0.4, 0.5]
+    np.testing.assert_allclose([float(row["map_age_s"]) for row in rows], ages, atol=1e-6)
+
+
+def test_the_fields_of_two_scenes_are_kept_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[weakref.ref[KnownFields]] = []
+    make = known_scene.splat_fields
+
+    def counted(*given: Any) -> KnownFields:
+        fields = make(*given)
+        made.append(weakref.ref(fields))
+        return fields
+
+    monkeypatch.setattr(known_scene, "splat_fields", counted)
+    scene = from_splats(
+        write_scene(tmp_path / "scene", *((k * SECOND, splats_of(BALL)) for k in range(6))), Config(), 1
+    )
+    for stamp in range(0, 6 * SECOND, SECOND // 4):
+        assert scene.at(stamp) is scene.at(stamp)
+        scene.step_at(stamp)
+        assert sum(ref() is not None for ref in made) <= 2
+    assert len(made) == 6

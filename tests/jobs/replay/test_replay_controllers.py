@@ -1,0 +1,197 @@
+"""A user's own controller in a replay: judged like ours, refused, or failed by name."""
+
+import json
+import shutil
+import subprocess
+import textwrap
+from pathlib import Path
+
+import pytest
+from splatctrl_cli.jobs.replay.metrics import metric_names
+
+from splatctrl_cli.robot.model import RobotModel
+from tests.cli.replay_desk import BALL, Desk, splats_of, write_scene
+from tests.cli.test_replay_modes import ball_ahead, events, moving
+from tests.jobs.stage import QUARTER, Stage, decisive
+
+pytestmark = pytest.mark.usefixtures("unpainted")
+
+EXAMPLES = Path(__file__).parents[3] / "docs" / "controllers"
+MODULE = """
+    import json
+
+    class Recorded:
+        def __init__(self, start):
+            self.velocities = iter(json.load(open("recorded.json")))
+
+        def step(self, now):
+            return next(self.velocities)
+
+    class Constant:
+        speed = 0.1
+
+        def __init__(self, start):
+            self.num = len(start.joints)
+
+        def step(self, now):
+            return [self.speed] + [0.0] * (self.num - 1)
+
+    class Fast(Constant):
+        speed = 2.5
+
+    class Raises(Constant):
+        def step(self, now):
+            if now.stamp_ns >= 300_000_000:
+                raise RuntimeError("out of ideas")
+            return super().step(now)
+    """
+
+
+@pytest.fixture
+def stage(desk: Desk, arm: RobotModel, monkeypatch: pytest.MonkeyPatch) -> Stage:
+    (desk.folder / "own.py").write_text(textwrap.dedent(MODULE))
+    monkeypatch.chdir(desk.folder)
+    return Stage(desk=desk, arm=arm, map_stamps=tuple(i * QUARTER for i in range(16)))
+
+
+def record(desk: Desk, out: str) -> None:
+    """Keep the commands of an earlier replay; steps.csv has nine digits of them."""
+    rows = [[row[f"v_joint{j}"] for j in range(1, 8)] for row in desk.rows(out)]
+    (desk.folder / "recorded.json").write_text(json.dumps([[float(v) for v in row] for row in rows if row[0]]))
+
+
+@pytest.mark.parametrize("mode", ["open-loop", "closed-loop"])
+def test_the_recorded_commands_of_ours_make_the_same_steps(stage: Stage, mode: str) -> None:
+    desk = stage.desk
+    moving(desk)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL, ball_ahead(stage.arm, 0.01))))
+    run = ("--scene", str(scene), "-q", "--mode", mode, "--set", "control.max_time=2")
+    assert desk.replay(*run, out="ours") == 0
+    record(desk, "ours")
+    assert desk.replay(*run, "--controller", "own:Recorded") == 0
+    ours, theirs = desk.rows("ours"), desk.rows()
+    assert list(ours[0]) == list(theirs[0]) and len(ours) == len(theirs)
+    unlike = {
+        name for our, their in zip(ours, theirs, strict=True) for name in our if not alike(our[name], their[name])
+    }
+    assert unlike <= {"rung", "scale", "slack", "relaxed", "intervening", "multipliers", "residual", "num_rows"}
+    assert {row["rung"] for row in theirs} == {"outside"}
+    metrics = desk.metrics()
+    assert set(metrics) == set(metric_names(mode, ("exact", "barrier"), has_truth=False)) == set(desk.metrics("ours"))
+    assert metrics["min_clearance"] == pytest.approx(desk.metrics("ours")["min_clearance"], abs=1e-6)
+    assert metrics["intervention_share"] is None and metrics["num_solved"] == 0
+
+
+def alike(a: str, b: str) -> bool:
+    try:
+        return float(a) == pytest.approx(float(b), abs=1e-5)
+    except ValueError:
+        return a == b
+
+
+def test_a_controller_that_is_good_is_safe_and_named(stage: Stage) -> None:
+    shutil.copy(EXAMPLES / "reach.py", stage.desk.folder)
+    code, verdict = stage.judged("--controller", "reach:Reach", "--controller-twice", mode="closed-loop")
+    assert (code, verdict["label"], decisive(verdict)) == (0, "safe", {})
+    (reason,) = [reason for reason in verdict["reasons"] if reason["criterion"] == "controller"]
+    num = stage.desk.metrics()["num_steps"]
+    assert reason["sentence"] == f"all {num} steps answered" and reason["count"] == num
+    assert f"{num} states, controller reach:Reach" in verdict["sentence"]
+    about = json.loads((stage.desk.folder / "out" / "summary.json").read_text())["about"]
+    assert about["controller"] == "reach:Reach"
+
+
+def test_a_controller_that_goes_elsewhere_does_not_reach_the_goal(stage: Stage) -> None:
+    constant = ("--controller", "own:Constant", "--set", "control.max_time=0.5")
+    code, verdict = stage.judged(*constant, mode="closed-loop")
+    assert (code, verdict["label"], decisive(verdict)) == (1, "goal not reached", {"goal": "failed"})
+
+
+def test_a_motion_of_its_own_is_judged_by_every_criterion(stage: Stage) -> None:
+    stage.balls = [*stage.balls, stage.ball_at_the_end(0.005)]
+    code, verdict = stage.judged("--controller", "own:Constant", "--set", "control.max_time=8", mode="closed-loop")
+    assert code == 1 and {"clearance", "goal"} <= set(decisive(verdict))
+    assert {event["kind"] for event in events(stage.desk)} >= {"below-margin", "row-broken"}
+
+
+@pytest.mark.parametrize("mode", ["open-loop", "closed-loop"])
+def test_commands_above_the_velocity_limits_fail(stage: Stage, mode: str) -> None:
+    fast = ("--controller", "own:Fast", "--set", "control.max_time=0.2")
+    code, verdict = stage.judged(*fast, mode=mode)
+    assert code == 1 and decisive(verdict)["velocity limits"] == "failed"
+    (reason,) = [reason for reason in verdict["reasons"] if reason["criterion"] == "velocity limits"]
+    assert reason["value"] == pytest.approx(2.5 / 2.175, abs=1e-3) and "joint1" in reason["sentence"]
+
+
+@pytest.mark.parametrize("mode", ["open-loop", "closed-loop"])
+def test_one_that_fails_on_the_way_is_named_and_judged_until_then(stage: Stage, mode: str) -> None:
+    code, verdict = stage.judged("--controller", "own:Raises", mode=mode)
+    assert (code, verdict["label"]) == (1, "controller failed")
+    (reason,) = [reason for reason in verdict["reasons"] if reason["criterion"] == "controller"]
+    num = {"open-loop": 3, "closed-loop": 30}[mode]
+    assert reason["sentence"] == f"crashed: exit status 1: RuntimeError: out of ideas; after {num} answers,"
+    assert reason["time_s"] == pytest.approx(0.3) and reason["count"] == num + 1
+    assert len(stage.desk.rows()) == {"open-loop": 11, "closed-loop": 31}[mode]
+    assert not any("max_detours" in reason["remedy"] for reason in verdict["reasons"])
+    assert "answers, at 0.30 s" in verdict["sentence"]
+
+
+def test_one_that_fails_at_once_is_still_judged(stage: Stage) -> None:
+    code, verdict = stage.judged(
+        "--controller-command", "sh -c 'read a; echo {\\\"protocol\\\":1}'", mode="closed-loop"
+    )
+    assert (code, verdict["label"]) == (1, "controller failed") and len(stage.desk.rows()) == 1
+    assert "ended: exit status 0; after 0 answers, at 0.00 s" in verdict["sentence"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("--controller", "own:Nobody"), 4, "own:Nobody: at the start: crashed: exit status 1: module own ("),
+        (("--controller-command", "./nobody 3"), 4, "./nobody 3: cannot be started: No such file or directory"),
+        (("--controller", "own"), 2, "--controller: expected module:Class, got 'own'"),
+        (("--controller-command", "it 'there"), 2, "No closing quotation; close the quotes"),
+        (("--controller-command", " "), 2, "expected a program and its arguments, got nothing"),
+        (("--controller", "own:Fast", "--controller-command", "x"), 2, "not allowed with argument --controller"),
+        (("--controller", "own:Fast", "--mode", "audit"), 2, "expected --mode open-loop or closed-loop"),
+        (("--controller-twice",), 2, "expected a controller"),
+        (("--controller-step-limit", "3"), 2, "expected a controller"),
+    ],
+)
+def test_what_cannot_be_meant_or_started_is_refused(
+    stage: Stage, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, words: str
+) -> None:
+    assert stage.judged(*arguments, mode="closed-loop")[0] == code
+    assert words in capsys.readouterr().err
+    assert not (stage.desk.folder / "out").exists()
+
+
+def test_the_examples_drive_alike(stage: Stage) -> None:
+    compiler = shutil.which("c++")
+    if compiler is None:
+        pytest.skip("no C++ compiler (c++): docs/controllers/reach.cpp is not tried")
+    program, source = stage.desk.folder / "reach", EXAMPLES / "reach.cpp"
+    subprocess.run([compiler, "-std=c++17", "-Wall", "-Wextra", "-Werror", "-O2", "-o", program, source], check=True)
+    shutil.copy(EXAMPLES / "reach.py", stage.desk.folder)
+    moving(stage.desk)
+    stage.states = stage.desk.source.states
+    stage.balls = [*stage.balls, ball_ahead(stage.arm, 0.03)]
+    scene = stage.scene()
+    code, _ = stage.judged("--controller", "reach:Reach", mode="closed-loop", scene=scene)
+    python = stage.desk.rows()
+    assert code == 0 and float(python[-1]["position_error"]) < 0.01
+    code, _ = stage.judged("--controller-command", "./reach", "--controller-twice", mode="closed-loop", scene=scene)
+    assert code == 0
+    cpp = stage.desk.rows()
+    assert_same_commands(cpp, python)
+    stage.judged("--controller", "reach:Reach", mode="open-loop", scene=scene)
+    python = stage.desk.rows()
+    stage.judged("--controller-command", "./reach", mode="open-loop", scene=scene)
+    assert_same_commands(stage.desk.rows(), python)
+    assert float(python[0]["v_joint1"]) > 0.1  # it goes along with the log
+
+
+def assert_same_commands(a: list[dict[str, str]], b: list[dict[str, str]]) -> None:
+    assert len(a) == len(b)
+    for name in (f"v_joint{j}" for j in range(1, 8)):
+        assert [float(row[name]) for row in a] == pytest.approx([float(row[name]) for row in b], abs=1e-6)

@@ -1,0 +1,278 @@
+"""What a replay says of the robot it was given, and that the size of its blocks of states changes nothing."""
+
+import json
+import re
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from splatctrl_cli.jobs.replay.inputs import MeasuredRobot, doubts_of, measured_robot
+from splatctrl_cli.jobs.replay.replay import files, state_pass, state_store
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.events import EventFold, EventKind, Signal, events_of
+from splatctrl_cli.control.replay import ReplayTask, closed_loop
+from splatctrl_cli.files import spilled_rows
+from splatctrl_cli.geometry import transform_points
+from splatctrl_cli.recording.log import state_columns
+from splatctrl_cli.records import Float64, JointState, SphereSet
+from splatctrl_cli.robot import self_margins
+from splatctrl_cli.robot.coverage import refined
+from splatctrl_cli.robot.link_meshes import read_solids
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.sphere_files import spheres_yaml
+from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, scene_of, splats_of, write_field, write_scene
+from tests.control.fakes import Balls
+from tests.robot.shapes import arm_of, coverage_deficit, l_shape, written
+
+pytestmark = pytest.mark.usefixtures("unpainted")
+
+SHORT = 0.012  # [m] taken off every radius
+
+
+def shrunk(spheres: SphereSet, links: tuple[str, ...] | None = None) -> SphereSet:
+    """The set with smaller spheres, only those on `links`."""
+    kept = [index for index, link in enumerate(spheres.links) if links is None or link in links]
+    return SphereSet(
+        links=tuple(spheres.links[index] for index in kept),
+        centers=spheres.centers[kept],
+        radii=spheres.radii[kept] - SHORT,
+    )
+
+
+def with_spheres(desk: Desk, spheres: SphereSet) -> Desk:
+    path = desk.folder / "spheres.yaml"
+    path.write_text(spheres_yaml(spheres))
+    desk.robot[-1] = str(path)
+    return desk
+
+
+def about(desk: Desk) -> str:
+    return str(json.loads((desk.folder / "out" / "summary.json").read_text())["about"]["coverage"])
+
+
+def surface_clearance(model: RobotModel, positions: Float64, field: Balls) -> float:
+    """The least distance from points on the collision surface of the links that move, at most 2 cm apart."""
+    least = np.inf
+    for link, solids in read_solids(model.urdf).items():
+        if link != "link0":
+            points = np.concatenate([refined(s.surface.corners, 0.02)[0].reshape(-1, 3)[::3] for s in solids])
+            poses = [model.frame_pose(q, link) for q in positions]
+            least = min(least, *(field.query(transform_points(pose, points))[0].min() for pose in poses))
+    return float(least)
+
+
+def test_a_replay_says_what_the_spheres_leave_uncovered(desk: Desk, arm: RobotModel) -> None:
+    with_spheres(desk, shrunk(arm.sphere_set))
+    assert desk.replay(*scene_of(desk, BALL), "-q") == 0
+    report = coverage_deficit(arm.urdf, shrunk(arm.sphere_set))
+    assert desk.metrics()["coverage_deficit"] == pytest.approx(report.max_deficit, abs=1e-9)
+    assert report.worst is not None and report.worst.link in about(desk)
+    assert f"up to {1e3 * report.worst.deficit.proven:.2f} mm" in about(desk)  # type: ignore[union-attr]
+    assert "where they keep 20 mm the surface keeps" in about(desk)
+
+
+def test_a_link_without_a_sphere_is_named_and_refused_as_a_margin(
+    desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    links = tuple(link for link in dict.fromkeys(arm.sphere_set.links) if link not in ("link0", "link3"))
+    with_spheres(desk, shrunk(arm.sphere_set, links))
+    assert desk.replay("--scene", str(scene), "-q") == 0
+    assert desk.metrics()["coverage_deficit"] is None
+    assert "nothing of link0, link3, which have no sphere" in about(desk)
+    capsys.readouterr()
+    assert desk.replay("--scene", str(scene), "-q", "--force", "--set", "control.coverage=margin") == 4
+    message = capsys.readouterr().err
+    assert "expected spheres on every link that moves, got none on link3\n" in message.replace(";", "\n")
+    assert "splatctrl robot spheres" in message
+
+
+def test_collision_geometry_that_cannot_be_read_is_said_and_refused_as_a_margin(
+    desk: Desk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    urdf = Path(desk.robot[1])
+    lost = desk.folder / "lost.urdf"
+    mesh = '<collision><geometry><mesh filename="package://arm/m.stl"/></geometry></collision>'
+    lost.write_text(urdf.read_text().replace('<link name="link1">', f'<link name="link1">{mesh}', 1))
+    desk.robot[1] = str(lost)
+    assert desk.replay("--scene", str(scene), "-q") == 0
+    assert desk.metrics()["coverage_deficit"] is None
+    assert "is not known" in about(desk) and "package://arm/m.stl" in about(desk)
+    capsys.readouterr()
+    assert desk.replay("--scene", str(scene), "-q", "--force", "--set", "control.coverage=margin") == 4
+    assert "with --packages DIR; or set control.coverage = report" in capsys.readouterr().err
+
+
+def test_with_the_deficit_in_the_rows_the_surface_keeps_the_margin(arm: RobotModel, plain_arm: Path) -> None:
+    spheres = shrunk(arm.sphere_set)
+    model = RobotModel.from_urdf(plain_arm / "tabletop" / "robot.urdf", spheres)
+    model = model.with_coverage(coverage_deficit(model.urdf, spheres))
+    ball, frame = Balls([BALL[0]], [BALL[1]]), model.frame_names[-1]
+    goal = model.frame_pose(START, frame)
+    goal[:3, 3] = np.array(BALL[0]) - [0.02, 0.02, 0.0]
+    task = ReplayTask(start=START, T_world_goal=goal, frame=frame)
+    kept = {}
+    for coverage in ("report", "margin"):
+        config = ControlConfig(coverage=coverage, solver="daqp", max_time=6.0)
+        trace = closed_loop(model, config, task, lambda stamp: ball)
+        kept[coverage] = surface_clearance(model, trace.position[:: len(trace.position) // 4], ball)
+    assert kept["margin"] >= 0.02 - 1e-3
+    assert kept["report"] < 0.02 - 3e-3
+
+
+def test_spheres_that_stick_out_of_a_drawn_link_into_the_margin_are_named(desk: Desk, arm: RobotModel) -> None:
+    drawn, place = desk.folder / "drawn.urdf", arm.frame_pose(START, "hand")
+    trimesh.creation.icosphere(radius=0.01).export(desk.folder / "palm.stl")
+    before, name, after = Path(desk.robot[1]).read_text().partition('<link name="hand">')
+    own, end, rest = after.partition("</link>")
+    own = re.sub("<visual>.*?</visual>", "", own, flags=re.DOTALL)
+    palm = '<visual><geometry><mesh filename="palm.stl"/></geometry></visual>'
+    text = before + name + palm + own + end + rest
+    drawn.write_text(re.sub('velocity="[0-9.]*"', 'velocity="0.001"', text))  # too slow to retreat
+    desk.robot[1] = str(drawn)
+    mine = np.array([link == "hand" for link in arm.sphere_set.links])
+    tips = arm.sphere_set.centers[mine, 2] + arm.sphere_set.radii[mine]
+    ball = (tuple((place @ [*arm.sphere_set.centers[mine][tips.argmax()][:2], tips.max() + 0.06, 1.0])[:3]), 0.05)
+    assert desk.replay(*scene_of(desk, ball), "--mode", "closed-loop", "-q") == 0  # type: ignore[arg-type]
+    told = json.loads((desk.folder / "out" / "summary.json").read_text())["about"]["by_surface"]
+    assert re.fullmatch(r"spheres that keep less than the margin, .* surfaces keep it: [1-9] of hand", told)
+    assert desk.metrics()["num_relaxed"] == 0
+    field = write_field(desk.folder / "field", ball)  # type: ignore[arg-type]
+    assert desk.replay("--field", str(field), "--mode", "closed-loop", "-q", out="grid") == 0
+    assert "by_surface" not in json.loads((desk.folder / "grid" / "summary.json").read_text())["about"]
+
+
+def test_pairs_that_an_srdf_disables_have_no_row(desk: Desk, arm: RobotModel) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    links = [arm.sphere_set.links[s] for s in arm.self_pairs()[0]]
+    srdf = desk.folder / "arm.srdf"
+    srdf.write_text(
+        f'<robot name="arm"><disable_collisions link1="{links[1]}" link2="{links[0]}" reason="Never"/></robot>'
+    )
+    assert desk.replay("--scene", str(scene), "-q") == 0
+    every = desk.metrics()["num_self_pairs"]
+    assert every == len(arm.self_pairs())
+    gone = sum({arm.sphere_set.links[a], arm.sphere_set.links[b]} == set(links) for a, b in arm.self_pairs())
+    assert desk.replay("--scene", str(scene), "-q", "--force", "--srdf", str(srdf)) == 0
+    assert gone > 0 and desk.metrics()["num_self_pairs"] == every - gone
+    assert srdf.name in json.loads((desk.folder / "out" / "run.json").read_text())["inputs"]
+
+
+@pytest.mark.painted
+def test_an_fr3_is_reminded_of_its_limits_by_position(plain_arm: Path, tmp_path: Path) -> None:
+    tabletop, urdf = plain_arm / "tabletop", tmp_path / "fr3.urdf"
+    urdf.write_text((tabletop / "robot.urdf").read_text().replace('joint name="joint', 'joint name="fr3_joint'))
+    model = RobotModel.from_urdf(urdf, tabletop / "robot_spheres.yaml")
+    drive, audit = Namespace(mode="closed-loop"), Namespace(mode="audit")
+    robot = MeasuredRobot(model=model, surfaces=None)
+    (doubt,) = doubts_of(drive, robot, ControlConfig())
+    assert "control.velocity_limits = fr3" in doubt
+    assert (
+        doubts_of(drive, robot, ControlConfig(velocity_limits="fr3"))
+        == doubts_of(audit, robot, ControlConfig())
+        == []
+    )
+
+
+def test_a_margin_that_spheres_cannot_keep_is_lowered_and_said_once(
+    desk: Desk, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(self_margins, "SELF_POSTURES", 100)
+    drive = (*scene_of(desk, BALL), "--force", "--set", "control.solver=daqp", "--set", "control.max_time=0.1")
+    wide = ("--set", "control.self_margin=0.06")
+    for options, said in (("--mode=closed-loop", 0), (("--mode=closed-loop", *wide), 1), (wide, 0)):
+        assert desk.replay(*drive, *([options] if isinstance(options, str) else options)) == 0
+        told = capsys.readouterr()
+        lines = [line for line in (told.out + told.err).splitlines() if "self-collision margin" in line]
+        assert len(lines) == said
+    assert desk.replay(*drive, "--mode=closed-loop", *wide) == 0
+    told = json.loads((desk.folder / "out" / "summary.json").read_text())["about"]["self_margins"]
+    assert told.startswith("self-collision margin: 60 mm, or what spheres can keep: ")
+    assert "link5 and link7" in told and told.endswith("whether links touch is judged by their surfaces")
+
+
+def test_a_replay_finds_the_meshes_of_the_self_mask_where_its_packages_are(tmp_path: Path) -> None:
+    mesh = tmp_path / "elsewhere" / "far" / "ell.stl"
+    mesh.parent.mkdir(parents=True)
+    l_shape().export(mesh)
+    shapes = arm_of('<mesh filename="package://far/ell.stl"/>', '<sphere radius="0.02"/>')
+    urdf = written(tmp_path / "robot", shapes)
+    spheres = SphereSet(links=("base", "tip"), centers=np.zeros((2, 3)), radii=np.full(2, 0.3))
+    file = written(tmp_path, spheres_yaml(spheres, ()), "spheres.yaml")
+    for packages, missing in (((), ("base",)), ((tmp_path / "elsewhere",), ())):
+        request = ReplayRequest(log=tmp_path, out=tmp_path, urdf=urdf, spheres=file, packages=packages)
+        model = RobotModel.from_urdf(urdf, file, packages=packages)
+        assert measured_robot(request, model, ControlConfig()).model.surface.by_spheres == missing
+
+
+FILES = ("steps.csv", "events.json", "summary.json", "states.json")
+
+
+@pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
+@pytest.mark.usefixtures("without_plots")
+def test_blocks_of_any_size_give_the_same_files(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, sample_data: Path, mode: str
+) -> None:
+    move = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    desk.source.states = [
+        JointState(stamp_ns=s.stamp_ns, position=s.position, velocity=move) for s in logged(START + move, num=24)
+    ]
+    near = ((0.45, 0.1, 0.6), 0.05)
+    scene = write_scene(
+        desk.folder / "scene",
+        (SECOND // 5, splats_of(BALL)),
+        (SECOND, splats_of(BALL, near)),
+        (SECOND * 2, splats_of(BALL)),
+    )
+    document = json.loads((sample_data / "tabletop" / "truth.json").read_text())
+    stamps = [state.stamp_ns for state in desk.source.states]
+    document["clearance"] |= {"stamps": stamps, "distance": [0.0] * len(stamps)}
+    (desk.folder / "truth.json").write_text(json.dumps(document))
+    truth = ("--truth", str(desk.folder / "truth.json"))
+    more = {"audit": truth, "open-loop": (), "closed-loop": ("--follow",)}[mode]
+    for num in (1, 7, 10_000):
+        for module in (files, state_pass, state_store, spilled_rows, state_columns):
+            monkeypatch.setattr(module, "BLOCK", num)
+        assert desk.replay("--scene", str(scene), "-q", "--mode", mode, *more, out=str(num)) == 0
+    for file in FILES:
+        whole = (desk.folder / "10000" / file).read_bytes()
+        assert all((desk.folder / out / file).read_bytes() == whole for out in ("1", "7")), file
+
+
+def signals(values: Sequence[float], names: Sequence[str]) -> list[Signal]:
+    value = np.array(values)
+    low = Signal(
+        kind=EventKind.BELOW_MARGIN, is_on=value < 1, value=value, names_at=lambda i: [names[i]], is_high_worse=False
+    )
+    return [low, Signal(kind=EventKind.LIMIT, is_on=value > 2, value=value, names_at=lambda i: [names[i]])]
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5, 12])
+def test_an_event_that_crosses_blocks_is_one(size: int) -> None:
+    values = [0.5, 0.2, 0.9, 0.2, 3.0, 4.0, 4.0, 1.5, 0.1, 5.0, 5.0, 0.3]
+    names = list("abacddefghij")
+    stamps = np.arange(12, dtype=np.int64) * 1_000_000
+    fold = EventFold()
+    for first in range(0, 12, size):
+        part = slice(first, first + size)
+        fold.add(stamps[part], signals(values[part], names[part]))
+    found = fold.events()
+    assert found == events_of(stamps, signals(values, names))
+    first = found[0]
+    assert (first.num_states, first.worst, first.state, first.worst_name) == (4, 0.2, 1, "b")
+    assert first.names == ("a", "b", "c") and [event.num_states for event in found] == [4, 3, 1, 2, 1]
+
+
+def test_stored_objects_are_those_of_a_list_over_the_borders_of_blocks() -> None:
+    stored: state_store.StoredObjects[int] = state_store.StoredObjects()
+    for block in ([0, 1], [], [2, 3, 4], [5]):
+        stored.extend(block)
+    whole = list(range(6))
+    assert list(stored) == whole and stored[-1] == 5 and stored[4:1:-1] == whole[4:1:-1]
+    assert all(stored[i:j] == whole[i:j] for i in range(-7, 8) for j in range(-7, 8))

@@ -1,0 +1,373 @@
+"""Reports and pages in 3-D of runs, scenes, fields and batches; opened in a browser where there is one."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from splatctrl_cli.jobs.compare.compare import CompareRequest, compare
+from splatctrl_cli.jobs.report.report import MOST_SCENES, ViewRequest, WriteReportRequest, view, write_report
+from splatctrl_cli.jobs.report.spaces import space_of
+from splatctrl_cli.jobs.runs.run_folder import open_run
+
+from splatctrl_cli.cli import report as command
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.files.output import part_digests
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.robot.model import RobotModel
+from tests.jobs.runs import Runs, patch_json
+from tests.jobs.stage import passing
+from tests.report.browser import found_on
+
+ARM = "const arm = () => viewer.links.map((link) => link.position.toArray().concat(link.quaternion.toArray()));"
+OPENED = "let viewer; while (!(viewer = document.querySelector('.space')?.viewer)) await wait(50);"
+
+
+def reported(path: Path, **more: Any) -> str:
+    out = path.with_name("page.html")
+    write_report(WriteReportRequest(path=path, out=out, force=True, **more))
+    return out.read_text()
+
+
+def test_a_report_says_the_verdict_first_and_holds_everything_itself(run: Runs) -> None:
+    folder = run()
+    page = reported(folder)
+    sentence = json.loads((folder / "run.json").read_text())["verdict"]["sentence"]
+    body = page[page.index("<body>") :]
+    assert "MARGIN BROKEN" in sentence
+    assert body.index(sentence.split(":")[0]) < body.index("<table") < body.index('<svg class="timeline"')
+    assert "data:image/jpeg;base64," in page
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
+    assert "replay fake.mcap --scene scene" in page
+    assert len(page) < 2_000_000
+
+
+def test_the_scene_of_a_replay_is_the_one_known_at_each_time(run: Runs, arm: RobotModel) -> None:
+    space = space_of(run())
+    assert space.motion is not None
+    assert space.deciding is not None
+    assert space.deciding.sphere is not None
+    assert [len(at.splats) for at in space.splats] == [1, 1, 2, 2, 2]
+    assert [at.time_s for at in space.splats] == [0.0, 0.25, 0.5, 0.75, 1.0]
+    worst = int(np.argmin(space.motion.clearance))
+    np.testing.assert_allclose(space.motion.path[worst], arm.frame_pose(passing()[worst].position, "hand")[:3, 3])
+    gap = np.linalg.norm(space.deciding.sphere[0] - space.deciding.place) - space.deciding.sphere[1]
+    assert gap == pytest.approx(0.012, abs=1e-4)
+
+
+def test_the_slider_moves_the_arm_and_shows_what_was_known_then(run: Runs) -> None:
+    folder = run()
+    reported(folder)
+    script = f"""{OPENED} {ARM}
+      viewer.slider.value = 0; viewer.slider.oninput(); found.first = arm();
+      const shown = () => viewer.sets.map((set) => set.nodes[0].visible);
+      found.early = shown();
+      viewer.slider.value = viewer.slider.max; viewer.slider.oninput(); found.last = arm();
+      found.late = shown(); found.words = viewer.words.textContent;
+      await wait(300); const pixels = new Uint8Array(4 * 90000), gl = viewer.renderer.getContext(); viewer.paint();
+      gl.readPixels(0, 0, 300, 300, gl.RGBA, gl.UNSIGNED_BYTE, pixels); found.shades = new Set(pixels).size;"""
+    found = found_on(folder.with_name("page.html"), script)
+    assert found["complaints"] == []
+    motion = space_of(folder).motion
+    assert motion is not None
+    for shown, poses in ((found["first"], motion.poses[0]), (found["last"], motion.poses[-1])):
+        drawn = [transform_from(link[:3], link[3:]) for link in shown]
+        np.testing.assert_allclose(drawn, poses, atol=2e-4)
+    assert np.abs(np.array(found["first"])[:, :3] - np.array(found["last"])[:, :3]).max() > 0.05
+    assert (found["early"], found["late"]) == ([True, *4 * [False]], [*4 * [False], True])
+    assert found["words"].startswith("1.00 s, ")
+    assert found["shades"] > 10
+
+
+def test_a_click_in_the_timeline_moves_the_arm_and_the_pointer_reads_values(run: Runs) -> None:
+    folder = run(mode="closed-loop")
+    page = reported(folder)
+    assert "QP rung" in page
+    script = f"""{OPENED}
+      const line = document.querySelector(".timeline"), box = line.getBoundingClientRect();
+      const at = {{clientX: box.left + 0.5 * box.width, clientY: box.top + 50, bubbles: true}};
+      line.dispatchEvent(new MouseEvent("click", at));
+      found.state = +viewer.slider.value; found.most = +viewer.slider.max;
+      line.dispatchEvent(new PointerEvent("pointermove", at));
+      found.words = line.parentElement.querySelector(".hover").textContent;"""
+    found = found_on(folder.with_name("page.html"), script)
+    assert found["complaints"] == []
+    assert 0.3 < found["state"] / found["most"] < 0.7
+    assert re.fullmatch(r"\d+\.\d\d s; to the splats -?[\d.]+ mm; the controller's field -?[\d.]+ mm", found["words"])
+
+
+def test_a_moved_scene_is_found_below_root_and_a_changed_robot_is_refused(run: Runs, tmp_path: Path) -> None:
+    folder = run()
+    (tmp_path / "away").mkdir()
+    (tmp_path / "scene").rename(tmp_path / "away" / "scene")
+    assert "the scene scene of its command line is not found" in reported(folder)
+    assert 'data-scene="data-scene"' in reported(folder, roots=(tmp_path / "away",))
+    patch_json(folder / "run.json", lambda found: found | {"inputs": {**found["inputs"], "robot.urdf": "0" * 64}})
+    assert "is not found, or was changed since" in reported(folder, roots=(tmp_path / "away",))
+
+
+def test_texts_of_a_run_are_no_markup(run: Runs) -> None:
+    folder = run()
+    bad = "</script><script>alert(1)</script>"
+    patch_json(folder / "run.json", lambda f: f | {"verdict": {**f["verdict"], "sentence": bad}, "seed": bad})
+    events = folder / "events.json"
+    patch_json(events, lambda f: {"events": [{**event, "kind": bad} for event in f["events"]]})
+    patch_json(folder / "run.json", lambda found: found | {"parts": part_digests(folder)})
+    assert "alert(1)</script>" not in reported(folder)
+
+
+@pytest.mark.parametrize(
+    ("break_it", "words"),
+    [
+        (lambda path: path.rename(path.with_name("audit.partial")), "still writing, or was interrupted"),
+        (lambda path: (path / "run.json").unlink(), "it has no run.json"),
+        (lambda path: (path / "run.json").write_text("[]"), "expected what a command of splatctrl writes"),
+        (
+            lambda path: patch_json(path / "run.json", lambda f: f | {"splatctrl": "99.1"}),
+            "written by splatctrl 99.1",
+        ),
+        (lambda path: (path / "steps.csv").write_text("time_s\n0\n"), "was changed after it was written"),
+    ],
+)
+def test_what_is_no_whole_run_is_refused(run: Runs, break_it: Callable[[Path], None], words: str) -> None:
+    folder = run()
+    break_it(folder)
+    with pytest.raises(InputError, match=words):
+        write_report(WriteReportRequest(path=folder))
+    assert not folder.with_name("audit.html").exists()
+
+
+def test_a_report_is_not_replaced_without_force(run: Runs) -> None:
+    folder = run()
+    made = write_report(WriteReportRequest(path=folder))
+    assert made.file == folder.with_name("audit.html")
+    with pytest.raises(UsageError, match="already exists"):
+        write_report(WriteReportRequest(path=folder))
+
+
+@pytest.fixture
+def batch(run: Runs, tmp_path: Path) -> Path:
+    """Ten recordings with an audit each, of which the third is not as expected, and the fourth has an error."""
+    folder, audit = tmp_path / "batch", run()
+    nodes = []
+    for number in range(10):
+        place = folder / f"rec{number}"
+        place.mkdir(parents=True)
+        (place / "audit.log").write_text(f"a line of {number}\n")
+        node = {"id": f"rec{number}/audit", "recording": f"rec{number}", "job": "audit", "command": "replay"}
+        node |= {"out": f"rec{number}/audit", "log": f"rec{number}/audit.log", "expect": "failed", "new": "later"}
+        node |= {"result": f"rec{number}/audit.json"}
+        if number == 3:
+            nodes.append(node | {"state": "error", "cause": "timed out after 600 s"})
+            continue
+        (place / "audit").mkdir()
+        for file in audit.iterdir():
+            (place / "audit" / file.name).write_bytes(file.read_bytes())
+        verdict = json.loads((audit / "run.json").read_text())["verdict"]
+        node |= {key: verdict[key] for key in ("outcome", "label", "sentence", "exit_code")}
+        state = "failed" if number == 2 else "done"
+        nodes.append(node | {"state": state, "expect": "passed" if number == 2 else "failed"})
+    document = {"format": "splatctrl-batch", "version": 1, "suite": "desk", "jobs": ["audit"], "nodes": nodes}
+    (folder / "batch.json").write_text(json.dumps(document))
+    return folder
+
+
+@pytest.fixture
+def before(batch: Path, tmp_path: Path) -> Path:
+    """The batch as it was before the seventh replay came nearer, and the eighth kept further off."""
+    shutil.copytree(batch, tmp_path / "before")
+    for number, clearance in ((7, -0.9), (8, 0.9)):
+        metrics = {"min_clearance": clearance}
+        patch_json(
+            batch / f"rec{number}/audit/run.json", lambda run, new=metrics: run | {"metrics": run["metrics"] | new}
+        )
+    return tmp_path / "before"
+
+
+def test_a_batch_begins_with_what_is_not_as_expected(batch: Path, before: Path) -> None:
+    page = reported(batch, against=before)
+    sections = re.findall(r'<section id="([^"]+)"', page)
+    assert sections[:3] == ["rec2/audit", "rec3/audit", "rec7/audit"]
+    assert len(sections) == 10
+    assert "2 of 10 jobs not as expected; first rec2/audit: replay: MARGIN BROKEN" in page
+    assert "timed out after 600 s" in page
+    assert "a line of 3" in page
+    assert len(re.findall(r'data-scene="', page)) == MOST_SCENES
+    assert len(re.findall(r'data-scene="', reported(batch, all_scenes=True))) == 9
+    assert page.count("The value of each curve") == 1
+
+
+def test_a_scene_of_a_batch_opens_when_it_is_asked_for_and_closes_the_other(batch: Path) -> None:
+    reported(batch)
+    script = """const buttons = [...document.querySelectorAll("button.open")];
+      const spaces = [...document.querySelectorAll(".space")];
+      for (const k of [0, 1]) { buttons[k].click(); while (!spaces[k].viewer) await wait(50); }
+      found.canvases = spaces.map((space) => space.querySelectorAll("canvas").length);"""
+    found = found_on(batch.with_name("page.html"), script)
+    assert found["complaints"] == []
+    assert found["canvases"] == [0, 1, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"version": 2}, "version 2, this program reads 1"),
+        ({"format": "other"}, "expected what batch writes"),
+        ({"nodes": [3]}, "nodes"),
+    ],
+)
+def test_a_batch_of_another_form_is_refused(batch: Path, change: dict[str, Any], words: str) -> None:
+    patch_json(batch / "batch.json", lambda found: found | change)
+    with pytest.raises(InputError, match=words):
+        write_report(WriteReportRequest(path=batch))
+
+
+def test_a_job_that_leads_out_of_its_batch_is_not_read(batch: Path) -> None:
+    patch_json(batch / "batch.json", lambda f: f | {"nodes": [{**node, "out": "../audit"} for node in f["nodes"]]})
+    assert "expected a path in the batch" in reported(batch)
+
+
+def test_a_report_says_what_changed_since_a_batch_or_a_baseline(batch: Path, before: Path, tmp_path: Path) -> None:
+    for folder in (batch, before):  # as few recordings as are judged one by one
+        patch_json(folder / "batch.json", lambda f: f | {"nodes": [f["nodes"][k] for k in (2, 7, 8)]})
+    patch_json(batch / "batch.json", lambda f: f | {"nodes": [_as_expected(node) for node in f["nodes"]]})
+    page = reported(batch, against=before)
+    table, better = page[page.index("What changed") : page.index("<h2>Recordings")].split("<details>")
+    assert re.findall(r'href="#([^"]+)"', table) == ["rec2/audit", "rec7/audit"]
+    assert "compare: REGRESSION" in table and "min_clearance" in table and "state " in table
+    assert re.findall(r'href="#([^"]+)"', better) == ["rec8/audit"]
+    compare(CompareRequest(runs=(before,), update_baseline=tmp_path / "baseline.toml"))
+    against = reported(batch, against=tmp_path / "baseline.toml")
+    assert re.findall(r'<tr class="failed">.*', against) == re.findall(r'<tr class="failed">.*', page)
+
+
+def test_a_report_says_that_nothing_changed(run: Runs) -> None:
+    folder = run()
+    page = reported(folder, against=folder)
+    start = page.index("What changed")
+    assert "NO REGRESSION" in page[start : start + 200] and page.count("<h2>What changed") == 1
+
+
+def _as_expected(node: dict[str, Any]) -> dict[str, Any]:
+    return node | {"state": "done"} if node["state"] == "failed" else node
+
+
+def test_variants_have_a_column_each_and_what_only_prints_has_no_folder_to_miss(batch: Path) -> None:
+    more = [
+        {
+            "id": f"rec0/drive+rate={rate}",
+            "recording": "rec0",
+            "job": "drive",
+            "state": "skipped",
+            "cause": "needs it",
+        }
+        for rate in (1, 2)
+    ]
+    check = {
+        "id": "rec0/check",
+        "recording": "rec0",
+        "job": "check",
+        "command": "check",
+        "state": "failed",
+        "out": "",
+    }
+    check |= {"outcome": "passed", "label": "passed", "expect": "failed"}
+    patch_json(batch / "batch.json", lambda f: f | {"nodes": [*f["nodes"], *more, check]})
+    page = reported(batch)
+    assert re.findall(r"<th[^>]*>(drive[^<]*)<", page) == ["drive +rate=1", "drive +rate=2"]
+    assert "expected a path in the batch" not in page
+
+
+def test_many_recordings_are_folded_and_an_expected_error_is_said(batch: Path) -> None:
+    refused = {"job": "ingest", "command": "ingest", "state": "done", "label": "exit 4", "expect": "exit 4"}
+    more = [{"id": f"bag{k}/ingest", "recording": f"bag{k}", **refused} for k in range(50)]
+    skipped = {"id": "bag0/scene", "recording": "bag0", "job": "scene", "state": "skipped", "cause": "needs it"}
+    patch_json(batch / "batch.json", lambda f: f | {"nodes": [*f["nodes"], *more, skipped]})
+    page = reported(batch)
+    first, _, rest = page[page.index("<h2>Recordings") :].partition("<summary>20 more recordings</summary>")
+    assert first.count("<tr") == 41 and rest.count(">exit 4, as expected<") == 20
+    assert "bag0/scene" in page and 'id="bag0/scene"' not in page, "what did not run has no section"
+    assert 'href="#bag0/scene"' not in page
+
+
+def test_recordings_as_expected_have_a_picture(batch: Path) -> None:
+    nodes = []
+    for number, (kind, name) in enumerate((("score", "cam3_best_worst"), ("sdf-bake", "slices"))):
+        folder = batch / f"other{number}/job"
+        folder.mkdir(parents=True)
+        cv2.imwrite(str(folder / f"{name}.png"), np.zeros((40, 900, 3), np.uint8))
+        run = {"command": kind, "splatctrl": "0.2.0", "parts": part_digests(folder)}
+        (folder / "run.json").write_text(json.dumps(run))
+        node = {"id": f"other{number}/job", "recording": f"other{number}", "job": "job", "command": kind}
+        nodes.append(node | {"state": "done", "outcome": "passed", "label": "passed", "out": f"other{number}/job"})
+    patch_json(batch / "batch.json", lambda f: f | {"nodes": [*f["nodes"], *nodes]})
+    page = reported(batch)
+    shown = page[page.index("Pictures of other recordings") :]
+    assert re.findall(r"<figcaption>([^:]+):", shown) == ["other0/job", "other1/job"]
+
+
+def test_a_report_against_what_cannot_be_compared_is_refused(run: Runs, batch: Path, tmp_path: Path) -> None:
+    (tmp_path / "other.toml").write_text("a = 1")
+    audit = run(out="audit_2")
+    for before in (batch, tmp_path / "other.toml", tmp_path / "missing.toml"):
+        with pytest.raises(InputError, match=r"expected a|cannot be read"):
+            write_report(WriteReportRequest(path=audit, against=before))
+
+
+def test_a_page_without_webgl_says_so(run: Runs) -> None:
+    folder = run()
+    reported(folder)
+    script = "await wait(1500); found.words = document.querySelector('.space').textContent;"
+    found = found_on(folder.with_name("page.html"), script, "--disable-3d-apis")
+    assert found["words"].startswith("This browser cannot show it in 3-D")
+
+
+def test_scene_splats_and_field_have_pages(run: Runs, tmp_path: Path) -> None:
+    run()
+    scene = view(ViewRequest(path=tmp_path / "scene", out=tmp_path / "scene.html"))
+    assert (scene.num_splats, scene.num_states) == (2, 0)
+    splats = view(ViewRequest(path=tmp_path / "scene" / "splats.ply", out=tmp_path / "ply.html"))
+    assert replace(splats, file=scene.file, bytes=0) == replace(scene, bytes=0, num_unknown=0)
+    assert (
+        main(["sdf-bake", "scene", "-o", "field", "--box=-1.2,-0.2,1.1,-0.8,0.2,1.5", "-q", "--formats", "npz"]) == 0
+    )
+    assert space_of(tmp_path / "field").surface is not None
+    found = found_on(scene.file, f"{OPENED} found.parts = Object.keys(viewer.parts);")
+    assert found == {"parts": ["objects", "grid of 10 cm"], "complaints": []}
+
+
+def test_a_run_without_anything_to_see_is_refused(run: Runs) -> None:
+    folder = run()
+    patch_json(folder / "run.json", lambda found: found | {"command": "score"})
+    with pytest.raises(InputError, match="score leaves nothing to see"):
+        view(ViewRequest(path=folder))
+
+
+def test_a_page_is_opened_only_where_there_is_a_screen(
+    run: Runs, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, opened = run(), []
+    monkeypatch.setattr(command.webbrowser, "open", lambda place: opened.append(place) is None)
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert main(["view", str(folder), "-o", "a.html"]) == 0
+    assert main(["view", str(folder), "-o", "b.html", "--no-open"]) == 0
+    for name in command.SCREENS:
+        monkeypatch.delenv(name, raising=False)
+    assert main(["view", str(folder), "-o", "c.html"]) == 0
+    assert [place.rpartition("/")[2] for place in opened] == ["a.html"]
+    assert "no browser here: open" in capsys.readouterr().err
+
+
+def test_the_command_line_of_a_program_around_it_is_replaced_by_the_batchs(run: Runs) -> None:
+    folder = run()
+    words = tuple(open_run(folder).arguments)
+    patch_json(folder / "run.json", lambda found: found | {"arguments": ["batch", "suite.toml"]})
+    assert replace(open_run(folder), words=words).option("--scene") == "scene"
+    assert open_run(folder).option("--scene") is None

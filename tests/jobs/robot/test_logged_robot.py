@@ -1,0 +1,244 @@
+"""The robot that a log describes itself stands in for --urdf, and a model that differs from it is said."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+from splatctrl_cli.jobs.reconstruct.reconstruct import _robot
+from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.replay.inputs import open_log
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.report.spaces import space_of
+from splatctrl_cli.jobs.robot.logged_robot import differs, logged_urdf, urdf_of
+from tests.jobs.bake.baked import Said
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.jobs.check import CheckRequest, check
+from splatctrl_cli.jobs.ingest import IngestRequest, ingest
+from splatctrl_cli.recording.capture.capture_header import is_capture
+from splatctrl_cli.recording.container.raw_log import RawMessage
+from splatctrl_cli.recording.source import describe, open_source
+from splatctrl_cli.robot.urdf import read_urdf
+from tests.jobs.stage import Stage
+from tests.recording.log.make_log import (
+    START_NS,
+    STORE,
+    LogRecipe,
+    encoded,
+    make_log,
+    messages_of,
+    write_bag,
+    write_raw,
+)
+from tests.recording.log.make_states import joint_state
+from tests.recording.state.test_state_files import lerobot
+from tests.robot.shapes import written
+
+BALL = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
+
+
+def robot(
+    *, shift: float = 0.2, upper: float = 1.0, first: str = "joint_a", shape: str = BALL, root: str = "world"
+) -> str:
+    """Two hinges named as those of `make_log`, in whose world the root is, each link with a ball unless another shape
+    is given.
+    """
+    limit = f'<limit lower="-1" upper="{upper}" velocity="1" effort="1"/>'
+    links = "".join(f'<link name="{name}">{shape}</link>' for name in (root, "arm", "tip"))
+    return f"""<robot name="r">{links}
+<joint name="{first}" type="revolute"><parent link="{root}"/><child link="arm"/><axis xyz="0 1 0"/>{limit}</joint>
+<joint name="joint_b" type="revolute"><parent link="arm"/><child link="tip"/><origin xyz="0 0 {shift}"/>
+<axis xyz="0 1 0"/>{limit}</joint></robot>"""
+
+
+def described(text: str, topic: str = "/robot_description", *, ros: int = 2) -> RawMessage:
+    store = STORE if ros == 2 else get_typestore(Stores.ROS1_NOETIC)
+    return encoded(START_NS, topic, store.types["std_msgs/msg/String"](data=text), store, ros=ros)
+
+
+def as_parameter(text: str, kind: int = 4) -> RawMessage:
+    """As a node says it when it starts (rcl_interfaces)."""
+    T: Any = STORE.types
+    fields: dict[str, Any] = {
+        **{"type": kind, "bool_value": False, "integer_value": 0, "double_value": 0.0, "string_value": text},
+        **dict.fromkeys(["integer_array_value"], np.zeros(0, np.int64)),
+        **{"byte_array_value": np.zeros(0, np.uint8), "double_array_value": np.zeros(0)},
+        **{"bool_array_value": np.zeros(0, bool), "string_array_value": []},
+    }
+    value = T["rcl_interfaces/msg/ParameterValue"](**fields)
+    parameter = T["rcl_interfaces/msg/Parameter"](name="robot_description", value=value)
+    event = T["rcl_interfaces/msg/ParameterEvent"](
+        stamp=T["builtin_interfaces/msg/Time"](sec=1, nanosec=0),
+        node="/robot_state_publisher",
+        new_parameters=[parameter],
+        changed_parameters=[],
+        deleted_parameters=[],
+    )
+    return encoded(START_NS, "/parameter_events", event)
+
+
+def log_with(path: Path, *messages: RawMessage, **recipe: Any) -> Path:
+    """The log of `make_log` behind these messages."""
+    return write_raw(path, [*messages, *messages_of(make_log(path.with_name("plain.mcap"), LogRecipe(**recipe)))])
+
+
+@pytest.mark.parametrize("kind", ["topic", "namespace", "parameter", "ROS 1"])
+def test_a_log_that_describes_its_robot_needs_no_urdf(tmp_path: Path, kind: str) -> None:
+    if kind == "ROS 1":
+        store = get_typestore(Stores.ROS1_NOETIC)
+        state = joint_state(START_NS, ("joint_a", "joint_b"), (0.0, 0.1), store=store)
+        messages = [described(robot(), ros=1), encoded(START_NS, "/joint_states", state, store, ros=1)]
+        path = write_bag(tmp_path / "run.bag", messages, store)
+    else:
+        topic = "/left/robot_description" if kind == "namespace" else "/robot_description"
+        message = as_parameter(robot()) if kind == "parameter" else described(robot(), topic)
+        path = log_with(tmp_path / "run.mcap", message)
+    found = logged_urdf([path])
+    assert found is not None
+    assert found.text == robot()
+    request = ReplayRequest(log=path, out=tmp_path / "out")
+    assert open_log(request)[0].joint_names == ("joint_a", "joint_b")
+
+
+def test_a_log_without_a_description_asks_for_the_urdf(tmp_path: Path) -> None:
+    path = log_with(tmp_path / "run.mcap", as_parameter(robot(), kind=3), described(robot(), "/chatter"))
+    assert logged_urdf([path]) is None
+    with pytest.raises(UsageError, match=r"run.mcap does not describe the robot; give it with --urdf FILE"):
+        open_log(ReplayRequest(log=path, out=tmp_path / "out"))
+
+
+def test_what_holds_states_and_is_no_log_is_replayed_with_the_urdf_that_is_given(tmp_path: Path) -> None:
+    names = ("joint_a", "joint_b")
+    (tmp_path / "x.csv").write_text("t,a,b\n0,0.1,0.2\n0.01,0.1,0.2\n")
+    columns = 'joints = ["joint_a", "joint_b"]\nposition = ["a", "b"]\ntime = "t"\n'
+    (tmp_path / "x.toml").write_text(f'[states]\nfile = "x.csv"\n{columns}')
+    folders = (tmp_path / "x.toml", lerobot(tmp_path / "set", 3, num_episodes=1, names={"motors": list(names)}))
+    for path in folders:
+        request = ReplayRequest(log=path, out=tmp_path / "out", urdf=written(tmp_path, robot()))
+        assert open_log(request)[0].joint_names == names
+
+
+def test_several_robots_in_a_log_ask_for_one_and_one_said_twice_does_not(tmp_path: Path) -> None:
+    twice = log_with(tmp_path / "twice.mcap", described(robot(), "/a/robot_description"), described(robot()))
+    assert logged_urdf([twice]) is not None
+    other = described(robot(shift=0.5), "/b/robot_description")
+    path = log_with(tmp_path / "run.mcap", described(robot(), "/a/robot_description"), other)
+    with pytest.raises(
+        InputError, match=r"2 robots, of /a/robot_description, /b/robot_description; give one of them"
+    ):
+        logged_urdf([path])
+
+
+def test_a_description_that_is_no_urdf_is_named_by_its_topic(tmp_path: Path) -> None:
+    path = log_with(tmp_path / "run.mcap", described("<robot"))
+    with pytest.raises(InputError, match=r"run.mcap/robot_description: expected a URDF, got broken XML"):
+        logged_urdf([path])
+    file = read_urdf(written(tmp_path, robot()))
+    assert "its robot_description cannot be read" in differs(file, [path])
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        (robot(), ""),
+        (robot(shape='<visual><geometry><sphere radius="1"/></geometry></visual>').replace("\n", "\n  "), ""),
+        (robot(shift=0.21), "link tip is 10.0 mm and 0.0 degrees elsewhere in"),
+        (robot(upper=0.9), "joint joint_a: lower, upper and fastest are -1, 1, 1 in"),
+        (robot(first="joint_c"), "has no joint joint_a"),
+        (robot().replace('<axis xyz="0 1 0"/>', '<axis xyz="0 0 1"/>', 1), "degrees elsewhere in"),
+    ],
+    ids=["the same", "other shapes", "a link moved", "a limit", "a joint", "an axis"],
+)
+def test_a_model_of_the_command_line_that_differs_as_a_mechanism_is_said(
+    tmp_path: Path, changed: str, words: str
+) -> None:
+    path, file, said = log_with(tmp_path / "run.mcap", described(changed)), written(tmp_path, robot()), Said()
+    found = urdf_of(file, [path], said)
+    assert found is not None and found.path == file
+    if not words:
+        assert said.lines == []
+        return
+    assert words in said.lines[0]
+    assert said.lines[0].startswith("warning: ")
+    assert said.lines[0].endswith("leave --urdf out to take the log's own, or correct the file")
+    findings = check(CheckRequest(paths=(path,), urdf=file)).report.findings
+    assert [finding.what for finding in findings if finding.code == "robot-model"] == [differs(found, [path])]
+
+
+MESH = '<collision><geometry><mesh filename="package://r/a.stl"/></geometry></collision>'
+
+
+@pytest.mark.parametrize(
+    ("text", "recipe", "words"),
+    [
+        (robot(), {}, ""),
+        (robot(shape=MESH), {}, "; give a spheres YAML file"),
+        (robot(root="base"), {}, "the poses are in the frame 'world', not in that of its root 'base'"),
+        (robot(), {"has_joints": False}, "expected joint states, got none"),
+    ],
+    ids=["it can", "no spheres", "elsewhere", "no states"],
+)
+def test_a_reconstruction_leaves_the_robot_of_the_log_out_where_it_can(
+    tmp_path: Path, text: str, recipe: dict[str, bool], words: str
+) -> None:
+    path, said = log_with(tmp_path / "run.mcap", described(text), **recipe), Said()
+    request = ReconstructRequest(source=open_source(path), out=tmp_path / "scene", recording=path)
+    model = _robot(request, said)
+    assert (model is None) == bool(words)
+    start = "warning: the robot stays in the map: " if words else f"the robot is the log's own: {path}/robot_desc"
+    assert said.lines[0].startswith(start) and words in said.lines[0]
+
+
+def test_a_robot_of_the_log_that_is_asked_for_is_used_or_refused(tmp_path: Path) -> None:
+    spheres = written(tmp_path, "collision_spheres:\n  tip:\n  - center: [0, 0, 0]\n    radius: 0.1\n", "s.yaml")
+    path = log_with(tmp_path / "run.mcap", described(robot(shape=MESH)))
+    request = ReconstructRequest(source=open_source(path), out=tmp_path / "out", recording=path, spheres=spheres)
+    model = _robot(request, Said())
+    assert model is not None and model.sphere_set.links == ("tip",)
+    other = log_with(tmp_path / "other.mcap", described(robot(root="base")))
+    with pytest.raises(InputError, match=r"give --world-frame base, or --urdf where both frames are one"):
+        _robot(replace(request, source=open_source(other), recording=other), Said())
+
+
+def test_a_replay_says_where_it_places_the_robot_of_the_log(tmp_path: Path) -> None:
+    path = log_with(tmp_path / "run.mcap", described(robot(root="base")))
+    request, said = ReplayRequest(log=path, out=tmp_path / "out"), Said()
+    open_log(request, said)
+    assert "placed at the origin: the poses are in the frame 'world'" in said.lines[0]
+    for given in ({"base": (0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)}, {"urdf": written(tmp_path, robot(root="base"))}):
+        open_log(replace(request, **given), told := Said())
+        assert told.lines == []
+
+
+def test_a_replay_keeps_the_robot_of_its_log_for_who_looks_at_it(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    urdf, spheres = stage.desk.robot[1], stage.desk.robot[3]
+    names = tuple(f"joint{i}" for i in range(1, 8))
+    states = [encoded(s.stamp_ns, "/joint_states", joint_state(s.stamp_ns, names, s.position)) for s in stage.states]
+    log = write_raw(stage.desk.folder / "x.mcap", [described(Path(urdf).read_text()), *states])
+    out = stage.desk.folder / "out"
+    words = ["replay", str(log), "--spheres", spheres, "--scene", str(stage.scene()), "-o", str(out), "-q"]
+    monkeypatch.setattr(sys, "argv", ["splatctrl", *words])
+    assert main(words) == 0
+    assert (out / "robot_description.urdf").read_text() == Path(urdf).read_text()
+    log.unlink()
+    assert space_of(out).motion is not None
+
+
+def test_a_capture_keeps_the_description(tmp_path: Path) -> None:
+    path = log_with(tmp_path / "run.mcap", described(robot()))
+    assert describe(path).facts["robot_description"] == ["/robot_description"]
+    capture = ingest(IngestRequest(paths=(path,), out=tmp_path / "run.capture")).capture
+    assert is_capture(capture)
+    assert (capture / "robot_description.urdf").read_text() == robot()
+    found = logged_urdf([capture])
+    assert found is not None and found.text == robot()
+    (capture / "robot_description.urdf").write_text(robot(shift=0.3))
+    with pytest.raises(InputError, match="its checksum differs from SHA256SUMS"):
+        logged_urdf([capture])

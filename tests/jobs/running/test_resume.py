@@ -1,0 +1,268 @@
+"""``splatctrl reconstruct --resume``: whatever stops a run, the rest of it ends in the same bytes."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from splatctrl_cli.formats.scene import scene_writer
+from splatctrl_cli.formats.scene.scene_folder import open_scene
+from splatctrl_cli.jobs.reconstruct import reconstruction
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.scene.fitter import SceneFitter
+from tests.jobs.stopped import contents, failing
+
+DTU = Path(__file__).parents[3] / "sample_data" / "dtu"
+FAST = [
+    *("--max-splats", "600", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4"),
+    *("--set", "scene.refine_iterations=30", "--set", "scene.checkpoint_period=0", "-q"),
+]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recording") / "small"
+    size = ["--duration", "1.2", "--width", "128", "--height", "96", "-q"]
+    assert main(["simulate", "-o", str(folder), *size]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    """What a run that is left alone gives, by input."""
+    found = {}
+    for kind in ("log", "dtu"):
+        out = tmp_path_factory.mktemp("whole") / kind
+        assert main(command(recording, kind, out)) == 0
+        found[kind] = contents(out)
+    return found
+
+
+def command(recording: Path, kind: str, out: Path) -> list[str]:
+    robot = ["--urdf", str(recording / "robot.urdf"), "--spheres", str(recording / "robot_spheres.yaml")]
+    given = {
+        "log": [str(recording / "log.mcap"), "--cameras", "cam0,cam1", *robot],
+        "dtu": ["--dtu", str(DTU), "--holdout", "2,3,4,5,6,7"],
+    }
+    return ["reconstruct", *given[kind], "-o", str(out), *FAST]
+
+
+PLACES = [
+    *(("log", "write_ply", 1), ("log", "write_ply", 4), ("log", "write_states", 5), ("log", "write_occupancy", 1)),
+    *(("log", "savez", 1), ("log", "savez", 2), ("log", "savez", 7)),
+    *(("dtu", "savez", 1), ("dtu", "savez", 4), ("dtu", "write_ply", 1)),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "when"), PLACES)
+def test_a_run_stopped_while_it_writes_goes_on_to_the_same_bytes(
+    recording: Path,
+    whole: dict[str, dict[str, Any]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    kind: str,
+    name: str,
+    when: int,
+) -> None:
+    given = command(recording, kind, tmp_path / "scene")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_writer, name, failing(getattr(scene_writer, name), when, KeyboardInterrupt()))
+        assert main(given) == 130
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    has_checkpoint = (name, when) not in {("write_ply", 1), ("write_states", 1), ("savez", 1)} or (
+        kind == "dtu" and name == "write_ply"
+    )
+    assert ("scene.partial is kept" in err) == has_checkpoint
+    assert not (tmp_path / "scene").exists()
+    assert main([*given, "--resume"]) == 0
+    assert contents(tmp_path / "scene") == whole[kind]
+    assert [p.name for p in tmp_path.iterdir()] == ["scene"]
+
+
+@pytest.mark.parametrize(("default", "budget"), [(600, 600), (500, 2000)])
+def test_a_budget_left_at_its_default_grows_to_what_the_first_frames_show(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, default: int, budget: int
+) -> None:
+    """600 were asked for, or a default of 500 was left alone; four times as many at most. A stopped run keeps it."""
+    monkeypatch.setattr(reconstruction, "SceneConfig", lambda: SceneConfig(max_splats=default + (default == 600)))
+    given = [word if word != "600" else str(default) for word in command(recording, "log", tmp_path / "scene")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_writer, "savez", failing(scene_writer.savez, 2, KeyboardInterrupt()))
+        assert main(given) == 130
+    assert main([*given, "--resume"]) == 0
+    document = json.loads((tmp_path / "scene" / "run.json").read_text())
+    assert document["config"]["scene"]["max_splats"] == budget
+    assert main([*given[: given.index("-o")], "-o", str(tmp_path / "whole"), *FAST[:1], str(default), *FAST[2:]]) == 0
+    assert contents(tmp_path / "scene") == contents(tmp_path / "whole")
+
+
+def test_a_full_disk_is_exit_code_6_and_what_was_written_goes_on(
+    recording: Path, whole: dict[str, dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = command(recording, "log", tmp_path / "scene")
+    full = OSError(28, "No space left on device", str(tmp_path / "scene.partial" / "snapshots" / "000003.ply"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_writer, "write_ply", failing(scene_writer.write_ply, 4, full))
+        assert main(given) == 6
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "000003.ply: writing failed: No space left" in err
+    assert "--resume" in err
+    assert main([*given, "--resume"]) == 0
+    assert contents(tmp_path / "scene") == whole["log"]
+
+
+def test_a_file_size_limit_is_a_full_disk_too(recording: Path, tmp_path: Path) -> None:
+    limited = "import resource, sys; sys.dont_write_bytecode = True; "
+    limited += "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)); "
+    limited += "from splatctrl_cli.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    words = [sys.executable, "-B", "-c", limited, *command(recording, "log", tmp_path / "scene")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 6
+    assert done.stderr.count("\n") == 1
+    assert "writing failed: File too large" in done.stderr
+    assert not list(tmp_path.iterdir())  # no checkpoint was whole
+
+
+# Kills itself within the time step that follows a number of audited ones: from outside, a quick run may end before.
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.scene.fitter import SceneFitter
+audit, num_rows, number, step = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), SceneFitter.step
+def killed(*given):
+    row = step(*given)
+    if audit.is_file() and audit.read_bytes().count(b"\\n") >= num_rows:
+        os.kill(os.getpid(), number)
+    return row
+SceneFitter.step = killed
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.exit(main(sys.argv[4:]))
+"""
+
+
+def test_a_killed_process_goes_on_to_the_same_bytes_with_another_number_of_threads(
+    recording: Path, whole: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    given = command(recording, "log", tmp_path / "scene")
+    audit = str(tmp_path / "scene.partial" / "audit.jsonl")
+    for threads, num_rows, number in (("1", 2, signal.SIGKILL), ("4", 4, signal.SIGTERM), ("2", 5, signal.SIGINT)):
+        words = [sys.executable, "-c", KILLED, audit, str(num_rows), str(int(number)), *given]
+        done = subprocess.run(
+            [*words, "--resume", "--threads", threads], capture_output=True, text=True, check=False, timeout=120
+        )
+        assert done.returncode == (130 if number == signal.SIGINT else -number), done.stderr
+        assert not (tmp_path / "scene").exists()
+    assert main([*given, "--resume"]) == 0
+    assert contents(tmp_path / "scene") == whole["log"]
+
+
+@pytest.fixture(scope="module")
+def stopped(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that stopped in its fourth time step."""
+    out = tmp_path_factory.mktemp("stopped") / "scene"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SceneFitter, "step", failing(SceneFitter.step, 4, KeyboardInterrupt()))
+        assert main(command(recording, "log", out)) == 130
+    return out.with_name("scene.partial")
+
+
+@pytest.fixture
+def interrupted(recording: Path, stopped: Path, tmp_path: Path) -> list[str]:
+    """The command of that run, its folder copied."""
+    shutil.copytree(stopped, tmp_path / "scene.partial")
+    return command(recording, "log", tmp_path / "scene")
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (["--set", "scene.lr_color=0.02"], "scene.lr_color was 0.01, is 0.02"),
+        (["--set", "scene.checkpoint_period=1"], "scene.checkpoint_period was 0.0, is 1.0"),
+        (["--seed", "3"], "--seed was 0, is 3"),
+        (["--cameras", "cam0"], "--cameras was cam0,cam1, is cam0"),
+        (["--box=-1,-1,-1,1,1,1"], "--box was not given"),
+        (["VERSION"], "splatctrl was"),
+        (["LOG"], "sha256 of log.mcap was"),
+        (["URDF"], "--urdf was"),
+    ],
+)
+def test_a_run_goes_on_only_as_what_it_was(
+    recording: Path,
+    interrupted: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    changed: list[str],
+    said: str,
+) -> None:
+    capsys.readouterr()
+    partial = tmp_path / "scene.partial"
+    before = {p: p.read_bytes() for p in partial.rglob("*") if p.is_file()}
+    given = list(interrupted)
+    if changed == ["VERSION"]:
+        monkeypatch.setattr("splatctrl_cli.jobs.running.resume.__version__", "99")
+        changed = []
+    elif changed == ["URDF"]:
+        other = tmp_path / "robot.urdf"
+        other.write_text((recording / "robot.urdf").read_text() + "\n")
+        given[given.index("--urdf") + 1] = str(other)
+        changed = []
+    elif changed == ["LOG"]:
+        assert (
+            main(["simulate", "-o", str(tmp_path / "b"), "--duration", "1", "--width", "64", "--height", "48"]) == 0
+        )
+        given[1], changed = str(tmp_path / "b" / "log.mcap"), []
+        capsys.readouterr()
+    assert main([*given, *changed, "--resume"]) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.count("\n") == 1
+    assert before == {p: p.read_bytes() for p in partial.rglob("*") if p.is_file()}
+
+
+def test_without_resume_a_run_starts_over_and_says_so(
+    interrupted: list[str], whole: dict[str, dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    assert main([word for word in interrupted if word != "-q"]) == 0
+    assert "an interrupted run is replaced" in capsys.readouterr().err
+    assert contents(tmp_path / "scene") == whole["log"]
+
+
+def test_resume_without_anything_to_go_on_from_starts_at_the_beginning(
+    recording: Path, whole: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    given = command(recording, "dtu", tmp_path / "scene")
+    assert main([*given, "--resume"]) == 0
+    assert contents(tmp_path / "scene") == whole["dtu"]
+    assert main([*given, "--resume"]) == 2  # it is whole: nothing is replaced without --force
+
+
+@pytest.mark.parametrize(
+    ("settings", "taken"),
+    [
+        (["scene.snapshot_every=2"], [0, 2, 4]),
+        (["scene.snapshot_period=0.4"], [0, 2, 4]),
+        (["scene.snapshot_period=0.5"], [0, 3, 5]),
+        (["scene.snapshot_period=100"], [0]),
+        (["scene.snapshot_every=3", "scene.snapshot_period=0.3"], [0, 3, 5]),
+    ],
+)
+def test_snapshots_are_taken_by_count_and_by_time(
+    recording: Path, tmp_path: Path, settings: list[str], taken: list[int]
+) -> None:
+    given = [word for setting in settings for word in ("--set", setting)]
+    assert main([*command(recording, "log", tmp_path / "scene"), *given]) == 0
+    scene = open_scene(tmp_path / "scene")
+    rows = [json.loads(line) for line in (tmp_path / "scene" / "audit.jsonl").read_text().splitlines()]
+    assert len(rows) == 6
+    assert [s.stamp_ns for s in scene.snapshots] == [rows[k]["stamp_ns"] for k in taken]
