@@ -8,7 +8,7 @@ raises on valid files without one and yields nothing from a truncated file.
 import struct
 import zlib
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatctrl_cli.formats.unpacking import BadBlockError, Budget, unpacked_start
@@ -71,7 +71,7 @@ def index_by_heads(file: McapFile) -> LogIndex:
                 channel, size = struct.unpack_from("<HI", content)
                 counts[channel] = counts.get(channel, 0) + size // 16
                 offsets = {**chunks[-1].message_index_offsets, channel: offset}
-                chunks[-1] = chunks[-1]._replace(message_index_offsets=offsets)
+                chunks[-1] = replace(chunks[-1], message_index_offsets=offsets)
             elif opcode == MESSAGE:
                 channel, _, stamp, _ = struct.unpack_from("<HIQQ", content)
                 counts[channel] = counts.get(channel, 0) + 1

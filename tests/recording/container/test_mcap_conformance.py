@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from splatctrl_cli.formats.unpacking import unpacked
 
+from splatctrl_cli.formats.unpacking import unpacked
 from splatctrl_cli.recording.container.mcap_file import McapFile
 from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.mcap_records import Chunk, parse_record
@@ -43,7 +43,7 @@ def records_in(chunk: Chunk) -> Iterator[Any]:
 
 def as_json(record: Any) -> dict[str, Any]:
     """A record in the suite's form: numbers as text, bytes as lists of numbers, fields by name."""
-    fields = record._asdict()
+    fields = vars(record)
     return {"type": type(record).__name__, "fields": [[name, _value(fields[name])] for name in sorted(fields)]}
 
 
