@@ -2,6 +2,7 @@
 count.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -48,3 +49,28 @@ class TriangleTree:
             np.ascontiguousarray(radii, np.float64), gap, ball, self._num_threads,
         )  # fmt: skip
         return gap, ball
+
+
+def better(
+    distance: Float64,
+    points: NDArray[np.floating],
+    trees: Sequence[TriangleTree],
+    poses: Sequence[Float64],
+    *,
+    within: NDArray[np.floating] | float,
+    enough: NDArray[np.floating] | float,
+    outside: Bool | None,
+    num_threads: int,
+) -> None:
+    """Lower the signed distance (N,) [m] of points (N, 3) to other surfaces, in place, where triangles are nearer.
+
+    poses: (4, 4), from the frame of the points to that of each tree. Triangles farther than `within` (N,) [m] do not
+    count, nor what is inside of them for points `outside` (N,). Where `enough` (N,) [m] is not negative, a distance
+    becomes any that is on the same side of `enough` and of `within`.
+    """
+    num = len(distance)
+    native.signed_distance(
+        [tree._native for tree in trees], np.array(poses, np.float64).reshape(-1, 4, 4)[:, :3].copy(),
+        np.ascontiguousarray(points, np.float64), np.full(num, within, np.float64), np.full(num, enough, np.float64),
+        np.full(num, 1, np.uint8) if outside is None else (~outside).view(np.uint8), distance, num_threads,
+    )  # fmt: skip

@@ -20,7 +20,7 @@ from splatctrl_cli.kernels.surface_image import (
     SurfaceScene,
     render_surface,
 )
-from splatctrl_cli.kernels.triangles import TriangleTree
+from splatctrl_cli.kernels.triangles import TriangleTree, better
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Intrinsics, SphereSet
 from splatctrl_cli.robot.link_meshes import mesh_path, placed
 from splatctrl_cli.robot.urdf import Shape, UrdfFile, visual_urdf
@@ -218,24 +218,24 @@ class RobotSurface:
         *,
         without: Sequence[str] = (),
         within: NDArray[np.floating] | float = np.inf,
+        enough: NDArray[np.floating] | float = -np.inf,
         outside: Bool | None = None,
         num_threads: int = 1,
     ) -> Float64:
         """Signed distance (Q,) [m] of points (Q, 3) to the nearest solid or triangle, negative inside; to triangles
-        infinite where it is more than `within` (Q,) [m]. The links `without` do not count; points `outside` (Q,) of
-        all triangles are not asked whether they are inside, which takes longest.
+        infinite where it is more than `within` (Q,) [m]. With `enough` (Q,) [m] of at least 0 it is any distance on
+        the same side of both bounds, which is found sooner. The links `without` do not count; points `outside` (Q,)
+        of all triangles are not asked whether they are inside, which takes longest.
         """
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
         counts = np.array([link not in without for link in self.links], bool)
         least = solid_distance(points_world, self._solids(T_solid_world)[counts[self.solid_links]], num_threads)
-        for number, tree in self.trees.items():
-            if counts[number]:
-                points = transform_points(invert_transform(T_world_link[number]), points_world)
-                is_inside = np.ones(len(points), bool) if outside is None else ~outside
-                is_inside[is_inside] = tree.holds(points[is_inside])
-                bound = np.where(is_inside, np.inf, np.minimum(np.maximum(least, 0.0), within))
-                found = tree.closest(points, bound)[0]
-                least = np.minimum(least, np.where(is_inside, -found, found))
+        trees = {number: tree for number, tree in self.trees.items() if counts[number]}
+        poses = [invert_transform(T_world_link[number]) for number in trees]
+        better(
+            least, points_world, list(trees.values()), poses, within=within, enough=enough, outside=outside,
+            num_threads=num_threads,
+        )  # fmt: skip
         return least
 
     def distance_to(self, link: str, points: Float64, outside: Bool | None = None) -> Float64:

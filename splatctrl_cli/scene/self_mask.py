@@ -9,8 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import (
@@ -26,6 +24,7 @@ from splatctrl_cli.config.fixed import (
     VOTE_SHARE,
 )
 from splatctrl_cli.geometry import back_project_pixels, invert_transform, project, transform_points
+from splatctrl_cli.kernels import native
 from splatctrl_cli.records import Bool, Float32, Float64, Index, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.surface_steps import surface_steps
@@ -88,7 +87,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     edge = max(round(frame.intrinsics.width / MASK_EDGE), reach)
     wide = 2 * edge + reach + 1  # pixels, beyond which nothing is explained, doubted or inside
     part = _grown(box, wide + 1, frame.depth.shape)  # one more, where a surface may go on
-    depth, rendered, kinds = frame.depth[part], shown.depth[part], kinds[part]
+    depth, rendered, kinds = np.ascontiguousarray(frame.depth[part]), shown.depth[part], kinds[part]
     link, inside = shown.link[part], shown.inside[part]
     has_depth, is_robot = depth > 0, rendered > 0
     tolerance = tolerance_at(depth, config)
@@ -108,12 +107,16 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
         rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
         sure = tolerance_at(depth[v, u], config, MASK_SURE) + edge * depth[v, u] / np.float32(frame.intrinsics.fx)
         gap = surface.distance(
-            T_world_link, transform_points(frame.T_world_camera, rays), within=sure, outside=~is_behind[v, u]
+            T_world_link,
+            transform_points(frame.T_world_camera, rays),
+            within=sure,
+            enough=tolerance[v, u],
+            outside=~is_behind[v, u],
         )
         is_explained[v, u] = gap <= tolerance[v, u]
         is_sure[v, u] &= gap > sure
     kinds[is_explained] = PixelKind.ROBOT
-    area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0)
+    area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0).astype(np.float64)
     is_object, is_edge = kinds == PixelKind.OBJECT, np.isfinite(nearest_at_edge)
     _judge(kinds, depth, beside, area, surface_steps(is_object, depth, is_edge, edge, tolerance, config.depth_error))
     core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
@@ -139,31 +142,11 @@ def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Flo
     pixels, as far as neither the sensor's error nor the outline accounts for them, is less than `MASK_SPECK`, and
     doubted where it is less than `MASK_ALONE`.
     """
-    is_object = kinds == PixelKind.OBJECT
-    chosen = is_object & beside
-    num = int(np.count_nonzero(chosen))
-    if not num:
-        return
-    number = np.full(depth.shape, -1, np.int32)
-    number[is_object] = num
-    number[chosen] = np.arange(num)
-    first, second = [], []
-    for dv, du in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        a = (slice(0, depth.shape[0] - dv), slice(max(-du, 0), depth.shape[1] - max(du, 0)))
-        b = (slice(dv, depth.shape[0]), slice(max(du, 0), depth.shape[1] + min(du, 0)))
-        is_one = (number[a] >= 0) & (number[b] >= 0) & (chosen[a] | chosen[b])
-        is_one &= np.abs(depth[a] - depth[b]) < np.minimum(steps[a], steps[b])
-        first.append(number[a][is_one])
-        second.append(number[b][is_one])
-    pairs = np.concatenate(first), np.concatenate(second)
-    graph = coo_array((np.ones(len(pairs[0]), bool), pairs), shape=(num + 1, num + 1))
-    piece = connected_components(graph, directed=False)[1]
-    shown = np.bincount(piece[:num], area[chosen], int(piece.max()) + 1)
-    shown[piece[num]] = np.inf  # goes on
-    judged = np.full(len(shown), PixelKind.OBJECT, np.uint8)
-    judged[shown < MASK_ALONE] = PixelKind.DOUBTED
-    judged[shown < MASK_SPECK] = PixelKind.MIXED
-    kinds[chosen] = judged[piece[:num]]
+    is_object, shown = kinds == PixelKind.OBJECT, np.empty(depth.shape)
+    asked = is_object & beside
+    native.piece_areas(depth, steps, area, is_object.view(np.uint8), asked.view(np.uint8), shown)
+    kinds[shown < MASK_ALONE] = PixelKind.DOUBTED
+    kinds[shown < MASK_SPECK] = PixelKind.MIXED
 
 
 def settled(

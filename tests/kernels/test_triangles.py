@@ -6,8 +6,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
-from splatctrl_cli.kernels.triangles import TriangleTree
-from splatctrl_cli.records import Float64
+from splatctrl_cli.kernels.triangles import TriangleTree, better
+from splatctrl_cli.records import Bool, Float64
 from tests.reference.triangles import distance_to_triangles, winding_number
 
 
@@ -62,3 +62,40 @@ def test_nothing_has_no_gap() -> None:
     for corners, balls in ((shell(), np.zeros((0, 3))), (np.zeros((0, 3, 3)), np.zeros((1, 3)))):
         gap, ball = TriangleTree(corners).gaps(pose, balls, np.zeros(len(balls)))
         assert gap[0] == np.inf and ball[0] == -1
+
+
+def placed_shells() -> tuple[list[TriangleTree], list[Float64], Float64, Float64, Float64]:
+    """Two trees, their poses, points (N, 3) about them, and the distance and signed distance (N,) to the nearer."""
+    rng, corners = np.random.default_rng(4), [shell(), 2.0 * shell(40)[::-1]]
+    poses = [pose_at(rng.uniform(-0.2, 0.2, 3), Rotation.random(random_state=rng).as_matrix()) for _ in corners]
+    points = rng.uniform(-0.5, 0.5, (600, 3))
+    away, signed = [], []
+    for T, triangles in zip(poses, corners, strict=True):
+        there = transform_points(T, points)
+        away.append(distance_to_triangles(there, triangles))
+        signed.append(np.where(winding_number(there, triangles) > 0.5, -away[-1], away[-1]))
+    return list(map(TriangleTree, corners)), poses, points, np.min(away, axis=0), np.min(signed, axis=0)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("is_outside", [False, True])
+def test_the_signed_distance_is_that_to_the_nearest_tree_within_reach(threads: int, is_outside: bool) -> None:
+    trees, poses, points, away, signed = placed_shells()
+    expected = away if is_outside else signed
+    outside = np.ones(len(points), bool) if is_outside else None
+    other = np.random.default_rng(5).uniform(-0.1, 0.5, len(points))
+    found = other.copy()
+    better(found, points, trees, poses, within=0.1, enough=-np.inf, outside=outside, num_threads=threads)
+    np.testing.assert_allclose(found, np.where(expected <= 0.1, np.minimum(expected, other), other), atol=1e-12)
+
+
+def test_where_a_distance_is_enough_only_its_class_is_told() -> None:
+    trees, poses, points, _, signed = placed_shells()
+    found = np.full(len(points), np.inf)
+    better(found, points, trees, poses, within=0.1, enough=0.04, outside=None, num_threads=1)
+
+    def classes(distance: Float64) -> tuple[Bool, Bool]:
+        return distance <= 0.04, distance <= 0.1
+
+    np.testing.assert_array_equal(classes(found), classes(signed))
+    assert all(20 < np.count_nonzero(chosen) < len(points) for chosen in (*classes(signed), signed < 0))

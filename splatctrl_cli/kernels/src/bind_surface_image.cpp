@@ -5,6 +5,7 @@
 #include "bind.h"
 #include "points.h"
 #include "surface_image.h"
+#include "surface_pieces.h"
 #include "surface_steps.h"
 
 namespace splatctrl {
@@ -88,6 +89,22 @@ void bind_surface(nb::module_& m) {
       nb::arg("depth").noconvert(), nb::arg("tolerance").noconvert(), nb::arg("support").noconvert(),
       nb::arg("asked").noconvert(), nb::arg("reach"), nb::arg("variance"), nb::arg("residual"),
       nb::arg("steps").noconvert());
+  m.def(
+      "piece_areas",
+      [](const Array<const float, nb::ndim<2>>& depth, const Array<const float>& steps, const Array<const double>& area,
+         const Array<const std::uint8_t>& is_object, const Array<const std::uint8_t>& asked,
+         const Array<double>& total) {
+        const std::size_t size = depth.size();
+        expect(steps.size() == size && area.size() == size && is_object.size() == size && asked.size() == size &&
+                   total.size() == size,
+               "expected images (H, W)");
+        const PieceImage image{depth.data(),     steps.data(), area.data(), is_object.data(), asked.data(),
+                               static_cast<int>(depth.shape(0)), static_cast<int>(depth.shape(1))};
+        const nb::gil_scoped_release release;
+        piece_areas(image, total.data());
+      },
+      nb::arg("depth").noconvert(), nb::arg("steps").noconvert(), nb::arg("area").noconvert(),
+      nb::arg("is_object").noconvert(), nb::arg("asked").noconvert(), nb::arg("total").noconvert());
 }
 
 }  // namespace splatctrl

@@ -1,4 +1,6 @@
 // Trees of triangles: see kernels/triangles.py for shapes.
+#include <nanobind/stl/vector.h>
+
 #include "bind.h"
 #include "triangle_tree.h"
 
@@ -50,6 +52,23 @@ void bind_triangles(nb::module_& m) {
           },
           nb::arg("poses").noconvert(), nb::arg("centers").noconvert(), nb::arg("radii").noconvert(),
           nb::arg("gap").noconvert(), nb::arg("ball").noconvert(), nb::arg("num_threads"));
+  m.def(
+      "signed_distance",
+      [](const std::vector<const TriangleTree*>& trees, const Array<const double>& poses,
+         const Array<const double>& points, const Array<const double>& within, const Array<const double>& enough,
+         const Array<const std::uint8_t>& may_be_inside, const Array<double>& distance, int num_threads) {
+        const std::size_t n = distance.size();
+        expect(poses.size() == 12 * trees.size(), "expected poses (K, 3, 4), one for each tree");
+        expect(points.size() == 3 * n && within.size() == n && enough.size() == n && may_be_inside.size() == n,
+               "expected points (N, 3), within, enough, may_be_inside and distance (N,)");
+        const nb::gil_scoped_release release;
+        signed_distance({trees, poses.data()},
+                        {points.data(), within.data(), enough.data(), may_be_inside.data(), static_cast<int>(n)},
+                        distance.data(), num_threads);
+      },
+      nb::arg("trees"), nb::arg("poses").noconvert(), nb::arg("points").noconvert(), nb::arg("within").noconvert(),
+      nb::arg("enough").noconvert(), nb::arg("may_be_inside").noconvert(), nb::arg("distance").noconvert(),
+      nb::arg("num_threads"));
 }
 
 }  // namespace splatctrl

@@ -9,15 +9,16 @@
 
 #include "parallel.h"
 #include "points.h"
+#include "simd.h"
 #include "voxel_grid.h"
 
 namespace splatctrl {
 namespace {
 
-constexpr int kLeaf = 8;        // triangles that are not split further
 constexpr int kDepth = 64;      // of the tree
-constexpr int kQueries = 256;   // of a chunk
+constexpr double kRounding = 1e-9;  // [m] that a box seems farther off at most
 constexpr double kFarOff = 2.3;  // radii of a node, beyond which it is one dipole
+constexpr double kInside = 0.5;  // of a winding number, from which a point is inside
 constexpr double kPi = 3.14159265358979323846;
 
 inline double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
@@ -66,6 +67,9 @@ void nearest_shares(const double* corner, const double* p, double* shares) {
   set(va / total, vb / total, vc / total);
 }
 
+// No less than any number whose root is at most `root`.
+inline double square_above(double root) { return root * root * (1 + 1e-12); }
+
 // The solid angle of a triangle over 4 pi (van Oosterom, Strackee, 1983).
 double solid_angle(const double* corner, const double* p) {
   double v[3][3], turned[3], length[3];
@@ -88,6 +92,22 @@ TriangleTree::TriangleTree(const double* corners, int num) : order_(num) {
   for (const int face : order_) {
     const double* corner = corners + 9 * static_cast<std::size_t>(face);
     corners_.insert(corners_.end(), corner, corner + 9);
+    for (int k = 0; k < 9; ++k) farthest_ = std::max(farthest_, std::fabs(corner[k]));
+  }
+  for (Node& node : nodes_) {
+    if (node.second != 0) continue;
+    node.leaf = static_cast<int>(leaves_.size());
+    Leaf leaf;
+    for (int k = 0; k < 3; ++k) {
+      std::fill_n(leaf.low[k], kLeaf, std::numeric_limits<float>::infinity());
+      std::fill_n(leaf.high[k], kLeaf, -std::numeric_limits<float>::infinity());
+      for (int i = node.first; i < node.last; ++i) {
+        const double* c = corners_.data() + 9 * static_cast<std::size_t>(i) + k;
+        leaf.low[k][i - node.first] = static_cast<float>(std::min({c[0], c[3], c[6]}));
+        leaf.high[k][i - node.first] = static_cast<float>(std::max({c[0], c[3], c[6]}));
+      }
+    }
+    leaves_.push_back(leaf);
   }
 }
 
@@ -154,42 +174,92 @@ double TriangleTree::depth_in(const Node& node, const double* p) const {
 double TriangleTree::box_squared(const Node& node, const double* p) const {
   double squared = 0.0;
   for (int k = 0; k < 3; ++k) {
-    const double beyond = std::max({node.low[k] - p[k], p[k] - node.high[k], 0.0});
+    const double below = node.low[k] - p[k], above = p[k] - node.high[k], most = below > above ? below : above;
+    const double beyond = most > 0.0 ? most : 0.0;
     squared += beyond * beyond;
   }
   return squared;
 }
 
-// Betters `best` by what is nearer; of equals, the triangle with the least number.
-void TriangleTree::look(const double* p, Hit& best) const {
-  if (nodes_.empty()) return;
-  std::pair<double, int> waiting[kDepth];
+// Betters `best` by a leaf's triangles, without those whose boxes are farther off.
+void TriangleTree::look_in(const Node& node, const double* p, Hit& best) const {
+  const Leaf& leaf = leaves_[node.leaf];
+  const double reach = std::max({std::fabs(p[0]), std::fabs(p[1]), std::fabs(p[2]), farthest_});
+  const Float8 rounding = splat8(static_cast<float>(4e-7 * reach));
+  Float8 squared = splat8(0.0f);
+  for (int k = 0; k < 3; ++k) {
+    const Float8 at = splat8(static_cast<float>(p[k]));
+    const Float8 beyond = max8(load8(leaf.low[k]) - at, at - load8(leaf.high[k])) - rounding;
+    squared += max8(beyond, splat8(0.0f)) * max8(beyond, splat8(0.0f));
+  }
+  const unsigned far = signs8(squared > static_cast<float>(best.squared * 1.000002));
+  unsigned near = ~far & ((1u << (node.last - node.first)) - 1);
+  for (; near != 0; near &= near - 1) {
+    const int i = node.first + __builtin_ctz(near);
+    const double* corner = corners_.data() + 9 * static_cast<std::size_t>(i);
+    double shares[3], away[3];
+    nearest_shares(corner, p, shares);
+    for (int k = 0; k < 3; ++k) {
+      away[k] = p[k] - (shares[0] * corner[k] + shares[1] * corner[3 + k] + shares[2] * corner[6 + k]);
+    }
+    const double found = dot(away, away);
+    if (found < best.squared || (found == best.squared && (best.face < 0 || order_[i] < best.face))) {
+      best = {found, order_[i], {shares[0], shares[1], shares[2]}, best.leaf};
+    }
+  }
+}
+
+// Betters `best` by what is nearer; of equals, the triangle with the least number. Where `enough` is not negative, the
+// first triangle does, but one within `enough` is looked for. The leaf of `best` is looked at first.
+void TriangleTree::look(const double* p, Hit& best, double enough) const {
+  if (nodes_.empty() || box_squared(nodes_[0], p) > best.squared) return;
+  double most = best.squared;
+  const auto is_found_in = [&](int leaf) {
+    const int before = best.face;
+    look_in(nodes_[leaf], p, best);
+    if (best.face != before) best.leaf = leaf;
+    const bool is_any = enough >= 0.0 && best.face >= 0;
+    most = is_any ? square_above(enough) : best.squared;
+    return is_any && std::sqrt(best.squared) <= enough;
+  };
+  if (best.leaf >= 0 && is_found_in(best.leaf)) return;
+  struct {
+    double squared;
+    int number;
+  } waiting[kDepth];  // not filled with zeros
   int num = 0;
-  waiting[num++] = {box_squared(nodes_[0], p), 0};
+  waiting[num++] = {0.0, 0};
   while (num > 0) {
-    const auto [squared, number] = waiting[--num];
-    if (squared > best.squared) continue;
-    const Node& node = nodes_[number];
-    if (node.second == 0) {
-      for (int i = node.first; i < node.last; ++i) {
-        const double* corner = corners_.data() + 9 * static_cast<std::size_t>(i);
-        double shares[3], away[3];
-        nearest_shares(corner, p, shares);
-        for (int k = 0; k < 3; ++k) {
-          away[k] = p[k] - (shares[0] * corner[k] + shares[1] * corner[3 + k] + shares[2] * corner[6 + k]);
-        }
-        const double found = dot(away, away);
-        if (found < best.squared || (found == best.squared && (best.face < 0 || order_[i] < best.face))) {
-          best = {found, order_[i], {shares[0], shares[1], shares[2]}};
-        }
-      }
+    const int number = waiting[--num].number;
+    if (waiting[num].squared > most) continue;
+    const int second = nodes_[number].second;
+    if (second == 0) {
+      if (is_found_in(number)) return;
       continue;
     }
-    const double one = box_squared(nodes_[number + 1], p), other = box_squared(nodes_[node.second], p);
+    const double one = box_squared(nodes_[number + 1], p), other = box_squared(nodes_[second], p);
     const bool is_first = one <= other;  // the nearer is looked at first: it is put last
-    waiting[num++] = is_first ? std::pair{other, node.second} : std::pair{one, number + 1};
-    waiting[num++] = is_first ? std::pair{one, number + 1} : std::pair{other, node.second};
+    if (is_first && other <= most) waiting[num++] = {other, second};
+    if (one <= most) waiting[num++] = {one, number + 1};
+    if (!is_first && other <= most) waiting[num++] = {other, second};
   }
+}
+
+double TriangleTree::nearer(const double* p, double least, double within, double enough, bool may_be_inside,
+                            int& leaf) const {
+  constexpr double kFar = std::numeric_limits<double>::infinity();
+  const double bound = enough >= 0.0 && least <= within ? enough : std::min(std::max(least, 0.0), within);
+  Hit best{bound * bound, -1, {0, 0, 0}, leaf};
+  look(p, best, enough);
+  leaf = best.leaf;
+  const double found = best.face < 0 ? kFar : std::sqrt(best.squared);
+  if (found <= enough || !may_be_inside || !(surrounds(p) > kInside)) return std::min(least, found);
+  if (enough >= 0.0) return std::min(least, enough);
+  if (best.face < 0) {
+    best.squared = kFar;
+    look(p, best);
+  }
+  return std::min(least, -std::sqrt(best.squared));
 }
 
 double TriangleTree::surrounds(const double* p) const {
@@ -221,7 +291,7 @@ void TriangleTree::closest(const double* points, int num_points, const double* b
                            std::int64_t* face, double* shares, int num_threads) const {
   parallel_for(parts(num_points, kQueries), num_threads, [&](int chunk) {
     for (int i = chunk * kQueries; i < std::min(num_points, (chunk + 1) * kQueries); ++i) {
-      Hit best{bound[i] * bound[i], -1, {0, 0, 0}};
+      Hit best{bound[i] * bound[i], -1, {0, 0, 0}, -1};
       look(points + 3 * static_cast<std::size_t>(i), best);
       distance[i] = best.face < 0 ? std::numeric_limits<double>::infinity() : std::sqrt(best.squared);
       face[i] = best.face;
@@ -264,9 +334,9 @@ void TriangleTree::gaps(const double* poses, int num_poses, const double* center
     ball[at] = -1;
     const auto ask = [&](const Ball& one) {
       const double radius = radii[one.which];
-      const bool is_inside = one.may_be_inside && surrounds(one.p) > 0.5;
+      const bool is_inside = one.may_be_inside && surrounds(one.p) > kInside;
       const double most = is_inside ? kFar : gap[at] + radius;
-      Hit best{most < 0 ? -1.0 : most * most, -1, {0, 0, 0}};
+      Hit best{most < 0 ? -1.0 : most * most, -1, {0, 0, 0}, -1};
       look(one.p, best);
       if (best.face < 0) return;
       const double found = (is_inside ? -1 : 1) * std::sqrt(best.squared) - radius;
@@ -286,6 +356,54 @@ void TriangleTree::gaps(const double* poses, int num_poses, const double* center
     for (const Ball& one : near) {
       if (one.least >= gap[at]) break;
       ask(one);
+    }
+  });
+}
+
+void TriangleTree::are_near(const double (*points)[kQueries], int num, const double* pose, const double* within,
+                            std::uint8_t* out) const {
+  if (nodes_.empty()) return;
+  const Node& all = nodes_[0];
+  for (int i = 0; i < num; ++i) {
+    double squared = 0.0;
+    for (int k = 0; k < 3; ++k) {
+      const double* T = pose + 4 * k;
+      const double at = T[0] * points[0][i] + T[1] * points[1][i] + T[2] * points[2][i] + T[3];
+      const double below = all.low[k] - at, above = at - all.high[k], most = below > above ? below : above;
+      const double beyond = most > kRounding ? most - kRounding : 0.0;
+      squared += beyond * beyond;
+    }
+    out[i] = squared <= within[i] * within[i];
+  }
+}
+
+void signed_distance(const PlacedTrees& placed, const AskedPoints& asked, double* distance, int num_threads) {
+  const std::size_t num = placed.trees.size();
+  parallel_for(parts(asked.num, kQueries), num_threads, [&](int chunk) {
+    const int begin = chunk * kQueries, size = std::min(asked.num - begin, kQueries);
+    double points[3][kQueries];
+    for (int i = 0; i < size; ++i) {
+      for (int k = 0; k < 3; ++k) points[k][i] = asked.points[3 * static_cast<std::size_t>(begin + i) + k];
+    }
+    std::vector<std::uint8_t> is_near(num * kQueries, 0);
+    for (std::size_t k = 0; k < num; ++k) {
+      placed.trees[k]->are_near(points, size, placed.poses + 12 * k, asked.within + begin, &is_near[k * kQueries]);
+    }
+    std::vector<int> leaves(num, -1);  // where the point before had its nearest triangle
+    std::size_t nearest = 0;           // and of which tree
+    for (int i = begin; i < begin + size; ++i) {
+      std::size_t k = nearest;
+      for (std::size_t n = 0; n < num && !(distance[i] <= asked.enough[i]); ++n, k = k + 1 < num ? k + 1 : 0) {
+        if (!is_near[k * kQueries + i - begin]) continue;
+        const double* T = placed.poses + 12 * k;
+        const double R[9] = {T[0], T[1], T[2], T[4], T[5], T[6], T[8], T[9], T[10]}, t[3] = {T[3], T[7], T[11]};
+        double p[3];
+        moved(R, t, asked.points + 3 * static_cast<std::size_t>(i), p);
+        const double found = placed.trees[k]->nearer(p, distance[i], asked.within[i], asked.enough[i],
+                                                     asked.may_be_inside[i] != 0, leaves[k]);
+        if (found < distance[i]) nearest = k;
+        distance[i] = found;
+      }
     }
   });
 }
