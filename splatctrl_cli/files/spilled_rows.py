@@ -36,6 +36,7 @@ class RowFile:
         self.row_shape = shape
         self._row_bytes = 8 * int(np.prod(shape, dtype=np.int64))
         self._num = 0
+        self._waiting: list[bytes] = []  # rows that are not in the file yet
         self._file = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
         weakref.finalize(self, self._file.close)
         for block in blocks:
@@ -49,16 +50,24 @@ class RowFile:
         block = np.ascontiguousarray(rows, dtype=np.float64)
         if block.shape[1:] != self.row_shape:
             raise ValueError(f"rows: expected {self.row_shape}, got {block.shape[1:]}")
-        self._file.seek(self._num * self._row_bytes)
-        self._file.write(block.tobytes())
+        self._waiting.append(block.tobytes())
         self._num += len(block)
+        if len(block) > 1 or len(self._waiting) == BLOCK:
+            self._flush()
 
     def read(self, first: int, last: int) -> Float64:
         """Rows (last - first, ...)."""
+        self._flush()
         num = max(min(last, self._num) - first, 0)
         self._file.seek(first * self._row_bytes)
         content = bytearray(self._file.read(num * self._row_bytes))
         return np.frombuffer(content, dtype=np.float64).reshape(num, *self.row_shape)
+
+    def _flush(self) -> None:
+        if self._waiting:
+            self._file.seek(0, os.SEEK_END)
+            self._file.write(b"".join(self._waiting))
+            self._waiting = []
 
     def take(self, index: Index) -> Float64:
         """The rows of an index (T,), in its order."""

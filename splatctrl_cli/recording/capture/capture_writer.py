@@ -21,7 +21,6 @@ from numpy.lib import format as npy
 from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
 from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.files.output import sha256, write_json
-from splatctrl_cli.files.spilled_rows import Table, blocks_of
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.recording.capture.capture_header import COLUMNS, FORMAT, MASKS, ROBOT, VERSION, Checksums
 from splatctrl_cli.recording.log.messages import metres
@@ -32,6 +31,7 @@ from splatctrl_cli.recording.log.stored_frame import (
     JointTopics,
     StoredFrame,
     is_png,
+    write_rows,
     write_topics,
 )
 from splatctrl_cli.records import Float32, JointState, LossReport
@@ -351,21 +351,9 @@ def _npy(depth: Float32) -> bytes:
 
 def _write_joints(path: Path, states: StateColumns) -> None:
     """joints.npz as numpy.savez would write it, a block at a time."""
-    columns: dict[str, Table | None] = {
-        "position": states.position,
-        "velocity": states.velocity,
-        "commanded_velocity": states.commanded_velocity,
-        "T_base_ee": states.T_base_ee,
-        "T_world_ee": states.T_world_ee,
-    }
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         with archive.open("stamp_ns.npy", "w", force_zip64=True) as stream:
             npy.write_array(stream, states.stamp_ns, allow_pickle=False)
-        for name, rows in columns.items():
-            if rows is None:
-                continue
+        for name, rows in states.tables().items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
-                header = {"descr": "<f8", "fortran_order": False, "shape": tuple(rows.shape)}
-                npy.write_array_header_1_0(stream, header)
-                for block in blocks_of(rows):
-                    stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())
+                write_rows(stream, rows)

@@ -5,14 +5,12 @@ The plan takes some fifty bytes of memory a frame.
 
 import tempfile
 import weakref
-from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, scratch_folder
+from splatctrl_cli.files.spilled_rows import RowFile, scratch_folder
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.recording.log.rig import Camera
 from splatctrl_cli.records import Float64, Index
@@ -45,7 +43,7 @@ class FramePlan:
     def __init__(self, cameras: Sequence[Camera]) -> None:
         self._cameras = tuple(sorted(cameras, key=lambda camera: camera.name))
         self._columns = np.zeros((6, 0), dtype=np.int64)  # stamp, camera, colour, depth and mask number, row of pose
-        self._poses = RowFile((3, 4))
+        self._poses = RowFile((4, 4))
 
     def __len__(self) -> int:
         return self._columns.shape[1]
@@ -61,7 +59,7 @@ class FramePlan:
             color_index=color,
             depth_index=depth,
             human_index=None if human == NO_MASK else human,
-            T_world_camera=np.vstack([self._poses.read(row, row + 1)[0], [[0.0, 0.0, 0.0, 1.0]]]),
+            T_world_camera=self._poses.read(row, row + 1)[0],
         )
 
     def add(
@@ -75,7 +73,7 @@ class FramePlan:
     ) -> int:
         """Take those frames (K,) of a camera whose pose (4, 4) is known, masks by colour number; returns how many."""
         first = len(self._poses)
-        is_known = self._written(poses)
+        is_known = np.fromiter(map(self._keep, poses), np.bool_, len(stamp_ns))
         number = self._cameras.index(camera)
         human = np.array([masks.get(index, NO_MASK) for index in color[is_known].tolist()], dtype=np.int64)
         num = int(is_known.sum())
@@ -85,19 +83,11 @@ class FramePlan:
         self._columns = columns[:, np.lexsort((columns[2], columns[1], columns[0]))]
         return num
 
-    def _written(self, poses: Iterable[Float64 | None]) -> NDArray[np.bool_]:
-        """Write the poses that are known; which these are (K,)."""
-        is_known, waiting = array("b"), []
-        for T in poses:
-            is_known.append(T is not None)
-            if T is not None:
-                waiting.append(T[:3])
-            if len(waiting) == BLOCK:
-                self._poses.append(np.array(waiting))
-                waiting = []
-        if waiting:
-            self._poses.append(np.array(waiting))
-        return np.array(is_known, dtype=np.bool_)
+    def _keep(self, T: Float64 | None) -> bool:
+        """Write a pose where it is known; whether it is."""
+        if T is not None:
+            self._poses.append(T[None])
+        return T is not None
 
     def uses(self) -> dict[str, Index]:
         """How many frames need each image, by topic and number."""

@@ -19,7 +19,7 @@ from splatctrl_cli.config.fixed import (
     WIDEST_RAY,
 )
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.spilled_rows import BLOCK, RowFile
+from splatctrl_cli.files.spilled_rows import RowFile
 from splatctrl_cli.geometry import (
     back_project,
     interpolate_transform,
@@ -31,32 +31,10 @@ from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS
 from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
 
 
-class _Transforms:
-    """Transforms by number, most of them in a file without a name."""
-
-    def __init__(self) -> None:
-        self._file = RowFile((3, 4))
-        self._waiting: list[Float64] = []
-
-    def add(self, T: Float64) -> int:
-        """Keep one; its number."""
-        self._waiting.append(T[:3])
-        if len(self._waiting) == BLOCK:
-            self._file.append(np.array(self._waiting))
-            self._waiting = []
-        return len(self._file) + len(self._waiting) - 1
-
-    def __getitem__(self, number: int) -> Float64:
-        waiting = number - len(self._file)
-        T = np.eye(4)
-        T[:3] = self._waiting[waiting] if waiting >= 0 else self._file.read(number, number + 1)[0]
-        return T
-
-
 class _Edge:
-    """T_parent_child over time, in `transforms` by number."""
+    """T_parent_child over time, its rows (4, 4) in `transforms` by number."""
 
-    def __init__(self, parent: str, transforms: _Transforms) -> None:
+    def __init__(self, parent: str, transforms: RowFile) -> None:
         self.parent = parent
         self.stamps, self.numbers = array("q"), array("q")
         self.static: dict[int, Float64] = {}  # by the stamp [ns] from which on each holds, ascending
@@ -67,7 +45,8 @@ class _Edge:
     def add(self, stamp_ns: int, T: Float64) -> None:
         self._is_sorted = self._is_sorted and (not self.stamps or stamp_ns >= self.stamps[-1])
         self.stamps.append(stamp_ns)
-        self.numbers.append(self._transforms.add(T))
+        self.numbers.append(len(self._transforms))
+        self._transforms.append(T[None])
 
     def at(self, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
         if self.static:
@@ -90,7 +69,8 @@ class _Edge:
         return interpolate_transform(T_before, T_after, (stamp_ns - self.stamps[after - 1]) / gap)
 
     def _at(self, sample: int) -> Float64:
-        return self._transforms[self.numbers[sample]]
+        number = self.numbers[sample]
+        return self._transforms.read(number, number + 1)[0]
 
     def _sort(self) -> None:
         if not self._is_sorted:
@@ -110,7 +90,7 @@ class TfTree:
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
-        self._transforms = _Transforms()
+        self._transforms = RowFile((4, 4))
         self.notes: list[str] = []
 
     def add(

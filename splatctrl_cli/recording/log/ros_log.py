@@ -18,15 +18,16 @@ from splatctrl_cli.recording.log.decoder import MessageDecoder, UndecodableMessa
 from splatctrl_cli.recording.log.frame_plan import FramePlan, Planned, PlannedImages
 from splatctrl_cli.recording.log.messages import ImageMessage, color_of, depth_of, num_invalid, read_image
 from splatctrl_cli.recording.log.rig import Camera, build_cameras, nearest_gap_ns
+from splatctrl_cli.recording.log.state_messages import STATE_TYPES
 from splatctrl_cli.recording.log.state_topics import joint_records
 from splatctrl_cli.recording.log.stored_frame import (
+    JointTopics,
     StoredFrame,
     check_depth,
     decoded,
     human_mask,
     is_kept,
     is_png,
-    topics_of,
     with_joints,
 )
 from splatctrl_cli.recording.log.survey import Survey, dropped, first_of_each, pair_by_stamp, paired, survey
@@ -62,7 +63,8 @@ class RosLogSource:
         self.world_frame = self._rig[0].world_frame
         loss, first_note = LossReport(), len(self._loss.notes)
         self.joint_names, self.states = joint_records(found, options, loss, joints)
-        self.joint_topics = topics_of(found, loss, first_note, options)
+        topics = found.of_type(*STATE_TYPES)
+        self.joint_topics = JointTopics(topics=topics, loss=loss, first_note=first_note, chosen=options.joint_topic)
         self._loss = with_joints(self._loss, loss, first_note)
         self._plan = self._planned(found)
         self._passes = [_Pass()]

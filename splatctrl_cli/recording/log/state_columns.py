@@ -1,9 +1,8 @@
 """Cleaned joint states as columns that memory need not hold, and as the states they are."""
 
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Self, overload
 
 import numpy as np
@@ -90,11 +89,11 @@ class StateColumns(Sequence[JointState]):
 
     def select(self, index: Index) -> Self:
         """The states of an index (K,), in its order."""
-        return replace(self, stamp_ns=self.stamp_ns[index], **self._each(partial(selected, index=index), COLUMNS))
+        return self._changed(lambda table, _: selected(table, index), COLUMNS, stamp_ns=self.stamp_ns[index])
 
     def of_joints(self, order: Index) -> Self:
         """The joints of an order (J,)."""
-        return replace(self, **self._each(partial(of_columns, order=order), OF_JOINTS))
+        return self._changed(lambda table, _: of_columns(table, order), OF_JOINTS)
 
     def of_log(self, order: Index, factor: Float64, offset: Float64) -> Self:
         """Joints (J,) each of which moves as a column: ``position[order] * factor + offset``."""
@@ -106,13 +105,16 @@ class StateColumns(Sequence[JointState]):
             shift = offset if name == "position" else 0.0
             return Rows(RowFile((len(order),), (block * factor + shift for block in blocks_of(table))))
 
-        tables = {name: getattr(plain, name) for name in OF_JOINTS}
-        changed: dict[str, Any] = {name: moved(table, name) for name, table in tables.items() if table is not None}
-        return replace(plain, **changed)
+        return plain._changed(moved, OF_JOINTS)
 
-    def _each(self, change: Callable[[Table], Table], names: Iterable[str]) -> dict[str, Any]:
-        """What becomes of those columns that there are."""
-        return {name: change(table) for name in names if (table := getattr(self, name)) is not None}
+    def tables(self) -> dict[str, Table]:
+        """Those columns of `COLUMNS` that there are."""
+        return {name: table for name in COLUMNS if (table := getattr(self, name)) is not None}
+
+    def _changed(self, change: Callable[[Table, str], Table], names: Collection[str], **others: Any) -> Self:
+        """With what `change` makes of the named columns that there are."""
+        changed = {name: change(table, name) for name, table in self.tables().items() if name in names}
+        return replace(self, **others, **changed)
 
 
 NO_STATES = StateColumns(stamp_ns=np.zeros(0, np.int64), position=np.zeros((0, 0)), velocity=np.zeros((0, 0)))

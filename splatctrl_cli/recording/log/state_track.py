@@ -151,19 +151,6 @@ class RawTrack(StateColumns):
         return replace(self.of_joints(order), names=tuple(names))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Velocities:
-    """What is known of T velocities: is_missing, is_zero (J,) for joints that have none, or that move at zero;
-    num_missing: states without one of a joint, num_taken: states in which one has to be taken from the positions.
-    """
-
-    is_missing: Bool
-    is_all_missing: bool
-    is_zero: Bool
-    num_missing: int
-    num_taken: int
-
-
 def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
     """The states by stamp, each stamp once, each with velocities; every change is noted in `loss`.
 
@@ -256,21 +243,22 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
 
 def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
     """velocity (T, J) with what is missing taken from the positions."""
-    found = _looked_at(raw)
-    if not found.num_taken:
+    num_taken, is_zero, why = _missing_velocities(raw)
+    if not num_taken:
         thinned = raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // fixed.STATES_COMPARED))
         _compare_units(thinned, loss)
         return raw.velocity
-    loss.differentiated_velocities += found.num_taken
-    loss.notes.append(f"{raw.where}: {_reason(raw, found)}; they are differences of the positions")
+    loss.differentiated_velocities += num_taken
+    loss.notes.append(f"{raw.where}: {why}; they are differences of the positions")
     whole = RowFile(raw.velocity.shape[1:])
     for first, slopes in slopes_by_block(raw.stamp_ns, raw.position):
         logged = raw.velocity[first : first + len(slopes)]
-        whole.append(np.where(~np.isfinite(logged) | found.is_zero, slopes, logged))
+        whole.append(np.where(~np.isfinite(logged) | is_zero, slopes, logged))
     return Rows(whole)
 
 
-def _looked_at(raw: RawTrack) -> _Velocities:
+def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
+    """How many states have a velocity that the positions have to give, joints (J,) that move at zero, and why."""
     num, num_joints = raw.position.shape[:2]
     low, high = np.full(num_joints, np.inf), np.full(num_joints, -np.inf)
     is_still, is_missing, is_there = (np.full(num_joints, first) for first in (True, False, False))
@@ -284,23 +272,13 @@ def _looked_at(raw: RawTrack) -> _Velocities:
         is_there |= ~missing.all(axis=0)
         num_missing += int(missing.any(axis=1).sum())
     is_zero = np.asarray(is_still & is_there & (high - low > fixed.STATES_STILL))
-    return _Velocities(
-        is_missing=is_missing,
-        is_all_missing=not is_there.any(),
-        is_zero=is_zero,
-        num_missing=num_missing,
-        num_taken=num if is_zero.any() else num_missing,
-    )
-
-
-def _reason(raw: RawTrack, found: _Velocities) -> str:
-    if found.is_all_missing:
-        return "no velocities recorded"
-    if found.is_zero.any():
-        joints = ", ".join(name for name, zero in zip(raw.names, found.is_zero, strict=True) if zero)
-        return f"velocities of {joints} are zero throughout although they move"
-    joints = ", ".join(name for name, missing in zip(raw.names, found.is_missing, strict=True) if missing)
-    return f"velocities of {joints} are missing or NaN in {found.num_missing} states"
+    named = is_zero if is_zero.any() else is_missing
+    joints = ", ".join(name for name, is_named in zip(raw.names, named, strict=True) if is_named)
+    if not is_there.any():
+        return num_missing, is_zero, "no velocities recorded"
+    if is_zero.any():
+        return num, is_zero, f"velocities of {joints} are zero throughout although they move"
+    return num_missing, is_zero, f"velocities of {joints} are missing or NaN in {num_missing} states"
 
 
 def _compare_units(raw: RawTrack, loss: LossReport) -> None:

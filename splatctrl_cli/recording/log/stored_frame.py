@@ -11,20 +11,20 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from math import prod
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_DEPTH
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.spilled_rows import Rows, blocks_of, ranges
+from splatctrl_cli.files.spilled_rows import Table, blocks_of, ranges
 from splatctrl_cli.formats.arrays import npy_head, npy_of
 from splatctrl_cli.formats.image_file import JPEG, PNG
 from splatctrl_cli.recording.container.raw_log import RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import UndecodableMessageError
 from splatctrl_cli.recording.log.state_columns import StateColumns
-from splatctrl_cli.recording.log.state_messages import STATE_TYPES, JointLog, JointStream
+from splatctrl_cli.recording.log.state_messages import JointLog, JointStream
 from splatctrl_cli.recording.log.state_topics import joint_records
 from splatctrl_cli.recording.log.survey import Survey, TopicSurvey
 from splatctrl_cli.recording.source_options import SourceOptions
@@ -57,12 +57,6 @@ class JointTopics:
     chosen: str | None = None
 
 
-def topics_of(found: Survey, loss: LossReport, first_note: int, options: SourceOptions) -> JointTopics:
-    """Those of a log."""
-    topics = found.of_type(*STATE_TYPES)
-    return JointTopics(topics=topics, loss=loss, first_note=first_note, chosen=options.joint_topic)
-
-
 def with_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
     """A report with that of the joint states, its notes from number `at` on."""
     return loss.plus(joints, [*loss.notes[:at], *joints.notes, *loss.notes[at:]])
@@ -87,7 +81,8 @@ def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) 
                 np.save(folder / place / f"{name}.npy", values, allow_pickle=False)
             columns = stream.columns()
             for name, rows in columns.items():
-                _write_rows(folder / place / f"{name}.npy", rows)
+                with (folder / place / f"{name}.npy").open("wb") as file:
+                    write_rows(file, rows)
             for name in (*times, *columns):
                 wrote(f"{place}/{name}.npy")
             streams.append({"folder": place, "joints": list(stream.names), "columns": list(columns)})
@@ -145,16 +140,15 @@ def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSur
     return TopicSurvey(topic=topic, count=int(entry["messages"]), joints=JointLog.of(int(entry["states"]), streams))
 
 
-def _write_rows(path: Path, rows: Rows) -> None:
-    """A .npy file, a block at a time."""
-    with path.open("wb") as stream:
-        np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": rows.shape})
-        for block in blocks_of(rows):
-            stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())
+def write_rows(stream: IO[bytes], rows: Table) -> None:
+    """Rows of float64 as a .npy file, a block at a time."""
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": tuple(rows.shape)})
+    for block in blocks_of(rows):
+        stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())
 
 
 def _blocks(path: Path) -> Iterator[Float64]:
-    """Of a .npy file as `_write_rows` writes it. Raises ValueError for another."""
+    """Of a .npy file as `write_rows` writes it. Raises ValueError for another."""
     with path.open("rb") as stream:
         shape, is_by_columns, dtype = npy_head(stream)
         if dtype != np.dtype("<f8") or is_by_columns or not shape:
