@@ -97,6 +97,7 @@ WELL_INSIDE = 0.005  # [m] below the robot's surface; what nothing shows to be a
 ROBOT_REACH = 0.2  # [m] from the robot's surface; beyond it nobody asks for the distance
 MASK_SPECK = 5e-5  # [m^2] of what is before the robot's surface alone: a 6 mm rod shows more from 9 mm length on
 MASK_ALONE = 4e-4  # [m^2] of it, if no other frame measured it
+MASK_BORDER = 32  # of an image's width, the pixels beyond its border in which the robot is looked for: 20 of 640
 MASK_EDGE = 128  # of an image's width, the pixels by which stereo fattens an outline: 5 of 640
 STEADY_GAIN = 0.25  # of a new depth in the running mean of a surface that stands still
 STEADY_SIGMAS = 4.0  # of the sensor's error, by which a pixel may differ from that mean

@@ -14,6 +14,7 @@ from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import (
     CONTACT_THICKNESS,
     MASK_ALONE,
+    MASK_BORDER,
     MASK_EDGE,
     MASK_FAR_OFF,
     MASK_PIXELS,
@@ -67,8 +68,19 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     surface and an outline that is off by the calibration are explained too; of a robot drawn by triangles, so is a
     point as near to any of them, or inside: it is seen through a slit. Spheres that stand for a link enclose its
     surface and are not it, as boxes do what it carries: what lies inside them is robot. Everything else with a depth
-    is an object, where its piece of surface shows enough of itself (`_judged`).
+    is an object, where its piece of surface shows enough of itself (`_judge`). The robot is looked for beyond the
+    image's border, too, by 1 / `MASK_BORDER` of its width: an outline there has its fat edge inside the image.
     """
+    k, border = frame.intrinsics, frame.intrinsics.width // MASK_BORDER
+    lens = replace(k, cx=k.cx + border, cy=k.cy + border, width=k.width + 2 * border, height=k.height + 2 * border)
+    wider = _mask_within(replace(frame, intrinsics=lens, depth=np.pad(frame.depth, border)), robot, config)
+    image = slice(border, border + k.height), slice(border, border + k.width)
+    kinds, depth = (np.ascontiguousarray(of_all[image]) for of_all in (wider.kinds, wider.robot_depth))
+    return replace(wider, kinds=kinds, robot_depth=depth)
+
+
+def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
+    """As `self_mask`, of the robot within the image."""
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     shown = surface.render(
         T_world_link,

@@ -119,6 +119,17 @@ def test_a_depth_between_the_robot_and_the_floor_at_its_outline_is_mixed_and_lef
     assert without(view, mask, PixelKind.MIXED).depth[~SHOWN].all()
 
 
+def test_an_outline_just_outside_of_the_image_has_its_fat_edge_inside() -> None:
+    right = K.fx * RADIUS / np.sqrt(CENTER[2] ** 2 - RADIUS**2)  # pixels from the ball's centre to its outline
+    k = replace(K, cx=-1.5 - right)
+    assert not np.isfinite(ball_depth(k=k)).any()
+    depth = np.full((k.height, k.width), FLOOR)
+    depth[57:63, :2] = CENTER[2]
+    found = self_mask(plain_frame(depth, k, stamp_ns=5), robot(), CONFIG).kinds
+    assert not (found[57:63, :2] == PixelKind.OBJECT).any()
+    assert (found[:, 4:] == PixelKind.OBJECT).all()
+
+
 @pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.MIXED), (3, PixelKind.OBJECT)])
 def test_what_is_behind_the_outline_counts_where_it_shows_beyond_the_width_of_an_edge(
     columns: int, kind: PixelKind
