@@ -19,18 +19,18 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-from splatctrl_cli.jobs.replay.evidence import Misses, misses_of
-from splatctrl_cli.jobs.replay.inputs import open_log, read_states
-from splatctrl_cli.jobs.replay.lockstep import from_log
-from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
-from splatctrl_cli.jobs.running.progress import SILENT
 
 from benchmarks.measure import Options, Result
 from benchmarks.random_tabletop import random_things
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.config.fixed import FEWEST_STRETCHES
 from splatctrl_cli.evaluate.conformal import autocorrelation_time, conformal_rank, stretch_scores, stretches
+from splatctrl_cli.jobs.replay.evidence import Misses, misses_of
+from splatctrl_cli.jobs.replay.inputs import open_log, read_states
+from splatctrl_cli.jobs.replay.lockstep import from_log
+from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
+from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.recording.container.mcap_writer import mcap_log
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, JointState

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 
 from splatctrl_cli.files.output import write_json
+from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.recording.folder.dtu import DtuView, write_dtu
 from splatctrl_cli.recording.folder.idr import write_idr

@@ -8,16 +8,16 @@ import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin
-from splatctrl_cli.formats.grid.grid_formats import write_grid
-from splatctrl_cli.formats.splat.splats import FORMATS
-from tests.formats.grid.make_grid import random_grid
-from tests.formats.splat.test_gaussian_ply import gaussian_set
 
 from benchmarks.fuzz_folders import Commands, layout_folders, scans, scene_folder
+from splatctrl_cli.formats.grid.grid_formats import write_grid
+from splatctrl_cli.formats.splat.splats import FORMATS
 from splatctrl_cli.recording.capture.capture_writer import write_capture
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import Damage
 from splatctrl_cli.recording.source import open_source
+from tests.formats.grid.make_grid import random_grid
+from tests.formats.splat.test_gaussian_ply import gaussian_set
 from tests.recording.container.test_log_formats import as_ros1_bag, as_ros2_folder
 from tests.recording.log.make_log import LogRecipe, make_log
 

@@ -24,15 +24,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatctrl_cli.formats.splat.splats import FORMATS
-from tests.formats.splat.test_gaussian_ply import gaussian_set
-
 from benchmarks.measure import ROBOT, SAMPLE
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.files.output import partial_path
+from splatctrl_cli.formats.splat.splats import FORMATS
 from splatctrl_cli.recording.source import describe, open_source
+from tests.formats.splat.test_gaussian_ply import gaussian_set
 
 _OWN = ("seconds", "arguments")  # of run.json
 _TIMED = ("run.json", "SHA256SUMS")  # SHA256SUMS holds the sum of run.json where it lists it

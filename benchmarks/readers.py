@@ -12,6 +12,9 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin
+
+from benchmarks.fuzz_samples import ROBOT, capture_of, plain_log
+from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.formats.arrays import DAMAGE, npy_of, read_arrays, savez
 from splatctrl_cli.formats.grid.grid_formats import write_grid
 from splatctrl_cli.formats.grid.npz_grid import read_npz
@@ -19,11 +22,6 @@ from splatctrl_cli.formats.grid.nrrd import read_nrrd_head
 from splatctrl_cli.formats.grid.vti import read_vti
 from splatctrl_cli.formats.image_file import image_head, read_pfm, write_pfm
 from splatctrl_cli.formats.splat.splats import FORMATS
-from tests.formats.grid.make_grid import random_grid
-from tests.formats.splat.test_gaussian_ply import gaussian_set
-
-from benchmarks.fuzz_samples import ROBOT, capture_of, plain_log
-from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.recording.capture.capture import CaptureSource
 from splatctrl_cli.recording.container.bag_logs import Bag1Log, Db3Log
 from splatctrl_cli.recording.container.foxglove import MessageTypes
@@ -36,6 +34,8 @@ from splatctrl_cli.recording.log.messages import decode_rvl, read_image
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.urdf import read_urdf
+from tests.formats.grid.make_grid import random_grid
+from tests.formats.splat.test_gaussian_ply import gaussian_set
 from tests.recording.container.test_foxglove import descriptor_set
 from tests.recording.container.test_log_formats import as_ros1_bag, as_ros2_folder
 from tests.recording.folder.make_layout import make_nerfstudio, make_redwood, make_tum

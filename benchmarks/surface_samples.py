@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from splatctrl_cli.formats.mesh import TriangleMesh
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.held_out_depth import drawn_on
+from splatctrl_cli.formats.mesh import TriangleMesh
 from splatctrl_cli.geometry import face_normals
 from splatctrl_cli.records import Float64, Index
 

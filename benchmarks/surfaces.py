@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from splatctrl_cli.formats.mesh import MeshDistance, TriangleMesh, load_mesh
 
 from benchmarks.measure import ROOT
 from benchmarks.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh
+from splatctrl_cli.formats.mesh import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
 from splatctrl_cli.records import Box, Float64
 from splatctrl_cli.simulate.primitives import Primitive, Texture, closest_point, normals

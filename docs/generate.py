@@ -13,15 +13,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from splatctrl_cli.formats.grid.grid_format import GridFormat
-from splatctrl_cli.formats.grid.grid_formats import FORMATS as GRID_FORMATS
-from splatctrl_cli.formats.splat.splat_format import SplatFormat
-from splatctrl_cli.formats.splat.splats import FORMATS as SPLAT_FORMATS
-from splatctrl_cli.jobs.compare.judged_runs import scales
-from splatctrl_cli.jobs.replay.criteria_input import Judged
-from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS, PROOF, Limit
-from splatctrl_cli.jobs.replay.verdict import CRITERIA
-
 from splatctrl_cli import config
 from splatctrl_cli.checks.finding import CHECKS, Check
 from splatctrl_cli.cli.commands import COMMANDS, EXIT_CODES, build_parser
@@ -30,6 +21,14 @@ from splatctrl_cli.config.load import type_name
 from splatctrl_cli.config.ranges import OneOf, Section
 from splatctrl_cli.evaluate.metrics import Better, Scale
 from splatctrl_cli.evaluate.verdict import Criterion
+from splatctrl_cli.formats.grid.grid_format import GridFormat
+from splatctrl_cli.formats.grid.grid_formats import FORMATS as GRID_FORMATS
+from splatctrl_cli.formats.splat.splat_format import SplatFormat
+from splatctrl_cli.formats.splat.splats import FORMATS as SPLAT_FORMATS
+from splatctrl_cli.jobs.compare.judged_runs import scales
+from splatctrl_cli.jobs.replay.criteria_input import Judged
+from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS, PROOF, Limit
+from splatctrl_cli.jobs.replay.verdict import CRITERIA
 from splatctrl_cli.recording.folder.layout import Layout
 from splatctrl_cli.recording.folder.layouts import LAYOUTS
 
@@ -91,8 +90,8 @@ def _general(name: str, names: Container[str]) -> str:
 
 Entry = SplatFormat | GridFormat | Layout | Check | Criterion[Judged] | Limit | Compared
 REGISTRIES: dict[str, tuple[tuple[str, ...], Iterable[Entry]]] = {
-    "splat formats": (("suffix", "what it is", "rounds to", "does not hold"), SPLAT_FORMATS.values()),
-    "grid formats": (("`--formats`", "file", "who opens it", "checked", "cost"), GRID_FORMATS.values()),
+    "splat_formats": (("suffix", "what it is", "rounds to", "does not hold"), SPLAT_FORMATS.values()),
+    "grid_formats": (("`--formats`", "file", "who opens it", "checked", "cost"), GRID_FORMATS.values()),
     "datasets": (("layout", "known by", "poses", "depth", "intrinsics"), LAYOUTS),
     "criteria": (("criterion", "holds where", "broken:"), CRITERIA),
     "limits": (("evidence", "allowed", "why"), (*LIMITS, PROOF)),

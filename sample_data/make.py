@@ -18,7 +18,7 @@ import trimesh
 import zstandard
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.mesh_distance import load_mesh
+from splatctrl_cli.formats.mesh import load_mesh
 
 HERE = Path(__file__).parent
 FILES = ("log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml")

@@ -10,7 +10,6 @@ from pathlib import Path
 from string import Template
 
 import pytest
-from splatctrl_cli.jobs.replay.metrics import metric_names
 
 from experiments.__main__ import EXPERIMENTS
 from splatctrl_cli.cli.commands import COMMANDS, build_parser
@@ -18,6 +17,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.parser import GONE
 from splatctrl_cli.config import PRESETS, load_config
 from splatctrl_cli.evaluate.gates import check_gate_names
+from splatctrl_cli.jobs.replay.metrics import metric_names
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_data/*.md")])

@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from splatctrl_cli.formats.splat.splats import write_ply
 
 from benchmarks.scenes import surface_splats
 from splatctrl_cli.config import FieldConfig
@@ -23,6 +22,7 @@ from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.distance import make_field
 from splatctrl_cli.field.grid_cells import GridLayout
 from splatctrl_cli.field.on_device import OnDevice
+from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.kernels.cuda.card import CudaDevice
 from splatctrl_cli.kernels.cuda.field import Answers
 from splatctrl_cli.kernels.cuda.memory import FIELD

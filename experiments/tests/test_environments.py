@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 
 from experiments import drawn_task
 from experiments.drawn_task import solids_of, task_of
 from experiments.environments import ENVIRONMENTS, Environment, drawn, ring_of_cameras
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.path import resampled
 from splatctrl_cli.records import Float64

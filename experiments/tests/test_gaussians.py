@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.splat.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from tests.jobs.score.wall import FakeSource
 
 from experiments.densify import GaussianSettings
 from experiments.gaussians import reconstruct_gaussians
 from splatctrl_cli import InputError, ReconstructRequest, RecordingRequest, UsageError, open_to_train
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.formats.splat.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from tests.jobs.score.wall import FakeSource
 from tests.scene.wall import frame
 
 SAMPLES = Path(__file__).parents[2] / "sample_data"

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS
-from splatctrl_cli.jobs.replay.replay import evidence_criteria
 
 from experiments import judge, trial
 from experiments.maps import Map
@@ -16,6 +14,8 @@ from experiments.trial import OURS, Attempt, Rig, Trial, trial_of
 from splatctrl_cli.config import Config
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict, held, verdict_of
 from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.jobs.replay import evidence_criteria
+from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.records import Float64
 

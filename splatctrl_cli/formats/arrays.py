@@ -20,10 +20,10 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from splatctrl_cli.formats.unpacking import PIECE
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, ranges
+from splatctrl_cli.formats.unpacking import PIECE
 from splatctrl_cli.libraries import of_extra
 from splatctrl_cli.records import Float64, Stamps
 

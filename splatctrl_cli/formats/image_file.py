@@ -13,9 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from splatctrl_cli.formats.unpacking import read_bytes
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.unpacking import read_bytes
 from splatctrl_cli.records import Float32
 
 JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"

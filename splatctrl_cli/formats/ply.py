@@ -11,10 +11,10 @@ from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
-from splatctrl_cli.formats.unpacking import read_bytes
 
 from splatctrl_cli.config.ranges import MAX_PLACE
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.formats.unpacking import read_bytes
 from splatctrl_cli.records import Float64, PointCloud
 
 SCALARS = {

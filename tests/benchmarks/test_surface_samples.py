@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from splatctrl_cli.formats.mesh import MeshDistance
 
 from benchmarks.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh, thin
+from splatctrl_cli.formats.mesh import MeshDistance
 from tests.formats.test_mesh import box_distance, box_mesh
 
 SIZE = (0.3, 0.2, 0.1)

@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
 
 from benchmarks.calibration import SetUp, write_log
 from splatctrl_cli.calibration.board import Board, matrix_of
@@ -18,6 +17,7 @@ from splatctrl_cli.calibration.pose_refinement import bends_alone, unbent
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import back_project, invert_transform
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
+from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.records import Float64, RgbdFrame, UInt8
 
 

@@ -9,15 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from splatctrl_cli.formats.scene.scene_folder import ViewCorrection
-from splatctrl_cli.jobs.reconstruct.correct_views import Corrections, corrected_among
-from splatctrl_cli.jobs.running.progress import SILENT
 
 from splatctrl_cli.calibration.evidence import transform_of
 from splatctrl_cli.calibration.gray_views import exposed, exposure_gains
 from splatctrl_cli.calibration.pose_refinement import refined_poses
 from splatctrl_cli.calibration.views import by_twists
+from splatctrl_cli.formats.scene.scene_folder import ViewCorrection
 from splatctrl_cli.geometry import invert_transform, transform_from, transform_points
+from splatctrl_cli.jobs.reconstruct.correct_views import Corrections, corrected_among
+from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 from tests.calibration.scan import disturbed, gains_of, views_of
 from tests.plain import plain_frame

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
-from splatctrl_cli.formats.ply import read_points, read_positions
 
+from splatctrl_cli.formats.ply import read_points, read_positions
 from tests.cases.case import Case, Run
 
 SIDE = 20  # splats along a side of the plane

@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 
 from splatctrl_cli.calibration.gray_views import exposed
 from splatctrl_cli.checks.check_arm import motion_findings
@@ -19,6 +18,7 @@ from splatctrl_cli.checks.check_views import ViewsCheck, check_views
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import Finding, Severity
 from splatctrl_cli.geometry import pose_at
+from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.log.survey import survey

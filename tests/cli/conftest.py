@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from splatctrl_cli.jobs.replay.replay import files, inputs, lockstep
 
+from splatctrl_cli.jobs.replay import files, inputs, lockstep
 from splatctrl_cli.recording.state import state_source
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot import coverage

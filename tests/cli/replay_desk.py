@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from splatctrl_cli.formats.grid.npz_grid import write_npz
-from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.files.output import part_digests
+from splatctrl_cli.formats.grid.npz_grid import write_npz
+from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.recording.log.state_columns import StateCollector, StateColumns
 from splatctrl_cli.records import Box, Float64, JointState, LossReport, Record, SplatSet
 from splatctrl_cli.robot.model import RobotModel

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.arrays import npy_of
-from splatctrl_cli.formats.splat.splats import FORMATS
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.arrays import npy_of
+from splatctrl_cli.formats.splat.splats import FORMATS
 from splatctrl_cli.robot.link_meshes import mesh_path
 from splatctrl_cli.robot.urdf import MeshShape
 from tests.formats.make_npz import write_zeros

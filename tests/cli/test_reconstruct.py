@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from splatctrl_cli.formats.scene.scene_folder import open_scene
 
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.records import Label, RgbdFrame
 from tests.recording.log.make_log import LogRecipe, make_log
 from tests.scene.wall import INTRINSICS, frame

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.splat.splats import write_ply
 
+from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.records import Label
 from tests.cli import here
 from tests.cli.replay_desk import BALL, START, splats_of, write_scene

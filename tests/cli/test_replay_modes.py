@@ -5,8 +5,8 @@ import re
 
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.replay.metrics import metric_names
 
+from splatctrl_cli.jobs.replay.metrics import metric_names
 from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, scene_of, splats_of, write_scene

@@ -4,11 +4,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from splatctrl_cli.formats.grid import grid_formats
-from splatctrl_cli.formats.grid.npz_grid import read_npz
-from splatctrl_cli.formats.scene.scene_writer import SceneWriter
-from splatctrl_cli.formats.splat.splats import FORMATS, write_ply
-from splatctrl_cli.jobs.bake.bake import SUMMARY_METRICS
 
 from splatctrl_cli.cli import scene_options
 from splatctrl_cli.cli.parser import words
@@ -19,6 +14,11 @@ from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_names
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_field import exact_channel
+from splatctrl_cli.formats.grid import grid_formats
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.scene.scene_writer import SceneWriter
+from splatctrl_cli.formats.splat.splats import FORMATS, write_ply
+from splatctrl_cli.jobs.bake.bake import SUMMARY_METRICS
 from splatctrl_cli.simulate.truth import load_truth
 from tests.cli import here
 from tests.cli.test_command_line import splatctrl

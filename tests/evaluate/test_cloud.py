@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.mesh import TriangleMesh
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, spaced, thinned
+from splatctrl_cli.formats.mesh import TriangleMesh
 from splatctrl_cli.records import Float64
 
 

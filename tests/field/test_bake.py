@@ -3,7 +3,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.grid.npz_grid import write_npz
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
@@ -12,6 +11,7 @@ from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
 from splatctrl_cli.field.grid_cells import GridLayout, bounding_box
 from splatctrl_cli.field.slabs import bake
+from splatctrl_cli.formats.grid.npz_grid import write_npz
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Label
 from splatctrl_cli.voxels import SWEPT
 from tests.field.scenes import cloud, splat_set

@@ -5,13 +5,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
-from splatctrl_cli.formats.splat.splats import read_ply, read_world_splats, write_ply
-from splatctrl_cli.jobs.replay.known_scene import from_grid
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import Parts, Stopwatch, part_digests, sha256, write_run
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
+from splatctrl_cli.formats.splat.splats import read_ply, read_world_splats, write_ply
+from splatctrl_cli.jobs.replay.known_scene import from_grid
 from tests.cli.replay_desk import SECOND, splats_of, write_scene
 
 BOX = ("--box=-0.1,-0.1,-0.1,0.1,0.1,0.1", "--voxel", "0.02", "--no-report")

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats import arrays
 
 from splatctrl_cli.files import spilled_rows
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, scratch_folder, selected
+from splatctrl_cli.formats import arrays
 from splatctrl_cli.recording.log import state_columns
 from splatctrl_cli.recording.log.state_columns import StateCollector
 from splatctrl_cli.recording.log.state_topics import checked_stamps

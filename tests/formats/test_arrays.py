@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import DAMAGE, NpzFile, read_arrays, savez
 from splatctrl_cli.formats.grid.npz_grid import MOST_PACKED, read_npz
 from splatctrl_cli.formats.scene.scene_writer import CHECKPOINT, read_checkpoint
 from splatctrl_cli.formats.scene.voxel_file import read_occupancy, read_states
-from tests.formats.make_npz import write_zeros
-
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.folder.idr import read_idr
 from splatctrl_cli.recording.source import describe
+from tests.formats.make_npz import write_zeros
 
 GIB4 = (1 << 14, 1 << 9, 1 << 9)  # of bytes
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from splatctrl_cli.formats.image_file import ImageHead, decode_file, image_head, read_pfm
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.image_file import ImageHead, decode_file, image_head, read_pfm
 
 RNG = np.random.default_rng(3)
 COLOR = RNG.integers(0, 256, (7, 11, 3), dtype=np.uint8)

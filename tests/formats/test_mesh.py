@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from splatctrl_cli.formats.mesh import MeshDistance, TriangleMesh, load_mesh
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.mesh import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.records import Float64
 from tests.reference.triangles import distance_to_triangles, winding_number
 

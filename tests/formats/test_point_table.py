@@ -4,10 +4,10 @@ import io
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats import ply
-from splatctrl_cli.formats.ply import point_blocks
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats import ply
+from splatctrl_cli.formats.ply import point_blocks
 
 
 def points_in(text: str) -> list[list[float]]:

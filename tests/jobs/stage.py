@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 
 from splatctrl_cli.files.output import part_digests, write_json
+from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Box, Float64, JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel

@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from splatctrl_cli.formats.summary import Summary
-from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, SimulateResult, simulate
 
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.formats.summary import Summary
 from splatctrl_cli.jobs import demo as module
 from splatctrl_cli.jobs.demo import SAMPLE, DemoRequest, Step, demo
+from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, SimulateResult, simulate
 from splatctrl_cli.simulate.recording import RecordingOptions
 
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.scene.voxel_file import write_occupancy
-from splatctrl_cli.formats.splat.splats import write_ply
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError
+from splatctrl_cli.formats.scene.voxel_file import write_occupancy
+from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.recording.capture.capture_writer import write_capture
 from splatctrl_cli.recording.source import SourceOptions, describe, open_source
 from splatctrl_cli.records import Label

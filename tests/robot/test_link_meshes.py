@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from splatctrl_cli.formats.mesh import load_mesh
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.robot.link_meshes import SolidDistance, read_solids
 from splatctrl_cli.robot.urdf import read_urdf
 from tests.robot.shapes import BALL, BOX, ROD, arm_of, collada, l_shape, written

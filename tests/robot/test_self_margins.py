@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
-from splatctrl_cli.formats.mesh import MeshDistance, TriangleMesh
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import LEAST_OVERLAP
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
+from splatctrl_cli.formats.mesh import MeshDistance, TriangleMesh
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.solid_scene import Solids

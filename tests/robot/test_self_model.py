@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.arrays import read_arrays, savez
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.geometry import look_at, pose_at, turn_about_z
 from splatctrl_cli.kernels.triangles import TriangleTree
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame

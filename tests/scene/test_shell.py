@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.splat.splats import check_splats
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.formats.splat.splats import check_splats
 from splatctrl_cli.kernels.points import SplatTree
 from splatctrl_cli.records import Bool, Box, RgbdFrame
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter

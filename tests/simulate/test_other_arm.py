@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.simulate.simulated_arm import adapted_motion
 
 from experiments.shared_workspace import scene_of
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import pose_at
+from splatctrl_cli.jobs.simulate.simulated_arm import adapted_motion
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel

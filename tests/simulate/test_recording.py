@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.mesh import load_mesh
 
 from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
+from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.records import Float64, JointState, RgbdFrame
 from splatctrl_cli.robot.coverage import coverage_of_solids

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
 from splatctrl_cli.geometry import pose_at
+from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel

@@ -14,7 +14,6 @@ from pathlib import Path
 from splatctrl_cli.jobs.batch.graph import Node
 from splatctrl_cli.jobs.batch.ledger import Ledger, Run
 from splatctrl_cli.jobs.batch.run import DONE, FAILED, Scheduler, local_executor
-
 from tools.hunt.table import border_of, merge_rows, read_rows, report
 from tools.hunt.trial import Row, family_of, run
 

@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS
-from splatctrl_cli.jobs.replay.state_store import Figures
-
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict
+from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS
+from splatctrl_cli.jobs.replay.state_store import Figures
 
 WORDS = ("safe", "waived", "failed", "contact", "not evaluable", "refused")
 LONGEST = 90  # characters of a reason

@@ -7,9 +7,9 @@ from dataclasses import fields
 from pathlib import Path
 
 from scipy.stats import beta
-from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS
 
 from splatctrl_cli.files.output import write_durably
+from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS
 from tools.hunt.observability import MARGIN, TOLERATED
 from tools.hunt.outcome import WORDS
 from tools.hunt.trial import Row

@@ -9,14 +9,15 @@ from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
 import numpy as np
-from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
-from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.replay.replay import ReplayResult, files, inputs, replay
-from splatctrl_cli.jobs.replay.request import ReplayRequest
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.geometry import pose_at
+from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
+from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.replay import files, inputs
+from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
+from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Box, Float64, Intrinsics, SphereSet

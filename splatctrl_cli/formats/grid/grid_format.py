@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from splatctrl_cli.formats.summary import Grid, Summary
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import write_durably, write_json
+from splatctrl_cli.formats.summary import Grid, Summary
 from splatctrl_cli.records import DistanceGrid
 
 FORMAT = "splatctrl distance grid"

@@ -3,9 +3,8 @@
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-from splatctrl_cli.formats.grid.grid_format import STEM, GridFormat
-
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.formats.grid.grid_format import STEM, GridFormat
 from splatctrl_cli.libraries import entries_of
 from splatctrl_cli.records import DistanceGrid
 

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import DAMAGE, check_numbers, has_arrays, npy_head, savez
 from splatctrl_cli.formats.grid.grid_format import (
     GridFormat,
@@ -25,8 +27,6 @@ from splatctrl_cli.formats.grid.grid_format import (
     summary_of,
 )
 from splatctrl_cli.formats.summary import Summary
-
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import DistanceGrid
 
 PLACE: Mapping[str, tuple[str, tuple[int, ...]]] = {"origin": ("<f8", (3,)), "voxel": ("<f8", ())}

@@ -9,6 +9,7 @@ could write this, but puts the clock into the file and holds whole channels in m
 import json
 from pathlib import Path
 
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
     GridFormat,
@@ -20,8 +21,6 @@ from splatctrl_cli.formats.grid.grid_format import (
 )
 from splatctrl_cli.formats.summary import Summary
 from splatctrl_cli.formats.unpacking import read_bytes
-
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import DistanceGrid
 
 PREFIX = "splatctrl."

@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+
+from splatctrl_cli import __version__
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
     FORMAT,
@@ -24,9 +27,6 @@ from splatctrl_cli.formats.grid.grid_format import (
     slabs,
 )
 from splatctrl_cli.formats.summary import Grid, Summary
-
-from splatctrl_cli import __version__
-from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import DistanceGrid
 
 MAGIC = b" BDV\0\0\0\0"

@@ -15,6 +15,8 @@ import numpy as np
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
     FORMAT,
@@ -30,8 +32,6 @@ from splatctrl_cli.formats.grid.grid_format import (
     x_fastest,
 )
 from splatctrl_cli.formats.summary import Grid, Summary
-
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import DistanceGrid
 
 _TYPES = {"<f4": "Float32", "|u1": "UInt8"}

@@ -14,6 +14,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+
+from splatctrl_cli.config import fixed
+from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.files.output import PARTIAL, Parts
 from splatctrl_cli.formats.scene.voxel_file import (
     read_known_occupancy,
     read_occupancy,
@@ -23,10 +27,6 @@ from splatctrl_cli.formats.scene.voxel_file import (
 )
 from splatctrl_cli.formats.splat.gaussian_ply import read_gaussian_ply
 from splatctrl_cli.formats.splat.splats import check_world, read_shell, read_splats, read_world_splats
-
-from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.files.output import PARTIAL, Parts
 from splatctrl_cli.records import Float64, GaussianSet, SplatSet
 from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid, SeenVoxels
 

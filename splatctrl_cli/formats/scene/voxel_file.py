@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from splatctrl_cli.formats.arrays import read_arrays, savez
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.records import Label, UInt8
 from splatctrl_cli.voxels import (
     FIRST_REASON,

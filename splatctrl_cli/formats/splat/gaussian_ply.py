@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+
+from splatctrl_cli.config.fixed import CENTER_LENGTH, CENTER_SHARE, SPARSEST, SPARSEST_SAMPLE
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.ply import PlyFile, check_properties, read_table, write_table
 from splatctrl_cli.formats.splat.splat_format import (
     SplatFormat,
@@ -26,9 +29,6 @@ from splatctrl_cli.formats.splat.splat_format import (
     unit_quaternions,
     without_labels,
 )
-
-from splatctrl_cli.config.fixed import CENTER_LENGTH, CENTER_SHARE, SPARSEST, SPARSEST_SAMPLE
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Label, UInt8
 
 REST = tuple(f"f_rest_{index}" for index in range(45))

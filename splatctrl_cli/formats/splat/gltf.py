@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
 from splatctrl_cli.formats.splat.splat_format import SH_C0, SplatFormat, refuse, unit_quaternions
 from splatctrl_cli.formats.unpacking import read_bytes
-
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float32, GaussianSet, Label
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942  # glTF, JSON, BIN

@@ -26,6 +26,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
 from splatctrl_cli.formats.splat.splat_format import (
     SH_C0,
@@ -36,8 +38,6 @@ from splatctrl_cli.formats.splat.splat_format import (
     without_labels,
 )
 from splatctrl_cli.formats.unpacking import FREE_BYTES, BadBlockError, read_bytes, unpacked
-
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float32, Float64, GaussianSet, UInt8
 
 ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])

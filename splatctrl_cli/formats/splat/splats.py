@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.ply import PlyFile, read_table, write_table
 from splatctrl_cli.formats.splat.gaussian_ply import (
     RoundedError,
@@ -32,8 +34,6 @@ from splatctrl_cli.formats.splat.splat_format import (
     sigmoid,
 )
 from splatctrl_cli.formats.summary import Summary
-
-from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.libraries import entries_of
 from splatctrl_cli.records import Bool, Float32, Float64, GaussianSet, Label, SplatSet
 

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
-from splatctrl_cli.formats.splat.splat_format import SplatFormat, unit_quaternions
 
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.formats.splat.gaussian_ply import check_gaussians
+from splatctrl_cli.formats.splat.splat_format import SplatFormat, unit_quaternions
 from splatctrl_cli.records import Float32, GaussianSet, Label
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"

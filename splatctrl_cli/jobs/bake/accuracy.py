@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from splatctrl_cli.jobs.bake.request import BakeRequest, BakeSource
 
 from splatctrl_cli.config.fixed import COMPARED_CELLS
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
@@ -23,6 +22,7 @@ from splatctrl_cli.evaluate.held_out_depth import HeldOutComparison, compare_wit
 from splatctrl_cli.field.clustered_splats import Spheres
 from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.field.probability import probabilities
+from splatctrl_cli.jobs.bake.request import BakeRequest, BakeSource
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import DistanceGrid, Float64, JointState, RecordSource, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel

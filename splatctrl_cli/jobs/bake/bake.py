@@ -7,22 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatctrl_cli.formats.grid.grid_formats import check_formats, write_grid
-from splatctrl_cli.jobs.bake.accuracy import Accuracy, accuracy_of, check_references
-from splatctrl_cli.jobs.bake.request import (
-    BakeRequest,
-    BakeSource,
-    Previous,
-    check_same,
-    covered,
-    device_for,
-    read_bake_source,
-    read_previous,
-)
-from splatctrl_cli.jobs.bake.slabs import CHECKPOINT, FOLDER, BakeTask, bake_to_disk, clear_leftovers
-from splatctrl_cli.jobs.running.device import Device, named
-from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.running.resume import deciding_versions, told_how_to_go_on
 
 from splatctrl_cli.config.fixed import FAR_GRID
 from splatctrl_cli.errors import UsageError
@@ -40,6 +24,22 @@ from splatctrl_cli.field.obstacles import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.field.report import GridStatistics, grid_statistics
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, slabs
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_json, write_run
+from splatctrl_cli.formats.grid.grid_formats import check_formats, write_grid
+from splatctrl_cli.jobs.bake.accuracy import Accuracy, accuracy_of, check_references
+from splatctrl_cli.jobs.bake.request import (
+    BakeRequest,
+    BakeSource,
+    Previous,
+    check_same,
+    covered,
+    device_for,
+    read_bake_source,
+    read_previous,
+)
+from splatctrl_cli.jobs.bake.slabs import CHECKPOINT, FOLDER, BakeTask, bake_to_disk, clear_leftovers
+from splatctrl_cli.jobs.running.device import Device, named
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.jobs.running.resume import deciding_versions, told_how_to_go_on
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture

@@ -7,11 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatctrl_cli.formats.grid.npz_grid import read_npz
-from splatctrl_cli.formats.scene.scene_folder import SceneFolder, Snapshot, open_scene
-from splatctrl_cli.formats.splat.splats import read_spheres
-from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, chosen
-from splatctrl_cli.jobs.running.progress import Progress
 
 from splatctrl_cli import __version__
 from splatctrl_cli.config import FieldConfig
@@ -21,6 +16,11 @@ from splatctrl_cli.field.distance import KERNEL_OF
 from splatctrl_cli.field.grid_cells import GridLayout, bounding_box, check_room
 from splatctrl_cli.field.obstacles import DEFAULT_LABELS, field_splats
 from splatctrl_cli.files.output import Parts, sha256
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder, Snapshot, open_scene
+from splatctrl_cli.formats.splat.splats import read_spheres
+from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, chosen
+from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import Balls, OccupancyGrid

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.formats.grid.grid_format import GridSlabs, SlabPlan, resume_slabs, start_slabs
-from splatctrl_cli.formats.grid.grid_formats import FORMATS
-from splatctrl_cli.jobs.running.progress import Progress, Wait
 from tqdm import tqdm
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_cells import GridLayout, check_room
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
+from splatctrl_cli.formats.grid.grid_format import GridSlabs, SlabPlan, resume_slabs, start_slabs
+from splatctrl_cli.formats.grid.grid_formats import FORMATS
+from splatctrl_cli.jobs.running.progress import Progress, Wait
 
 FOLDER = "channels"
 CHECKPOINT = f"{FOLDER}/progress.json"

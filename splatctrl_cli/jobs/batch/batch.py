@@ -9,6 +9,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from splatctrl_cli import __version__
+from splatctrl_cli.errors import DAMAGED, InputError, UsageError
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, damage_mark, verdict_of
+from splatctrl_cli.files.output import MARKERS, write_durably, write_json
 from splatctrl_cli.jobs.batch.graph import COMMANDS, CommandLine, Node, nodes_of, of_shard
 from splatctrl_cli.jobs.batch.ledger import Ledger, Run, keys_of
 from splatctrl_cli.jobs.batch.run import (
@@ -28,11 +32,6 @@ from splatctrl_cli.jobs.batch.suite import Suite as Asked
 from splatctrl_cli.jobs.batch.suite import read_suite
 from splatctrl_cli.jobs.batch.task import last_lines
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-
-from splatctrl_cli import __version__
-from splatctrl_cli.errors import DAMAGED, InputError, UsageError
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, damage_mark, verdict_of
-from splatctrl_cli.files.output import MARKERS, write_durably, write_json
 from splatctrl_cli.libraries import distributed
 from splatctrl_cli.report.suites import Case, Kind, Suite, cases_of, damage_case, error_case, skipped_case
 

@@ -9,9 +9,8 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any, Protocol
 
-from splatctrl_cli.jobs.batch.suite import Job, Limits, Recording, Suite, Table, jobs_for
-
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.jobs.batch.suite import Job, Limits, Recording, Suite, Table, jobs_for
 
 RECORDING, NAME = "recording", "name"  # what {…} in an option may stand for, beside the jobs
 ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name

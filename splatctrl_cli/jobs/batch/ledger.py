@@ -20,11 +20,10 @@ from pathlib import Path
 from typing import Any, TextIO
 from uuid import uuid4
 
-from splatctrl_cli.jobs.batch.graph import Node
-
 import splatctrl_cli
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import PACKAGES, sha256, write_durably
+from splatctrl_cli.jobs.batch.graph import Node
 
 NAME, OWNERS = "ledger.sqlite", ".owners"
 VERSION = 1  # of the tables

@@ -14,13 +14,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from splatctrl_cli import __version__
+from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.jobs.batch.graph import Node
 from splatctrl_cli.jobs.batch.ledger import Ledger, Run, keys_of
 from splatctrl_cli.jobs.batch.task import End, Task, last_lines, read_end, run_task, stamp_of, stop_runners
 from splatctrl_cli.jobs.running.progress import Progress, duration
-
-from splatctrl_cli import __version__
-from splatctrl_cli.evaluate.verdict import damage_mark
 
 DONE, FAILED, ERROR, SKIPPED, TO_DO = "done", "failed", "error", "skipped", "to do"
 NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes of a command that came to none

@@ -7,6 +7,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
+from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, failed, lacking, noted, verdict_of
 from splatctrl_cli.jobs.compare.judged_runs import (
     Judged,
     JudgedRun,
@@ -18,10 +21,6 @@ from splatctrl_cli.jobs.compare.judged_runs import (
     write_baseline,
 )
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
-from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, failed, lacking, noted, verdict_of
 
 MOST_NAMES = 5  # in an error
 REGRESSION = "regression"

@@ -13,12 +13,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.jobs.bake import bake
-from splatctrl_cli.jobs.reconstruct import verdict as reconstruct_verdict
-from splatctrl_cli.jobs.replay.metrics import metric_scales, shown_metrics
-from splatctrl_cli.jobs.replay.request import MODES
-from splatctrl_cli.jobs.robot.robot import robot
-
 from splatctrl_cli import __version__
 from splatctrl_cli.config.fixed import BANDS
 from splatctrl_cli.errors import InputError, UsageError
@@ -27,6 +21,11 @@ from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.metrics import Better, Scale, Shown
 from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PARTIAL, output_path
+from splatctrl_cli.jobs.bake import bake
+from splatctrl_cli.jobs.reconstruct import verdict as reconstruct_verdict
+from splatctrl_cli.jobs.replay.metrics import metric_scales, shown_metrics
+from splatctrl_cli.jobs.replay.request import MODES
+from splatctrl_cli.jobs.robot import robot
 
 REPLAY_FIELDS = ("exact", "barrier", "certified")
 

@@ -8,6 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from splatctrl_cli.config.fixed import EXPORT_DIFFERENCE, EXPORT_MAX_COLOR, EXPORT_MIN_PSNR, EXPORT_VIEWS
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, WriteError
+from splatctrl_cli.files.output import output_path, sha256
 from splatctrl_cli.formats.splat.gaussian_ply import REFERENCE_PLY
 from splatctrl_cli.formats.splat.splat_format import Comments, Differences, SplatFormat, differences, refuse
 from splatctrl_cli.formats.splat.splats import (
@@ -22,12 +26,8 @@ from splatctrl_cli.formats.splat.splats import (
     read_source,
     write_ply,
 )
-from splatctrl_cli.jobs.running.progress import SILENT, Progress
-
-from splatctrl_cli.config.fixed import EXPORT_DIFFERENCE, EXPORT_MAX_COLOR, EXPORT_MIN_PSNR, EXPORT_VIEWS
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, WriteError
-from splatctrl_cli.files.output import output_path, sha256
 from splatctrl_cli.geometry import look_at
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render

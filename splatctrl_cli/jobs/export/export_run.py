@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatctrl_cli.formats.grid.npz_grid import read_npz
-from splatctrl_cli.formats.scene.scene_folder import Snapshot, open_scene
-from splatctrl_cli.jobs.report.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
-from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, open_run
 
 from splatctrl_cli.control.events import INTERVENTIONS, SHOWN
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import output_path
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.scene.scene_folder import Snapshot, open_scene
+from splatctrl_cli.jobs.report.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
+from splatctrl_cli.jobs.runs.run_folder import REPLAY, FolderRequest, RunFolder, States, WrittenFile, open_run
 from splatctrl_cli.recording.container.foxglove_writer import FoxgloveLog, foxglove_log
 
 FREE_BELOW, OCCUPIED_ABOVE = 0.3, 0.7  # of snapshots, whose log-odds say nothing finer

@@ -5,7 +5,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from splatctrl_cli.jobs.bake.request import BakeSource
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import MARCH_STEPS
@@ -17,6 +16,7 @@ from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.obstacles import ObstacleSpheres
 from splatctrl_cli.field.on_device import OnDevice
 from splatctrl_cli.field.probability import make_probability
+from splatctrl_cli.jobs.bake.request import BakeSource
 from splatctrl_cli.kernels.cuda.memory import Memory
 from splatctrl_cli.records import Bool, DistanceField, DistanceGrid, Float64, Label
 from splatctrl_cli.voxels import VoxelState

@@ -8,13 +8,6 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
-from splatctrl_cli.formats.grid.npz_grid import read_npz
-from splatctrl_cli.formats.ply import point_blocks
-from splatctrl_cli.formats.scene.scene_folder import run_value
-from splatctrl_cli.jobs.bake.request import BakeSource, read_bake_source, source_of_grid
-from splatctrl_cli.jobs.query.point_answers import TITLES, Answers, GridAnswers, SceneAnswers, rows_of
-from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, chosen, named
-from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
 from tqdm import tqdm
 
 from splatctrl_cli.config import Config
@@ -23,6 +16,13 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.field.grid_cells import check_room
 from splatctrl_cli.field.obstacles import DEFAULT_LABELS, obstacle_spheres
 from splatctrl_cli.files.output import Parts, Stopwatch, output_path
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.ply import point_blocks
+from splatctrl_cli.formats.scene.scene_folder import run_value
+from splatctrl_cli.jobs.bake.request import BakeSource, read_bake_source, source_of_grid
+from splatctrl_cli.jobs.query.point_answers import TITLES, Answers, GridAnswers, SceneAnswers, rows_of
+from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, chosen, named
+from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Label
 from splatctrl_cli.voxels import VoxelState

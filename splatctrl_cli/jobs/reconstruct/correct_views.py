@@ -5,8 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from splatctrl_cli.formats.scene.scene_folder import ViewCorrection
-from splatctrl_cli.jobs.running.progress import Progress
 
 from splatctrl_cli.calibration.gray_views import exposed, exposure_gains
 from splatctrl_cli.calibration.pose_refinement import (
@@ -19,6 +17,8 @@ from splatctrl_cli.calibration.pose_refinement import (
 )
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.formats.scene.scene_folder import ViewCorrection
+from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.folder.folder_views import HOLDOUT
 from splatctrl_cli.records import Float64, RecordSource, RgbdFrame
 from splatctrl_cli.scene.scale import RecordedDepth

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from splatctrl_cli.formats.scene.scene_writer import SceneWriter
-from splatctrl_cli.formats.scene.voxel_file import read_states, read_unrepresented
-from splatctrl_cli.formats.splat.splats import read_ply
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import NEWS_LEAST, SAME_MOMENT_NS
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.field.obstacles import obstacle_spheres
+from splatctrl_cli.formats.scene.scene_writer import SceneWriter
+from splatctrl_cli.formats.scene.voxel_file import read_states, read_unrepresented
+from splatctrl_cli.formats.splat.splats import read_ply
 from splatctrl_cli.records import SplatSet
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.voxels import Balls, OccupancyGrid

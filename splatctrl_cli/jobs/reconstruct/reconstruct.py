@@ -6,6 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.gates import check_gate_names
+from splatctrl_cli.evaluate.verdict import Verdict, brief
+from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.formats.arrays import savez
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.formats.scene.scene_writer import CHECKPOINT
@@ -17,11 +21,6 @@ from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, other_frame, ur
 from splatctrl_cli.jobs.running.device import FitDevice
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.running.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
-
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.verdict import Verdict, brief
-from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.declared_contact import Declarations, read_declarations

@@ -8,6 +8,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
+from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.config.fixed import MOST_GROWTH
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.ply import read_points
 from splatctrl_cli.formats.scene.scene_folder import FORMAT
 from splatctrl_cli.formats.scene.scene_writer import Checkpoint, SceneWriter
@@ -17,11 +22,6 @@ from splatctrl_cli.jobs.recordings.open_recording import CameraAgreement, guesse
 from splatctrl_cli.jobs.recordings.same_recording import first_frame
 from splatctrl_cli.jobs.running.device import CPU, Device, FitDevice, RunOptions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
-from tqdm import tqdm
-
-from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.config.fixed import MOST_GROWTH
-from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel

@@ -4,16 +4,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from splatctrl_cli.formats.arrays import savez
-from splatctrl_cli.jobs.reconstruct.reconstruction import training_cameras
-from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
-from splatctrl_cli.jobs.running.progress import SILENT, Progress
 
 from splatctrl_cli.config.fixed import STATES_CLOSE_NS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import output_path
+from splatctrl_cli.formats.arrays import savez
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.calibrate import depth_frame, frames_nearest, stamps_by_camera
+from splatctrl_cli.jobs.reconstruct.reconstruction import training_cameras
+from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions

@@ -4,13 +4,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from splatctrl_cli.jobs.replay.request import ReplayRequest
-
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import MASK_PIXELS
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, FAULTS, Better, Scale
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, note, noted, verdict_of
+from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.records import LossReport
 from splatctrl_cli.robot.declared_contact import carried_words
 from splatctrl_cli.scene.time_steps import AuditRow

@@ -5,14 +5,13 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 
-from splatctrl_cli.jobs.running.progress import Progress
-
 from splatctrl_cli.checks.check_views import are_far, check_views, rescaled
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.jobs.check import refuse_errors
+from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.capture.capture_header import is_capture
 from splatctrl_cli.recording.folder.dtu_source import DtuSource, view_numbers

@@ -3,13 +3,13 @@
 from collections.abc import Iterator
 
 import numpy as np
-from splatctrl_cli.jobs.replay.criteria_input import CONTACT, CONTROL, LIMITS, Judged, events_of, seconds_at
-from splatctrl_cli.jobs.replay.result import OutsideRun
 
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED
 from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, counted, failed, held
+from splatctrl_cli.jobs.replay.criteria_input import CONTACT, CONTROL, LIMITS, Judged, events_of, seconds_at
+from splatctrl_cli.jobs.replay.result import OutsideRun
 
 
 def controller(judged: Judged) -> Iterator[Reason]:

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
+from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.metrics import Metrics
 from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.result import Replay
-
-from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
-from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.records import Float64
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"

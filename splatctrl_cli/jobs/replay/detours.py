@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass
 
-from splatctrl_cli.jobs.replay.known_scene import KnownFields
-from splatctrl_cli.jobs.replay.request import ReplayInputs
-
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.control.goals import PlanDetour
 from splatctrl_cli.control.replay import ReplayTask
+from splatctrl_cli.jobs.replay.known_scene import KnownFields
+from splatctrl_cli.jobs.replay.request import ReplayInputs
 from splatctrl_cli.planner.planned import planned_detours
 
 ROUNDING = 1e-5  # [m] taken off distances to splats, far above what float32 rounds within 8 m

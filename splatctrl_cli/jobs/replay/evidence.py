@@ -13,10 +13,6 @@ from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
-from splatctrl_cli.formats.scene.scene_folder import open_scene
-from splatctrl_cli.jobs.reconstruct.reconstruction import training_cameras
-from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.state_store import StoredAudit
 
 from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
 from splatctrl_cli.config.motion import VerdictConfig
@@ -26,7 +22,11 @@ from splatctrl_cli.evaluate.conformal import ConformalBound, conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.files.spilled_rows import ranges
+from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.geometry import back_project, transform_points
+from splatctrl_cli.jobs.reconstruct.reconstruction import training_cameras
+from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.state_store import StoredAudit
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame, Stamps

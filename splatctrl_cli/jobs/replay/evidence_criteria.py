@@ -5,6 +5,16 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+
+from splatctrl_cli.config.fixed import (
+    BEYOND,
+    COARSE_VOXEL,
+    HIDDEN,
+    MISPLACED,
+    UNSEEN,
+)
+from splatctrl_cli.evaluate.conformal import ConformalBound
+from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
 from splatctrl_cli.jobs.replay.criteria_input import (
     MARGIN,
     UNKNOWN,
@@ -17,16 +27,6 @@ from splatctrl_cli.jobs.replay.criteria_input import (
 from splatctrl_cli.jobs.replay.request import OCCUPIED
 from splatctrl_cli.jobs.replay.state_store import Figures
 from splatctrl_cli.jobs.replay.time_criteria import clocks, evidence_age, judged_time, map_age
-
-from splatctrl_cli.config.fixed import (
-    BEYOND,
-    COARSE_VOXEL,
-    HIDDEN,
-    MISPLACED,
-    UNSEEN,
-)
-from splatctrl_cli.evaluate.conformal import ConformalBound
-from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
 from splatctrl_cli.records import Float64
 from splatctrl_cli.voxels import EvidenceClass
 

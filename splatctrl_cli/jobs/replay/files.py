@@ -8,9 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatctrl_cli.jobs.replay.metrics import Metrics
-from splatctrl_cli.jobs.replay.pictures import draw_replay
-from splatctrl_cli.jobs.replay.result import Replay
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.arm import sphere_names
@@ -19,6 +16,9 @@ from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, finite, write_json, write_run
 from splatctrl_cli.files.spilled_rows import BLOCK
+from splatctrl_cli.jobs.replay.metrics import Metrics
+from splatctrl_cli.jobs.replay.pictures import draw_replay
+from splatctrl_cli.jobs.replay.result import Replay
 from splatctrl_cli.records import Float64
 
 UNITS = {

@@ -13,9 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.replay.result import OutsideRun
-from splatctrl_cli.jobs.running.progress import Progress
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
@@ -27,6 +24,9 @@ from splatctrl_cli.control.step import OURS, Commander, ControlStep
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
 from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.replay.result import OutsideRun
+from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.state.twists import read_twists
 from splatctrl_cli.records import Float64, FloatRows, Stamps
 from splatctrl_cli.robot.model import RobotModel

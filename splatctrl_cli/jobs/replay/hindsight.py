@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-from splatctrl_cli.jobs.replay.known_scene import KnownScene
 
 from splatctrl_cli.config.fixed import UNWATCHED_AFTER_NS, UNWATCHED_APART_NS, UNWATCHED_NS
 from splatctrl_cli.control.near_space import NearSpace
+from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.records import Float64, Stamps
 
 STEP_NS = 100_000_000  # between looks after a motion

@@ -5,9 +5,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.robot.logged_robot import other_frame, urdf_of, with_self_model
-from splatctrl_cli.jobs.running.progress import SILENT, Progress
 
 from splatctrl_cli.checks.check_states import PoseAgreement, check_angles, check_states, pose_agreement
 from splatctrl_cli.checks.clock_offset import (
@@ -22,6 +19,9 @@ from splatctrl_cli.config.fixed import COVERED_COARSE, SELF_POSTURES
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
 from splatctrl_cli.geometry import transform_from, transform_points
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.robot.logged_robot import other_frame, urdf_of, with_self_model
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.log.stored_frame import FrameSource
 from splatctrl_cli.recording.state.state_source import StateSource, open_states

@@ -10,8 +10,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from splatctrl_cli.formats.grid.npz_grid import read_npz
-from splatctrl_cli.formats.scene.scene_folder import open_scene
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import NEXT_SCENE_NS
@@ -25,6 +23,8 @@ from splatctrl_cli.field.distance import SphereField, field_over
 from splatctrl_cli.field.grid_field import GridField, exact_channel
 from splatctrl_cli.field.obstacles import NO_SPLAT, ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Parts, sha256
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, Index, Label, SplatSet, UInt8
 from splatctrl_cli.voxels import SWEPT, Balls, EvidenceClass, OccupancyGrid, SeenVoxels, VoxelState
 

@@ -7,8 +7,16 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import POSE_JUMP
+from splatctrl_cli.control.audit import Observed
+from splatctrl_cli.control.near_space import Seen
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.files.output import Stopwatch, write_run
 from splatctrl_cli.formats.scene.voxel_file import read_seen, read_unrepresented
 from splatctrl_cli.formats.splat.splats import read_ply
+from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import check_pose_jumps
 from splatctrl_cli.jobs.replay.evidence import EVERY, every_of, trained, training_options
@@ -25,14 +33,6 @@ from splatctrl_cli.jobs.replay.known_scene import (
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, FitDevice
 from splatctrl_cli.jobs.running.progress import Progress
-
-from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import POSE_JUMP
-from splatctrl_cli.control.audit import Observed
-from splatctrl_cli.control.near_space import Seen
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.files.output import Stopwatch, write_run
-from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.log.stored_frame import FrameSource
 from splatctrl_cli.recording.state.state_source import open_states

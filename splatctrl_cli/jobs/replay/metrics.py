@@ -8,10 +8,6 @@ from functools import partial
 from operator import attrgetter
 
 import numpy as np
-from splatctrl_cli.jobs.replay.goal import TWIST_FIGURES
-from splatctrl_cli.jobs.replay.inputs import LOG_FIGURES, LoggedStates
-from splatctrl_cli.jobs.replay.result import Replay
-from splatctrl_cli.jobs.replay.state_store import RUNGS
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import MOTION_WINDOW
@@ -46,6 +42,10 @@ from splatctrl_cli.evaluate.metrics import (
     largest_of,
     least_of,
 )
+from splatctrl_cli.jobs.replay.goal import TWIST_FIGURES
+from splatctrl_cli.jobs.replay.inputs import LOG_FIGURES, LoggedStates
+from splatctrl_cli.jobs.replay.result import Replay
+from splatctrl_cli.jobs.replay.state_store import RUNGS
 from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.voxels import EvidenceClass
 

@@ -4,6 +4,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.barriers import scene_margin
+from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
+from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
+from splatctrl_cli.control.preconditions import StaticViolation, check_within_limits, static_violations
+from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, StepRecord, closed_loop, divergence, scene_change
+from splatctrl_cli.control.step import Commander
+from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.jobs.replay.detours import planned_ways_out
 from splatctrl_cli.jobs.replay.goal import commander_of, goal_waypoints, outside_run, twist_figures, twist_track
 from splatctrl_cli.jobs.replay.inputs import check_inside
@@ -14,15 +23,6 @@ from splatctrl_cli.jobs.replay.result import Replay
 from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
 from splatctrl_cli.jobs.replay.state_store import Figures, StoredLoop, StoredOpenLoop
 from splatctrl_cli.jobs.running.progress import Progress
-
-from splatctrl_cli.config import Config
-from splatctrl_cli.control.barriers import scene_margin
-from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
-from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
-from splatctrl_cli.control.preconditions import StaticViolation, check_within_limits, static_violations
-from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, StepRecord, closed_loop, divergence, scene_change
-from splatctrl_cli.control.step import Commander
-from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.model import RobotModel

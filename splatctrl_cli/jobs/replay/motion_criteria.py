@@ -4,6 +4,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+
+from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
+from splatctrl_cli.control.events import Event, EventKind
+from splatctrl_cli.evaluate.verdict import Criterion, Reason, counted, failed, held, lacking
 from splatctrl_cli.jobs.replay.control_criteria import commanded, controller, goal, scene_hits
 from splatctrl_cli.jobs.replay.criteria_input import (
     BROKEN,
@@ -19,10 +23,6 @@ from splatctrl_cli.jobs.replay.criteria_input import (
     time_of_least,
 )
 from splatctrl_cli.jobs.replay.inputs import bare_moving_links, recorded_postures
-
-from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
-from splatctrl_cli.control.events import Event, EventKind
-from splatctrl_cli.evaluate.verdict import Criterion, Reason, counted, failed, held, lacking
 from splatctrl_cli.robot.self_margins import least_gap
 
 

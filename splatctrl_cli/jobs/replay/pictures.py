@@ -5,12 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from splatctrl_cli.jobs.replay.request import ReplayInputs
-from splatctrl_cli.jobs.replay.result import Replay
 
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event, EventKind
 from splatctrl_cli.evaluate.worst_frames import Moment, Sight, draw_sight, sights_of, worst_moments
+from splatctrl_cli.jobs.replay.request import ReplayInputs
+from splatctrl_cli.jobs.replay.result import Replay
 from splatctrl_cli.records import Float64, FloatRows, RgbdFrame
 from splatctrl_cli.report.replay_pictures import (
     clearance_picture,

@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from splatctrl_cli.formats.scene.scene_folder import SceneFolder
-from splatctrl_cli.jobs.recordings.same_recording import changed_files, differences
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.config.fixed import (
@@ -18,6 +16,8 @@ from splatctrl_cli.config.fixed import (
     SAME_LINK_AREA,
     SAME_MOTION_STATES,
 )
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder
+from splatctrl_cli.jobs.recordings.same_recording import changed_files, differences
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB
 from splatctrl_cli.records import RecordSource, Stamps

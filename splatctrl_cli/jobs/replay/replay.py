@@ -4,6 +4,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from splatctrl_cli.checks.clock_offset import ImageMotion
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.evaluate.gates import check_gate_names
+from splatctrl_cli.evaluate.verdict import Verdict, brief
+from splatctrl_cli.evaluate.views import frames_of
+from splatctrl_cli.evaluate.worst_frames import Sight
+from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.jobs.reconstruct.reconstruct import declarations_of
 from splatctrl_cli.jobs.replay.criteria_input import Judged
@@ -34,14 +41,6 @@ from splatctrl_cli.jobs.replay.truth import with_agreement, with_truth
 from splatctrl_cli.jobs.replay.verdict import ASKED, replay_verdict
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-
-from splatctrl_cli.checks.clock_offset import ImageMotion
-from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.verdict import Verdict, brief
-from splatctrl_cli.evaluate.views import frames_of
-from splatctrl_cli.evaluate.worst_frames import Sight
-from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
 from splatctrl_cli.recording.capture.capture_header import ROBOT
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.robot.model import RobotModel

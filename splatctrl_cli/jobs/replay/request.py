@@ -4,14 +4,13 @@ from dataclasses import dataclass
 from dataclasses import field as made_by
 from pathlib import Path
 
+from splatctrl_cli.config.fixed import POSE_JUMP
+from splatctrl_cli.control.goals import LoggedMotion
+from splatctrl_cli.control.outside import STEP_LIMIT
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.jobs.replay.provenance import Mismatch
 from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.jobs.running.device import RunOptions
-
-from splatctrl_cli.config.fixed import POSE_JUMP
-from splatctrl_cli.control.goals import LoggedMotion
-from splatctrl_cli.control.outside import STEP_LIMIT
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import RecordSource

@@ -3,10 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from splatctrl_cli.jobs.replay.evidence import MapError
-from splatctrl_cli.jobs.replay.hindsight import Overtaken, Unwatched
-from splatctrl_cli.jobs.replay.state_store import Figures, StoredAudit, StoredOpenLoop, StoredSteps
-
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.events import Event
 from splatctrl_cli.control.outside import Failure
@@ -14,6 +10,9 @@ from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.clearance_agreement import ClearanceAgreement
+from splatctrl_cli.jobs.replay.evidence import MapError
+from splatctrl_cli.jobs.replay.hindsight import Overtaken, Unwatched
+from splatctrl_cli.jobs.replay.state_store import Figures, StoredAudit, StoredOpenLoop, StoredSteps
 from splatctrl_cli.records import FloatRows
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin

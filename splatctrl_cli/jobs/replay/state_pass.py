@@ -5,9 +5,6 @@ from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
-from splatctrl_cli.jobs.replay.hindsight import Hindsight, NewerDepth
-from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene
-from splatctrl_cli.jobs.replay.state_store import BLOCK, Figures, StoredAudit, StoredObjects
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
@@ -20,6 +17,9 @@ from splatctrl_cli.control.limits import MotionLimits
 from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace, Seen
 from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep
+from splatctrl_cli.jobs.replay.hindsight import Hindsight, NewerDepth
+from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene
+from splatctrl_cli.jobs.replay.state_store import BLOCK, Figures, StoredAudit, StoredObjects
 from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel

@@ -3,6 +3,10 @@
 from collections.abc import Iterator
 
 import numpy as np
+
+from splatctrl_cli.config.fixed import CLOCKS_APART, SAME_MOMENT_NS
+from splatctrl_cli.control.events import EventKind
+from splatctrl_cli.evaluate.verdict import Reason, counted, failed, held, lacking
 from splatctrl_cli.jobs.replay.criteria_input import (
     CONTACT,
     MARGIN,
@@ -14,10 +18,6 @@ from splatctrl_cli.jobs.replay.criteria_input import (
     seconds_at,
 )
 from splatctrl_cli.jobs.replay.metrics import is_blank
-
-from splatctrl_cli.config.fixed import CLOCKS_APART, SAME_MOMENT_NS
-from splatctrl_cli.control.events import EventKind
-from splatctrl_cli.evaluate.verdict import Reason, counted, failed, held, lacking
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:

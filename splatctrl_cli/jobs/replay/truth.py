@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from splatctrl_cli.jobs.replay.request import ReplayInputs
-from splatctrl_cli.jobs.replay.result import Replay
 
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.events import Event, EventFold, EventKind, Obstacle
 from splatctrl_cli.control.signals import clearance_signals
 from splatctrl_cli.evaluate.clearance_agreement import clearance_agreement, mark_seen
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, ranges
+from splatctrl_cli.jobs.replay.request import ReplayInputs
+from splatctrl_cli.jobs.replay.result import Replay
 from splatctrl_cli.records import Float64, RgbdFrame, Stamps
 from splatctrl_cli.simulate.truth import distance_to
 

@@ -3,15 +3,14 @@
 from collections.abc import Iterator
 from operator import attrgetter
 
+from splatctrl_cli.control.line_process import shown
+from splatctrl_cli.evaluate.gates import gate_reasons
+from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
 from splatctrl_cli.jobs.replay.criteria_input import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words
 from splatctrl_cli.jobs.replay.metrics import counts_of, first_time
 from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION
 from splatctrl_cli.jobs.replay.request import ReplayRequest
-
-from splatctrl_cli.control.line_process import shown
-from splatctrl_cli.evaluate.gates import gate_reasons
-from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
 from splatctrl_cli.robot.declared_contact import carried_words
 
 ASKED = ("--require",)  # criteria that the request itself asked for

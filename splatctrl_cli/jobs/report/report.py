@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from splatctrl_cli.errors import DAMAGE, InputError, SplatCtrlError
+from splatctrl_cli.files.output import output_path
 from splatctrl_cli.jobs.batch.graph import columns_of
 from splatctrl_cli.jobs.report.sections import PASSED, changes_since, section_of
 from splatctrl_cli.jobs.report.spaces import space_of, space_of_run
@@ -23,9 +25,6 @@ from splatctrl_cli.jobs.runs.run_folder import (
     open_batch,
     open_run,
 )
-
-from splatctrl_cli.errors import DAMAGE, InputError, SplatCtrlError
-from splatctrl_cli.files.output import output_path
 from splatctrl_cli.report.page import Cell, Page, Picture, Row, RunSection, Table, packed, picture, rendered
 
 MOST_SCENES = 6  # of a batch, without `all_scenes`

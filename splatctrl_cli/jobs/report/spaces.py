@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatctrl_cli.formats.grid.iso_surface import iso_surface
-from splatctrl_cli.formats.grid.npz_grid import read_npz
-from splatctrl_cli.formats.scene.scene_folder import SceneFolder, Snapshot, open_scene
-from splatctrl_cli.formats.splat.splats import nearest_splats, read_splats
-from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, States, open_run
 
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.output import sha256
+from splatctrl_cli.formats.grid.iso_surface import iso_surface
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder, Snapshot, open_scene
+from splatctrl_cli.formats.splat.splats import nearest_splats, read_splats
 from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, States, open_run
 from splatctrl_cli.recording.capture.capture_header import ROBOT
 from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
 from splatctrl_cli.report.page import Deciding, Motion, Space, SplatsAt, Surface, bodies_of, coarsened

@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import DAMAGE, read_arrays
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.log.survey import NAME, RobotDescription
 from splatctrl_cli.recording.source import logged_descriptions

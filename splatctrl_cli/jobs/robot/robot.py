@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatctrl_cli.jobs.running.progress import SILENT, Progress
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
@@ -16,6 +15,7 @@ from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
 from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.geometry import transform_points
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.report.robot_picture import robot_picture
 from splatctrl_cli.robot.coverage import CoverageReport, LinkCoverage, coverage_of_solids

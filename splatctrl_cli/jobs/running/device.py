@@ -6,11 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.jobs.running.progress import Progress
-
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import CARD_LEAST_WORK
 from splatctrl_cli.errors import DeviceFault, DeviceFull, UsageError
+from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.kernels.cuda.driver import Card, usable_card
 from splatctrl_cli.kernels.cuda.fit import DeviceFit, bytes_needed
 from splatctrl_cli.kernels.cuda.memory import FIELD, FIT, DeviceError, Memory, OutOfMemory

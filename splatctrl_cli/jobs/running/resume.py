@@ -7,12 +7,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.formats.scene.scene_writer import Checkpoint, read_checkpoint
-
 from splatctrl_cli import __version__
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.output import sha256
+from splatctrl_cli.formats.scene.scene_writer import Checkpoint, read_checkpoint
 from splatctrl_cli.kernels import arithmetic
 
 DECIDING_OPTIONS: Mapping[str, object] = {  # what decides the bytes of a scene beside its configuration, if not given

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder
 from splatctrl_cli.jobs.recordings.open_recording import (
     RecordingRequest,
@@ -14,9 +16,6 @@ from splatctrl_cli.jobs.recordings.open_recording import (
 )
 from splatctrl_cli.jobs.recordings.same_recording import changed_files, differences
 from splatctrl_cli.jobs.running.progress import Progress
-
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.recording.folder.dtu_source import DtuSource
 from splatctrl_cli.recording.source import lacks_depth, open_session, open_source
 from splatctrl_cli.recording.source_options import SourceOptions

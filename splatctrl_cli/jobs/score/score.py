@@ -8,19 +8,6 @@ from math import nan
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_splats, run_value
-from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
-from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.score.reference import (
-    Reference,
-    cameras_to_score,
-    check_times,
-    check_training,
-    open_reference,
-    recording_check,
-)
-from splatctrl_cli.jobs.score.views import CloudSettings, Scorer, Scores, cloud_figures
-
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.score import PROTOCOL, as_json, free_mass, total_score
@@ -37,6 +24,18 @@ from splatctrl_cli.evaluate.score_report import (
 from splatctrl_cli.evaluate.verdict import Verdict, brief
 from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_splats, run_value
+from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.jobs.score.reference import (
+    Reference,
+    cameras_to_score,
+    check_times,
+    check_training,
+    open_reference,
+    recording_check,
+)
+from splatctrl_cli.jobs.score.views import CloudSettings, Scorer, Scores, cloud_figures
 from splatctrl_cli.records import Label
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, view_picture
 

@@ -11,12 +11,6 @@ from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
-from splatctrl_cli.formats.mesh import load_mesh
-from splatctrl_cli.formats.ply import is_mesh, read_positions
-from splatctrl_cli.formats.scene.scene_folder import SceneFolder
-from splatctrl_cli.jobs.reconstruct.correct_views import corrected, corrected_among
-from splatctrl_cli.jobs.running.progress import Progress, Wait
-from splatctrl_cli.jobs.score.reference import Reference
 
 from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
 from splatctrl_cli.errors import NotEvaluableError, UsageError
@@ -26,6 +20,12 @@ from splatctrl_cli.evaluate.score import ViewScore, score_view
 from splatctrl_cli.evaluate.score_report import Doubts
 from splatctrl_cli.evaluate.views import View, seen_by, seen_pixels, surface_points, views_to_score
 from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.formats.mesh import load_mesh
+from splatctrl_cli.formats.ply import is_mesh, read_positions
+from splatctrl_cli.formats.scene.scene_folder import SceneFolder
+from splatctrl_cli.jobs.reconstruct.correct_views import corrected, corrected_among
+from splatctrl_cli.jobs.running.progress import Progress, Wait
+from splatctrl_cli.jobs.score.reference import Reference
 from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, Label, RgbdFrame, SplatSet
 from splatctrl_cli.report.pictures import ComparisonRow
 from splatctrl_cli.scene.gaussians import render_gaussians

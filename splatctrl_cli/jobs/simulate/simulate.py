@@ -5,11 +5,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.simulate.simulated_arm import adapted_motion, copied_arm
-
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.jobs.simulate.simulated_arm import adapted_motion, copied_arm
 from splatctrl_cli.recording.container.mcap_writer import mcap_log
 from splatctrl_cli.recording.folder.dtu import DtuView, write_dtu
 from splatctrl_cli.recording.folder.idr import write_idr

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 from defusedxml import ElementTree
-from splatctrl_cli.formats.mesh import load_mesh
-from splatctrl_cli.jobs.running.progress import Progress
 
 from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.mesh import load_mesh
+from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.planner.planned import goal_postures
 from splatctrl_cli.records import Float64

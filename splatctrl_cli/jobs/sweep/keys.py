@@ -7,14 +7,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.jobs.batch.graph import CommandLine
-from splatctrl_cli.jobs.batch.suite import Job
-from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, open_run
-
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.ranges import Within
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import sha256
+from splatctrl_cli.jobs.batch.graph import CommandLine
+from splatctrl_cli.jobs.batch.suite import Job
+from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, open_run
 from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB
 from splatctrl_cli.simulate.tabletop import VISITOR
 

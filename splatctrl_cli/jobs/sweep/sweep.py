@@ -7,6 +7,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.evaluate.verdict import EXIT_CODES, Outcome
+from splatctrl_cli.files.output import check_can_be_written, write_durably, write_json
 from splatctrl_cli.jobs.batch.batch import check_same_asked, scheduling, write_batch
 from splatctrl_cli.jobs.batch.graph import CommandLine, Node, nodes_of
 from splatctrl_cli.jobs.batch.ledger import Ledger, Run
@@ -16,10 +19,6 @@ from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, open_run
 from splatctrl_cli.jobs.sweep.keys import Chain, Key, chain_of, key_of
 from splatctrl_cli.jobs.sweep.search import Flip, find_flip, find_least
-
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.evaluate.verdict import EXIT_CODES, Outcome
-from splatctrl_cli.files.output import check_can_be_written, write_durably, write_json
 
 FORMAT, VERSION = "splatctrl-sweep", 1
 TOLERANCE = 1 / 64  # of a range

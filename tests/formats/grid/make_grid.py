@@ -1,8 +1,8 @@
 """Distance grids of known content: random channels that no two cells share, and a ball."""
 
 import numpy as np
-from splatctrl_cli.formats.grid.grid_format import CHANNELS, FORMAT, VERSION
 
+from splatctrl_cli.formats.grid.grid_format import CHANNELS, FORMAT, VERSION
 from splatctrl_cli.records import DistanceGrid, Float64
 
 SHAPE = (5, 4, 11)  # no two alike, none a multiple of eight

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from splatctrl_cli.formats.grid.planner_grids import write_curobo
-from tests.formats.grid.make_grid import HEADER, centers, random_grid, with_unknown
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.grid.planner_grids import write_curobo
 from splatctrl_cli.records import DistanceGrid
+from tests.formats.grid.make_grid import HEADER, centers, random_grid, with_unknown
 
 f32 = np.float32
 

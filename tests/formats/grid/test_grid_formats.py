@@ -2,13 +2,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.grid.grid_format import GridFormat, SlabPlan, start_slabs
-from splatctrl_cli.formats.grid.grid_formats import FORMATS, check_formats, write_grid
-from tests.formats.grid.make_grid import HEADER, ball_grid, random_grid
 
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.formats.grid.grid_format import GridFormat, SlabPlan, start_slabs
+from splatctrl_cli.formats.grid.grid_formats import FORMATS, check_formats, write_grid
 from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import DistanceGrid
+from tests.formats.grid.make_grid import HEADER, ball_grid, random_grid
 
 PLACE = {"shape": [21, 22, 23], "voxel": 0.04}
 MADE = {key: HEADER[key] for key in ("distance", "splats_used", "labels", "frame")}

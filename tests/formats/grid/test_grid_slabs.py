@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.grid.grid_format import GridSlabs, SlabPlan, resume_slabs, start_slabs
-from tests.formats.grid.make_grid import SHAPE, random_grid
 
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.formats.grid.grid_format import GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.records import DistanceGrid
+from tests.formats.grid.make_grid import SHAPE, random_grid
 
 CHANNELS = ("sdf", "gradient", "observed")
 PLAN = SlabPlan(

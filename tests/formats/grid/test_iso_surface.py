@@ -3,12 +3,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from splatctrl_cli.formats.grid import iso_surface as module
-from splatctrl_cli.formats.grid.iso_surface import Surface, iso_surface, write_surface
-from tests.formats.grid.make_grid import ball_grid, random_grid
 
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.formats.grid import iso_surface as module
+from splatctrl_cli.formats.grid.iso_surface import Surface, iso_surface, write_surface
 from splatctrl_cli.records import DistanceGrid
+from tests.formats.grid.make_grid import ball_grid, random_grid
 
 MIDDLE = np.array([0.1, 0.0, 0.0])
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.grid import planner_grids
-from splatctrl_cli.formats.grid.planner_grids import read_moveit_head, write_moveit
-from tests.formats.grid.make_grid import HEADER, ball_grid, centers, random_grid, with_unknown
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.grid import planner_grids
+from splatctrl_cli.formats.grid.planner_grids import read_moveit_head, write_moveit
 from splatctrl_cli.records import Bool, DistanceGrid, Float64
+from tests.formats.grid.make_grid import HEADER, ball_grid, centers, random_grid, with_unknown
 
 
 def read_from_stream(path: Path) -> tuple[Float64, float, Bool]:

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.grid.npz_grid import read_npz, read_npz_head, write_npz
-from tests.formats.grid.make_grid import HEADER, SHAPE, random_grid, with_unknown
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.grid.npz_grid import read_npz, read_npz_head, write_npz
 from splatctrl_cli.records import DistanceGrid
+from tests.formats.grid.make_grid import HEADER, SHAPE, random_grid, with_unknown
 
 
 @pytest.fixture

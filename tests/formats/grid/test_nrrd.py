@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from splatctrl_cli.formats.grid import grid_format
 from splatctrl_cli.formats.grid.nrrd import PREFIX, read_nrrd_head, write_nrrd
 from tests.formats.grid.make_grid import random_grid, with_unknown

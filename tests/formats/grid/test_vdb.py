@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.grid.npz_grid import write_npz
-from splatctrl_cli.formats.grid.vdb import openvdb, read_vdb_head, write_vdb
-from tests.formats.grid.make_grid import random_grid, with_unknown
 
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.formats.grid.npz_grid import write_npz
+from splatctrl_cli.formats.grid.vdb import openvdb, read_vdb_head, write_vdb
 from splatctrl_cli.recording.source import describe
+from tests.formats.grid.make_grid import random_grid, with_unknown
 
 ROOT = Path(__file__).parents[3]
 ROUND_TRIP = """

@@ -2,11 +2,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.grid import grid_format
 from splatctrl_cli.formats.grid.vti import read_vti, read_vti_head, write_vti
 from tests.formats.grid.make_grid import SHAPE, random_grid, with_unknown
-
-from splatctrl_cli.errors import InputError
 
 
 @pytest.mark.parametrize("channels", [(), ("sdf",), ("sdf", "bound", "observed")])

@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.files.output import write_json
 from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.formats.scene.scene_writer import CHECKPOINT, SceneWriter, read_checkpoint
@@ -20,9 +23,6 @@ from splatctrl_cli.formats.scene.voxel_file import (
     write_occupancy,
     write_states,
 )
-
-from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.files.output import write_json
 from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.voxels import SWEPT, EvidenceClass, LostEdges, OccupancyGrid, Unseen

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.splat.packed_splats import read_splat, write_splat
-from tests.formats.splat.test_gaussian_ply import gaussian_set
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.splat.packed_splats import read_splat, write_splat
+from tests.formats.splat.test_gaussian_ply import gaussian_set
 
 ROW = struct.Struct("<6f8B")
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.splat.gaussian_ply import NAMES, read_gaussian_ply, write_gaussian_ply
-from splatctrl_cli.formats.splat.splats import read_ply
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.splat.gaussian_ply import NAMES, read_gaussian_ply, write_gaussian_ply
+from splatctrl_cli.formats.splat.splats import read_ply
 from splatctrl_cli.records import GaussianSet, SplatSet
 
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from splatctrl_cli.formats.splat.gltf import read_gltf, write_glb
-from tests.formats.splat.test_gaussian_ply import gaussian_set
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.splat.gltf import read_gltf, write_glb
 from splatctrl_cli.records import GaussianSet
+from tests.formats.splat.test_gaussian_ply import gaussian_set
 
 SPLATS = "KHR_gaussian_splatting"
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.ply import is_mesh, read_points, read_positions
-from tests.formats.splat.test_gaussian_ply import ascii_ply
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.ply import is_mesh, read_points, read_positions
+from tests.formats.splat.test_gaussian_ply import ascii_ply
 
 COLOURED = ["x", "y", "z", "red", "green", "blue"]
 ROWS: list[list[object]] = [[1, 2, 3, 255, 0, 51], [4, 5, 6, 0, 255, 0]]

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.splat import usd
 from splatctrl_cli.formats.splat.gaussian_ply import REFERENCE_PLY, write_gaussian_ply
 from splatctrl_cli.formats.splat.splat_format import SplatFormat, differences
@@ -18,12 +20,10 @@ from splatctrl_cli.formats.splat.splats import (
     read_splats,
     write_ply,
 )
-from tests.formats.splat.test_gaussian_ply import gaussian_set
-from tests.formats.splat.test_splats import splat_set
-
-from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.recording.source import describe
 from splatctrl_cli.records import GaussianSet, SplatSet
+from tests.formats.splat.test_gaussian_ply import gaussian_set
+from tests.formats.splat.test_splats import splat_set
 
 
 @pytest.fixture(params=FORMATS.values(), ids=FORMATS)

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.splat.gaussian_ply import read_gaussian_ply
-from splatctrl_cli.formats.splat.splats import DTYPE, read_ply, write_ply
-from tests.formats.splat.test_gaussian_ply import ascii_ply, assert_equal_bits
 
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.formats.splat.gaussian_ply import read_gaussian_ply
+from splatctrl_cli.formats.splat.splats import DTYPE, read_ply, write_ply
 from splatctrl_cli.records import Label, SplatSet
+from tests.formats.splat.test_gaussian_ply import ascii_ply, assert_equal_bits
 from tests.plain import plain_splats
 
 MINIMAL = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]

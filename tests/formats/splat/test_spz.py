@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.splat.packed_splats import read_spz, spz_bound, write_spz
 from splatctrl_cli.formats.splat.splat_format import differences
 from tests.formats.splat.test_gaussian_ply import gaussian_set
-
-from splatctrl_cli.errors import InputError
 
 HEADER = struct.Struct("<IIIBBBB")
 MAGIC = 0x5053474E

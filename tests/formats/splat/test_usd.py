@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.splat.usd import read_usd, write_usd
-from tests.formats.splat.test_gaussian_ply import gaussian_set
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.splat.usd import read_usd, write_usd
+from tests.formats.splat.test_gaussian_ply import gaussian_set
 
 pxr = pytest.importorskip("pxr", reason="usd-core is not installed: USD was not written")
 

@@ -5,11 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.jobs.bake.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake.request import BakeRequest
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-
-from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.records import Box
 
 

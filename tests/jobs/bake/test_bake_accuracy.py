@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from splatctrl_cli.formats.splat.splats import read_ply, write_ply
-from splatctrl_cli.jobs.bake.bake import BakeResult, counts_of
-from tests.jobs.bake.baked import baked, field_json
 
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.formats.splat.splats import read_ply, write_ply
+from splatctrl_cli.jobs.bake.bake import BakeResult, counts_of
 from splatctrl_cli.simulate.truth import load_truth
 from tests.cli.replay_desk import write_scene
 from tests.field.scenes import splat_set
+from tests.jobs.bake.baked import baked, field_json
 
 BOX = np.array([[0.4, -0.15, -0.05], [0.7, 0.15, 0.2]])
 

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.jobs.bake.bake import BakeResult
-from tests.jobs.bake.baked import baked, field_json
-
-from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.records import Label, SplatSet
 from tests.field.scenes import cloud, splat_set
+from tests.jobs.bake.baked import baked, field_json
 
 BOX = (-0.2, -0.2, -0.2, 0.2, 0.2, 0.2)
 

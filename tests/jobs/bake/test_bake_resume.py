@@ -13,19 +13,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.grid.grid_format import GridSlabs
-from splatctrl_cli.formats.grid.grid_formats import FORMATS
-from splatctrl_cli.formats.splat.splats import write_ply
-from splatctrl_cli.jobs.bake import slabs as bake_slabs
-from splatctrl_cli.jobs.bake.bake import BakeResult
-from tests.jobs.bake.baked import Said, baked
 
 from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.field import grid_cells, slabs
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_cells import GridLayout
+from splatctrl_cli.formats.grid.grid_format import GridSlabs
+from splatctrl_cli.formats.grid.grid_formats import FORMATS
+from splatctrl_cli.formats.splat.splats import write_ply
+from splatctrl_cli.jobs.bake import slabs as bake_slabs
+from splatctrl_cli.jobs.bake.bake import BakeResult
 from splatctrl_cli.records import Label
 from tests.field.scenes import cloud, splat_set
+from tests.jobs.bake.baked import Said, baked
 from tests.jobs.stopped import contents, failing
 
 ROOT = Path(__file__).parents[3]

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.scene.scene_writer import SceneWriter
-from splatctrl_cli.formats.splat.splats import write_ply
-from splatctrl_cli.jobs.bake.bake import BakeResult
-from tests.jobs.bake.baked import Said, baked, field_json
 
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 from splatctrl_cli.field import slabs
+from splatctrl_cli.formats.scene.scene_writer import SceneWriter
+from splatctrl_cli.formats.splat.splats import write_ply
+from splatctrl_cli.jobs.bake.bake import BakeResult
 from splatctrl_cli.records import Label, SplatSet
 from tests.field.scenes import cloud, splat_set
+from tests.jobs.bake.baked import Said, baked, field_json
 from tests.jobs.stopped import interrupt
 from tests.plain import known, plain_grid
 

@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 
 import pytest
+
 from splatctrl_cli.jobs.batch.ledger import Ledger
 from splatctrl_cli.jobs.batch.run import DONE, Scheduler
 from splatctrl_cli.jobs.running.progress import SILENT

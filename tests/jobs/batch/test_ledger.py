@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from splatctrl_cli.jobs.batch.ledger import NAME, VERSION, Ledger, Run, write_csv
 
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.jobs.batch.ledger import NAME, VERSION, Ledger, Run, write_csv
 
 
 def run(node: str, **more: object) -> Run:

@@ -10,15 +10,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
+from splatctrl_cli.files.output import partial_path
 from splatctrl_cli.jobs.batch.batch import verdict_of_runs
 from splatctrl_cli.jobs.batch.ledger import Ledger, Run
 from splatctrl_cli.jobs.batch.run import DONE, ERROR, FAILED, SKIPPED, Clock, Scheduler, local_executor
 from splatctrl_cli.jobs.batch.task import End, Task, run_task, stop_runners
+from splatctrl_cli.kernels.cuda import driver
 from tests.jobs.bake.baked import Said
 from tests.jobs.batch.desk import ENTRY, batch_of, node, states
-
-from splatctrl_cli.files.output import partial_path
-from splatctrl_cli.kernels.cuda import driver
 
 
 def count(told: Path) -> int:

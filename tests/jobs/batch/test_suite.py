@@ -3,11 +3,11 @@
 from pathlib import Path
 
 import pytest
-from splatctrl_cli.jobs.batch.graph import COMMANDS, Node, columns_of, nodes_of, of_shard
-from splatctrl_cli.jobs.batch.suite import Limits, read_suite
 
 from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.jobs.batch.graph import COMMANDS, Node, columns_of, nodes_of, of_shard
+from splatctrl_cli.jobs.batch.suite import Limits, read_suite
 
 RECORDINGS = '[[recordings]]\npaths = ["*.mcap"]\n'
 ROBOT = 'urdf = "arm.urdf"\n'

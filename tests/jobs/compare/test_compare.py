@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, CompareResult, compare, judged_runs
-from splatctrl_cli.jobs.replay.metrics import metric_names
-from splatctrl_cli.jobs.report.report import WriteReportRequest, write_report
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
 from splatctrl_cli.evaluate.metrics import Better
 from splatctrl_cli.evaluate.verdict import Outcome
+from splatctrl_cli.jobs.compare import judged_runs
+from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, CompareResult, compare
+from splatctrl_cli.jobs.replay.metrics import metric_names
+from splatctrl_cli.jobs.report.report import WriteReportRequest, write_report
 from tests.jobs.runs import Runs
 
 OLDER = Path(__file__).parents[2] / "data" / "older.zip"

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-from splatctrl_cli.formats.splat.splats import write_ply
 
+from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.records import SplatSet
 from tests.plain import plain_splats
 

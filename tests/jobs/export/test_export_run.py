@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-from splatctrl_cli.formats.scene.scene_folder import open_scene
-from splatctrl_cli.jobs.export.export_run import ExportRunRequest, export_run
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.export.export_run import ExportRunRequest, export_run
 from splatctrl_cli.recording.container.foxglove import read_foxglove
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import VoxelState
@@ -175,7 +175,7 @@ def test_a_run_of_another_kind_is_refused(run: Runs) -> None:
         export_run(ExportRunRequest(path=folder))
 
 
-def test_the_command_writes_beside_the_run_and_takes_no_option_of_splat_files(
+def test_the_command_writes_beside_the_run_and_takes_no_option_of_splats(
     run: Runs, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = run()

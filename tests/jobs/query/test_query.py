@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats import ply
-from splatctrl_cli.formats.grid.npz_grid import read_npz
-from splatctrl_cli.formats.splat.splats import write_ply
-from splatctrl_cli.jobs.query.point_answers import TITLES
-from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
-from tests.jobs.bake.baked import baked
 
 from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.field.distance import SphereField, make_field, march
 from splatctrl_cli.field.grid_field import GridField
+from splatctrl_cli.formats import ply
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.splat.splats import write_ply
+from splatctrl_cli.jobs.query.point_answers import TITLES
+from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
 from splatctrl_cli.records import Float64, Label
 from tests.cli.replay_desk import splats_of, write_scene
+from tests.jobs.bake.baked import baked
 from tests.recording.log.make_states import START_NS
 
 BALLS = (((0.0, 0.0, 0.0), 0.10), ((0.5, 0.0, 0.0), 0.05))

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.config import load_config
 from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from tests.jobs.bake.baked import Said
-
-from splatctrl_cli.config import load_config
 from splatctrl_cli.records import Record
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.recording import START_NS, Recording, RecordingOptions
 from tests.cli.replay_desk import START, Desk, FakeSource
+from tests.jobs.bake.baked import Said
 from tests.jobs.stage import MOVE, Stage, states_on
 
 pytestmark = pytest.mark.usefixtures("without_plots")

@@ -5,6 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.calibration.gray_views import exposed
+from splatctrl_cli.calibration.pose_refinement import unbent
+from splatctrl_cli.config import load_config
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, ViewCorrection
 from splatctrl_cli.jobs.reconstruct.correct_views import Corrections, corrected, corrected_among
 from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
@@ -12,14 +17,9 @@ from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
 from splatctrl_cli.jobs.score import reference as score_reference
 from splatctrl_cli.jobs.score.score import ScoreRequest, score
-from tests.jobs.score.wall import FakeSource
-
-from splatctrl_cli.calibration.gray_views import exposed
-from splatctrl_cli.calibration.pose_refinement import unbent
-from splatctrl_cli.config import load_config
-from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import RgbdFrame
 from tests.calibration.scan import a_bend, bent, disturbed, gains_of, robot_in, views_of
+from tests.jobs.score.wall import FakeSource
 
 SMALL = [
     "scene.max_splats=1500",

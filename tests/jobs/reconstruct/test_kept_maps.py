@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
-from splatctrl_cli.formats.scene.scene_writer import SceneWriter
-from splatctrl_cli.jobs.reconstruct.kept_maps import KeptMaps
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.formats.scene.scene_writer import SceneWriter
+from splatctrl_cli.jobs.reconstruct.kept_maps import KeptMaps
 from splatctrl_cli.records import Label
 from tests.field.scenes import splat_set
 from tests.plain import known, plain_grid

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import savez
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter, read_checkpoint
@@ -14,15 +16,13 @@ from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructRequest
 from splatctrl_cli.jobs.replay.inputs import grasp_contacts, open_log, read_states
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL
-from tests.jobs.bake.baked import Said
-
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_model import ALWAYS, SelfModel, surface_digest
+from tests.jobs.bake.baked import Said
 from tests.robot.shapes import held_part
 
 PLATE: Float64 = np.asarray(trimesh.creation.box((0.05, 0.05, 0.05)).triangles)

@@ -9,18 +9,18 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
-from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.running.progress import Progress
-from tests.jobs.bake.baked import Said
 
 from splatctrl_cli.config import Config, SceneConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import strided_lens
 from splatctrl_cli.jobs.check import CheckRequest, check
+from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
+from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import RgbdFrame
 from tests.calibration.scan import views_of
+from tests.jobs.bake.baked import Said
 from tests.recording.folder.make_layout import OPENGL_FROM_OPTICAL
 
 CONFIG = Config(scene=SceneConfig(max_splats=600, first_iterations=20, refine_iterations=20))

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.reconstruct.verdict import GATED, Reconstructed, longest_blind, reconstruct_verdict
-from splatctrl_cli.jobs.recordings.open_recording import CameraAgreement, RecordingRequest, open_to_train
-from splatctrl_cli.jobs.running.progress import SILENT
 
 from splatctrl_cli.config import Config, OccupancyConfig
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
+from splatctrl_cli.jobs.reconstruct.verdict import GATED, Reconstructed, longest_blind, reconstruct_verdict
+from splatctrl_cli.jobs.recordings.open_recording import CameraAgreement, RecordingRequest, open_to_train
+from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.records import LossReport, RecordSource, RgbdFrame
 from splatctrl_cli.scene.time_steps import AuditRow, TimeStep
 from tests.calibration.scan import views_of

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import pytest
-from splatctrl_cli.jobs.reconstruct.self_model import LearnRequest, learn_robot
-from splatctrl_cli.jobs.robot.logged_robot import with_self_model
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.jobs.reconstruct.self_model import LearnRequest, learn_robot
+from splatctrl_cli.jobs.robot.logged_robot import with_self_model
 from splatctrl_cli.robot.model import RobotModel
 
 

@@ -8,21 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.output import part_digests
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.formats.splat.splats import SHELL, read_ply, write_ply
 from splatctrl_cli.jobs.export.export import ExportRequest, export
 from splatctrl_cli.jobs.query.query import QueryRequest, query
 from splatctrl_cli.jobs.report.spaces import space_of_scene
-from tests.jobs.bake.baked import baked
-from tests.jobs.score.test_score import run as scores
-from tests.jobs.score.wall import FRAMES, FakeScene, FakeSource, set_up, wall, write_scene
-
-from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.output import part_digests
 from splatctrl_cli.records import SplatSet
 from tests.cli.replay_desk import splats_of
+from tests.jobs.bake.baked import baked
 from tests.jobs.runs import patch_json
+from tests.jobs.score.test_score import run as scores
+from tests.jobs.score.wall import FRAMES, FakeScene, FakeSource, set_up, wall, write_scene
 from tests.jobs.stage import FAR, Stage, ball_beside, voxels
 
 pytestmark = pytest.mark.usefixtures("without_plots")

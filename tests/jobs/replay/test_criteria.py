@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.replay.control_criteria import controller
-from splatctrl_cli.jobs.replay.motion_criteria import surface_clearance
-from splatctrl_cli.jobs.replay.replay import evidence_criteria as evidence
-from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
+from splatctrl_cli.jobs.replay import evidence_criteria as evidence
+from splatctrl_cli.jobs.replay.control_criteria import controller
+from splatctrl_cli.jobs.replay.motion_criteria import surface_clearance
+from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
 from splatctrl_cli.voxels import EvidenceClass
 
 NUM = 11

@@ -1,10 +1,10 @@
 """The distances in which the closed loop's ways out of local minima are planned."""
 
 import numpy as np
-from splatctrl_cli.jobs.replay.detours import certified_distance
-from splatctrl_cli.jobs.replay.known_scene import splat_fields
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.jobs.replay.detours import certified_distance
+from splatctrl_cli.jobs.replay.known_scene import splat_fields
 from tests.cli.replay_desk import splats_of
 
 

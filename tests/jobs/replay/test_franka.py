@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.replay.inputs import MeasuredRobot, measured_robot
-from splatctrl_cli.jobs.replay.request import ReplayRequest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
+from splatctrl_cli.jobs.replay.inputs import MeasuredRobot, measured_robot
+from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel

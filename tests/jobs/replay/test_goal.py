@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.replay.goal import goal_waypoints
-from splatctrl_cli.jobs.replay.request import ReplayRequest
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.jobs.replay.goal import goal_waypoints
+from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
 from tests.robot.test_fingers import ARM, FRANKA, robot

@@ -5,9 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from splatctrl_cli.formats.grid.npz_grid import read_npz, write_npz
-from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene, fields_at, known_space
-from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
 
 from experiments.problems import simulated_arm
 from splatctrl_cli.config import Config
@@ -16,6 +13,9 @@ from splatctrl_cli.control.events import Obstacle
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.distance import SphereField
+from splatctrl_cli.formats.grid.npz_grid import read_npz, write_npz
+from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene, fields_at, known_space
+from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.self_model import ALWAYS
 from splatctrl_cli.scene.posture import posture_of

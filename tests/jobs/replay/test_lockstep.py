@@ -9,24 +9,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.replay.known_scene import KnownFields, from_splats
-from splatctrl_cli.jobs.replay.lockstep import check_lockstep, from_log
-from splatctrl_cli.jobs.replay.replay import known_scene
-from splatctrl_cli.jobs.replay.replay import replay as job
-from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from tests.jobs.bake.baked import Said
-from tests.jobs.running.test_device import cards, run_of
 
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.jobs.replay import known_scene
+from splatctrl_cli.jobs.replay.known_scene import KnownFields, from_splats
+from splatctrl_cli.jobs.replay.lockstep import check_lockstep, from_log
+from splatctrl_cli.jobs.replay.replay import replay as job
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene
+from tests.jobs.bake.baked import Said
+from tests.jobs.running.test_device import cards, run_of
 from tests.kernels.cuda.emulator import EmulatedDevice
 
 SETTINGS = ["scene.max_splats=600", "scene.first_iterations=15", "scene.iterations_per_step=3"]

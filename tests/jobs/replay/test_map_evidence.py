@@ -7,11 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.replay.evidence import apart_from_robot, held_out, open_evidence, trained
-from splatctrl_cli.jobs.replay.lockstep import from_log
-from splatctrl_cli.jobs.replay.replay import evidence
-from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.running.progress import SILENT
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import load_config
@@ -19,6 +14,11 @@ from splatctrl_cli.config.fixed import SPHERE_CELL
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.geometry import look_at
+from splatctrl_cli.jobs.replay import evidence
+from splatctrl_cli.jobs.replay.evidence import apart_from_robot, held_out, open_evidence, trained
+from splatctrl_cli.jobs.replay.lockstep import from_log
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, Intrinsics, Record, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel

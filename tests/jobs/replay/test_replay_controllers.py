@@ -7,8 +7,8 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from splatctrl_cli.jobs.replay.metrics import metric_names
 
+from splatctrl_cli.jobs.replay.metrics import metric_names
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, Desk, splats_of, write_scene
 from tests.cli.test_replay_modes import ball_ahead, events, moving

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.splat.splats import read_ply, write_ply
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.files.output import part_digests, write_json
+from splatctrl_cli.formats.splat.splats import read_ply, write_ply
 from splatctrl_cli.records import SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import VoxelState

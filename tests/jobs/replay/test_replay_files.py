@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from splatctrl_cli.jobs.replay.files import write_steps
 
 

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from splatctrl_cli.jobs.replay.inputs import MeasuredRobot, doubts_of, measured_robot
-from splatctrl_cli.jobs.replay.replay import files, state_pass, state_store
-from splatctrl_cli.jobs.replay.request import ReplayRequest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.events import EventFold, EventKind, Signal, events_of
 from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.files import spilled_rows
 from splatctrl_cli.geometry import transform_points
+from splatctrl_cli.jobs.replay import files, state_pass, state_store
+from splatctrl_cli.jobs.replay.inputs import MeasuredRobot, doubts_of, measured_robot
+from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.recording.log import state_columns
 from splatctrl_cli.records import Float64, JointState, SphereSet
 from splatctrl_cli.robot import self_margins

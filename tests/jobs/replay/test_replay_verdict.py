@@ -5,8 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.checks.clock_offset import ClockOffset
+from splatctrl_cli.config.fixed import UNSEEN
 from splatctrl_cli.jobs.replay.replay import replay as job
 from splatctrl_cli.jobs.replay.verdict import CRITERIA
+from tests.cli.replay_desk import SECOND, START, grid_seen
 from tests.jobs.replay.broken import (
     ALONE,
     ELSEWHERE,
@@ -18,10 +22,6 @@ from tests.jobs.replay.broken import (
     near_margin,
     no_new_map,
 )
-
-from splatctrl_cli.checks.clock_offset import ClockOffset
-from splatctrl_cli.config.fixed import UNSEEN
-from tests.cli.replay_desk import SECOND, START, grid_seen
 from tests.jobs.stage import (
     FAR,
     MOVE,

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatctrl_cli.formats.grid.npz_grid import read_npz
-from splatctrl_cli.formats.scene.scene_folder import open_scene
-from splatctrl_cli.jobs.replay.known_scene import from_splats, splat_fields
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, ControlConfig
 from splatctrl_cli.control.events import UNREPRESENTED
+from splatctrl_cli.formats.grid.npz_grid import read_npz
+from splatctrl_cli.formats.scene.scene_folder import open_scene
+from splatctrl_cli.jobs.replay.known_scene import from_splats, splat_fields
 from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.voxels import Balls, OccupancyGrid
 from tests.cli.replay_desk import SECOND, splats_of, write_scene

@@ -11,16 +11,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.compare.compare import CompareRequest, compare
-from splatctrl_cli.jobs.report.report import MOST_SCENES, ViewRequest, WriteReportRequest, view, write_report
-from splatctrl_cli.jobs.report.spaces import space_of
-from splatctrl_cli.jobs.runs.run_folder import open_run
 
 from splatctrl_cli.cli import report as command
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import part_digests
 from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.compare.compare import CompareRequest, compare
+from splatctrl_cli.jobs.report.report import MOST_SCENES, ViewRequest, WriteReportRequest, view, write_report
+from splatctrl_cli.jobs.report.spaces import space_of
+from splatctrl_cli.jobs.runs.run_folder import open_run
 from splatctrl_cli.robot.model import RobotModel
 from tests.jobs.runs import Runs, patch_json
 from tests.jobs.stage import passing

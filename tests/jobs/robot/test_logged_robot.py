@@ -8,22 +8,22 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.jobs.check import CheckRequest, check
+from splatctrl_cli.jobs.ingest import IngestRequest, ingest
 from splatctrl_cli.jobs.reconstruct.reconstruct import _robot
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay.inputs import open_log
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.report.spaces import space_of
 from splatctrl_cli.jobs.robot.logged_robot import differs, logged_urdf, urdf_of
-from tests.jobs.bake.baked import Said
-
-from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.jobs.check import CheckRequest, check
-from splatctrl_cli.jobs.ingest import IngestRequest, ingest
 from splatctrl_cli.recording.capture.capture_header import is_capture
 from splatctrl_cli.recording.container.raw_log import RawMessage
 from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.robot.urdf import read_urdf
+from tests.jobs.bake.baked import Said
 from tests.jobs.stage import Stage
 from tests.recording.log.make_log import (
     START_NS,

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from splatctrl_cli.jobs.running import device
-from splatctrl_cli.jobs.running.device import Device
 
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.jobs.running import device
+from splatctrl_cli.jobs.running.device import Device
 from splatctrl_cli.kernels.cuda.driver import Card
 from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Memory
 from splatctrl_cli.scene.fitter import SceneFitter

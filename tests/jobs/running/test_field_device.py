@@ -5,17 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.jobs.bake import request as bake_request
 from splatctrl_cli.jobs.query.query import query
-from tests.jobs.running.test_device import CARD, PROCESSOR, Fails, cards, run_of
-
-from splatctrl_cli.cli.main import main
 from splatctrl_cli.kernels.cuda import driver
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from tests.cli.test_reconstruct import contents
 from tests.field.scenes import cloud, queries, splat_set
+from tests.jobs.running.test_device import CARD, PROCESSOR, Fails, cards, run_of
 from tests.kernels.cuda.emulator import EmulatedDevice
 
 BAKE = ("--box=-0.2,-0.15,-0.1,0.15,0.2,0.14", "--voxel", "0.02", "--formats", "npz", "--no-report")

@@ -4,11 +4,11 @@ import ast
 from pathlib import Path
 
 import pytest
+
+import splatctrl_cli
 from splatctrl_cli.jobs.running import progress
 from splatctrl_cli.jobs.running.progress import Wait, duration
 from tests.jobs.bake.baked import Said
-
-import splatctrl_cli
 
 
 @pytest.fixture

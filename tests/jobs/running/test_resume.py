@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from splatctrl_cli.formats.scene import scene_writer
-from splatctrl_cli.formats.scene.scene_folder import open_scene
-from splatctrl_cli.jobs.reconstruct import reconstruction
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.formats.scene import scene_writer
+from splatctrl_cli.formats.scene.scene_folder import open_scene
+from splatctrl_cli.jobs.reconstruct import reconstruction
 from splatctrl_cli.scene.fitter import SceneFitter
 from tests.jobs.stopped import contents, failing
 

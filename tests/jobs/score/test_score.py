@@ -7,8 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
 from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.recording.folder.dtu import DtuView, write_dtu
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import Label, RgbdFrame
 from tests.jobs.score.wall import (
     AWAY,
     FRAMES,
@@ -22,11 +27,6 @@ from tests.jobs.score.wall import (
     wall,
     write_scene,
 )
-
-from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.recording.folder.dtu import DtuView, write_dtu
-from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import Label, RgbdFrame
 
 
 @pytest.fixture

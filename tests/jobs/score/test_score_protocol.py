@@ -9,10 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, is_folder_of_views
-from splatctrl_cli.jobs.score.reference import missing_views
-from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.jobs.score.views import CloudSettings
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.score import lines_of
@@ -20,6 +16,10 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.held_out_depth import spaced
 from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.geometry import pose_at
+from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, is_folder_of_views
+from splatctrl_cli.jobs.score.reference import missing_views
+from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.score.views import CloudSettings
 from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.recording.folder.dtu_source import DtuSource
 from splatctrl_cli.recording.folder.idr import write_idr

@@ -4,18 +4,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
 from splatctrl_cli.jobs.recordings.same_recording import first_frame
 from splatctrl_cli.jobs.score import score as score_job
 from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
-from tests.jobs.score.wall import FakeScene, FakeSnapshot, wall
-
-from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.recording.container.raw_log import RawMessage
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import RgbdFrame
+from tests.jobs.score.wall import FakeScene, FakeSnapshot, wall
 from tests.recording.log.make_log import FRAME_NS, START_NS, LogRecipe, make_log, messages_of, write_raw
 
 Keep = Callable[[RawMessage], bool]

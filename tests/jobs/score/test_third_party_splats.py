@@ -5,6 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.formats.splat.gaussian_ply import write_gaussian_ply
 from splatctrl_cli.formats.splat.splats import FORMATS, as_gaussians
 from splatctrl_cli.jobs.bake.request import read_bake_source
@@ -12,12 +15,9 @@ from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
 from splatctrl_cli.jobs.score import reference as score_reference
 from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.score.views import CloudSettings
-from tests.jobs.score.wall import FRAMES, INTRINSICS, SIDE, FakeSource, wall
-
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.records import GaussianSet
 from splatctrl_cli.scene.gaussians import render_gaussians
+from tests.jobs.score.wall import FRAMES, INTRINSICS, SIDE, FakeSource, wall
 
 STRETCHED = np.array([1.0, 0.6, 1.4], np.float32)
 

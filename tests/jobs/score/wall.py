@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from splatctrl_cli.formats.scene.scene_folder import ViewCorrection
 from splatctrl_cli.formats.splat.splats import write_ply
+from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.score import reference as score_reference
 from splatctrl_cli.jobs.score import score
-
-from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Float64, Intrinsics, LossReport, Record, RgbdFrame, SplatSet
 from splatctrl_cli.scene.render import render
 from splatctrl_cli.voxels import OccupancyGrid

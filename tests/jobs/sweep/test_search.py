@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+
 from splatctrl_cli.jobs.sweep.search import Flip, find_flip, find_least
 
 Span = tuple[float, float]

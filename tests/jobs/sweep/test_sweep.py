@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from splatctrl_cli.jobs.compare.judged_runs import read_judged
-from splatctrl_cli.jobs.sweep.sweep import SweepRequest, SweepResult, sweep
-from tests.jobs.sweep.entry import Told, config_of, document_of
 
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.files.output import sha256, write_json
+from splatctrl_cli.jobs.compare.judged_runs import read_judged
+from splatctrl_cli.jobs.sweep.sweep import SweepRequest, SweepResult, sweep
+from tests.jobs.sweep.entry import Told, config_of, document_of
 
 
 def run_of(folder: Path, outcome: str = "passed", words: tuple[str, ...] = (), **told: Any) -> Path:

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
-from splatctrl_cli.jobs.runs.run_folder import open_run
-from splatctrl_cli.jobs.sweep.keys import chain_of, key_of
-from splatctrl_cli.jobs.sweep.sweep import Runs, SweepRequest, sweep
 
 from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.jobs.runs.run_folder import open_run
+from splatctrl_cli.jobs.sweep.keys import chain_of, key_of
+from splatctrl_cli.jobs.sweep.sweep import Runs, SweepRequest, sweep
 
 PROGRAM = OfThisProgram(threads=1)
 TOLERATED = 0.001  # [m] below the margin, which the criterion allows

@@ -7,8 +7,8 @@ import pytest
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.typesys import Stores, get_typestore
-from splatctrl_cli.formats.unpacking import MAX_BLOCK
 
+from splatctrl_cli.formats.unpacking import MAX_BLOCK
 from splatctrl_cli.recording.container.bag_logs import Bag1Log, BagFile
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage
 

@@ -15,10 +15,10 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, DataEnd, Footer, Header
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from splatctrl_cli.formats.unpacking import MAX_BLOCK
 
 from benchmarks.mcap_recovery import DAMAGES, LOGS, NUM_MESSAGES, counted, damaged, log
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.unpacking import MAX_BLOCK
 from splatctrl_cli.recording.container.mcap_file import McapFile
 from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.mcap_records import CHUNK, MAGIC

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from splatctrl_cli.formats.arrays import npy_of, read_arrays, savez
 
 from splatctrl_cli.config.fixed import TF_GAP_NS
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.arrays import npy_of, read_arrays, savez
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.recording.container.mcap_records import BadRecordError, parse_record
 from splatctrl_cli.recording.folder.poses import read_tum

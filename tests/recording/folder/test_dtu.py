@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from splatctrl_cli.formats.image_file import write_pfm
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import score_protocol
+from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, project
 from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, read_image, write_dtu
 from splatctrl_cli.recording.folder.dtu_source import DtuSource, shrunk, view_numbers

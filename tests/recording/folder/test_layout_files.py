@@ -5,9 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from splatctrl_cli.formats.image_file import write_pfm
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.recording.capture.capture import CaptureSource
 from splatctrl_cli.recording.capture.capture_writer import write_capture

@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from splatctrl_cli.formats.image_file import decode_file
 
+from splatctrl_cli.formats.image_file import decode_file
 from splatctrl_cli.recording.log.decoder import COMPRESSED_IMAGE, IMAGE, UndecodableMessageError
 from splatctrl_cli.recording.log.messages import color_of, depth_of, num_invalid, read_image
 from tests.recording.log.make_log import header
