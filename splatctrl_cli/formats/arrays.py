@@ -71,7 +71,7 @@ def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) 
         left, found = most, {}
         for name in dict.fromkeys(chosen):
             with archive.open(f"{name}.npy") as member:
-                found[name] = _array(member, name, archive.getinfo(f"{name}.npy").file_size, left)
+                found[name] = _array(member, f"{name}: ", archive.getinfo(f"{name}.npy").file_size, left)
             left -= found[name].nbytes
     return found
 
@@ -106,21 +106,21 @@ def check_numbers(dtype: np.dtype[Any]) -> None:
         raise ValueError("objects, expected numbers")
 
 
-def _array(member: IO[bytes], name: str, file_size: int, most: int) -> NDArray[np.generic]:
+def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> NDArray[np.generic]:
     shape, is_fortran, dtype = npy_head(member)
     check_numbers(dtype)
     size = prod(shape) * dtype.itemsize
-    if size > most:
-        raise ValueError(f"{name}: {size} bytes, expected at most {most}")
+    if most is not None and size > most:
+        raise ValueError(f"{name}{size} bytes, expected at most {most}")
     if size != file_size - member.tell():
-        raise ValueError(f"{name}: announces {size} bytes, holds {file_size - member.tell()}")
+        raise ValueError(f"{name}announces {size} bytes, holds {file_size - member.tell()}")
     content = bytearray(size)
     view, at = memoryview(content), 0
     while at < size and (piece := member.read(min(size - at, PIECE))):
         view[at : at + len(piece)] = piece
         at += len(piece)
     if at < size or member.read(1):  # reading to the end is what checks the sum
-        raise ValueError(f"{name}: expected {size} bytes, got {'more' if at == size else at}")
+        raise ValueError(f"{name}expected {size} bytes, got {'more' if at == size else at}")
     values: NDArray[np.generic] = np.frombuffer(content, dtype) if size else np.zeros(0, dtype)
     return values.reshape(shape, order="F" if is_fortran else "C")
 
@@ -130,14 +130,7 @@ def npy_of(data: bytes) -> NDArray[np.generic]:
 
     `np.load` allocates what the header announces before it looks.
     """
-    stream = BytesIO(data)
-    shape, is_fortran, dtype = npy_head(stream)
-    check_numbers(dtype)
-    size = prod(shape) * dtype.itemsize
-    if size != len(data) - stream.tell():
-        raise ValueError(f"announces {size} bytes, holds {len(data) - stream.tell()}")
-    values = np.frombuffer(data, dtype, offset=stream.tell()) if size else np.zeros(0, dtype)
-    return values.reshape(shape, order="F" if is_fortran else "C")
+    return _array(BytesIO(data), "", len(data), None)
 
 
 FREE_BYTES = 1 << 30  # of an array, unpacked, and beside it:
@@ -169,15 +162,13 @@ class ArrayFile(ABC):
         if len(set(lengths)) > 1:
             said = ", ".join(f"{name} {length}" for name, length in zip(names, lengths, strict=True))
             raise InputError(f"{self.path}: expected arrays of one length, got {said}", remedy="check the file")
-        parts = [self._flat(name, prod(shape[1:])) for name, (shape, _) in zip(names, headers, strict=True)]
-        width = sum(prod(shape[1:]) for shape, _ in headers)
+        widths = [prod(shape[1:]) for shape, _ in headers]
+        parts = [  # how many rows its blocks have is its own
+            RowFile((width,), (part.reshape(len(part), width).astype(np.float64) for part in self._blocks(name)))
+            for name, width in zip(names, widths, strict=True)
+        ]
         blocks = (np.hstack([part.read(*block) for part in parts]) for block in ranges(max(lengths, default=0)))
-        return Rows(RowFile((width,), blocks))
-
-    def _flat(self, name: str, width: int) -> RowFile:
-        """An array as (T, width); how many rows its blocks have is its own."""
-        blocks = (block.reshape(len(block), width).astype(np.float64) for block in self._blocks(name))
-        return RowFile((width,), blocks)
+        return Rows(RowFile((sum(widths),), blocks))
 
     def read(
         self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
@@ -303,15 +294,9 @@ class Hdf5File(ArrayFile):
         """Raises InputError for a file of another kind."""
         super().__init__(path)
         self._h5py = of_extra("h5py", _EXTRA, "HDF5 files")
-        found: list[str] = []
-
-        def visit(name: str, item: Any) -> None:
-            if isinstance(item, self._h5py.Dataset):
-                found.append(name)
-
+        self.names = found = list[str]()
         with self._opened() as file:
-            file.visititems(visit)
-        self.names = found
+            file.visititems(lambda name, item: found.append(name) if isinstance(item, self._h5py.Dataset) else None)
 
     def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
         name = name.strip("/")

@@ -97,24 +97,16 @@ class _Element:
         return offset
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Header:
-    format: str
-    elements: list[_Element]
-    comments: list[str]
-    length: int
-
-
 def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
     """Element `element` of a PLY file (ASCII or binary, either byte order) that has all of the `required` properties.
 
     Raises InputError for a file that is missing, no PLY, cut short or too long, compressed, or lacks a property.
     """
     content = read_bytes(path)
-    header = _parse_header(path, content)
-    wanted = next((found for found in header.elements if found.name == element), None)
+    form, elements, comments, length = _parse_header(path, content)
+    wanted = next((found for found in elements if found.name == element), None)
     if wanted is None:
-        raise InputError(f"{path}: expected an element {element}, got {[found.name for found in header.elements]}")
+        raise InputError(f"{path}: expected an element {element}, got {[found.name for found in elements]}")
     names = [name for name, _ in wanted.properties]
     if "packed_position" in names:
         raise InputError(
@@ -122,8 +114,8 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
             remedy="export it there as an uncompressed PLY",
         )
     check_properties(path, names, required)
-    read = _read_ascii if header.format == "ascii" else _read_binary
-    return PlyFile(path=path, rows=read(path, content, header, wanted), comments=tuple(header.comments))
+    read = _read_ascii if form == "ascii" else _read_binary
+    return PlyFile(path=path, rows=read(path, content, form, elements, length, wanted), comments=tuple(comments))
 
 
 def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) -> None:
@@ -157,29 +149,32 @@ def write_table(path: Path, rows: NDArray[Any], comments: Mapping[str, str]) -> 
     path.write_bytes(header + rows.tobytes())
 
 
-def _read_binary(path: Path, content: bytes, header: _Header, wanted: _Element) -> NDArray[Any]:
-    byte_order, start, end = BYTE_ORDERS[header.format], 0, header.length
+def _read_binary(
+    path: Path, content: bytes, form: str, elements: Sequence[_Element], length: int, wanted: _Element
+) -> NDArray[Any]:
+    byte_order, start, end = BYTE_ORDERS[form], 0, length
     dtype = wanted.dtype(path, byte_order)
-    for found in header.elements:
+    for found in elements:
         start, end = end if found is wanted else start, found.end(content, end, byte_order)
     if len(content) != end:
         what = "cut short" if len(content) < end else "longer than its header says"
         raise InputError(
-            f"{path}: {what}: expected {end} bytes ({header.length} of header and the data it promises), "
-            f"got {len(content)}",
+            f"{path}: {what}: expected {end} bytes ({length} of header and the data it promises), got {len(content)}",
             remedy="copy or write the file again",
         )
     return np.frombuffer(content, dtype, count=wanted.count, offset=start)
 
 
-def _read_ascii(path: Path, content: bytes, header: _Header, wanted: _Element) -> NDArray[Any]:
-    lines = [line.split() for line in content[header.length :].split(b"\n") if line.strip()]
-    expected = sum(found.count for found in header.elements if found.properties)
+def _read_ascii(
+    path: Path, content: bytes, form: str, elements: Sequence[_Element], length: int, wanted: _Element
+) -> NDArray[Any]:
+    lines = [line.split() for line in content[length:].split(b"\n") if line.strip()]
+    expected = sum(found.count for found in elements if found.properties)
     if len(lines) != expected:
         raise InputError(f"{path}: expected {expected} lines of data, got {len(lines)}")
-    start = sum(found.count for found in header.elements[: header.elements.index(wanted)] if found.properties)
+    start = sum(found.count for found in elements[: elements.index(wanted)] if found.properties)
     rows = lines[start : start + wanted.count]
-    table = np.zeros(wanted.count, dtype=wanted.dtype(path, BYTE_ORDERS[header.format]))
+    table = np.zeros(wanted.count, dtype=wanted.dtype(path, BYTE_ORDERS[form]))
     bad = next((i for i, row in enumerate(rows) if len(row) != len(wanted.properties)), None)
     if bad is not None:
         raise InputError(
@@ -193,7 +188,8 @@ def _read_ascii(path: Path, content: bytes, header: _Header, wanted: _Element) -
     return table
 
 
-def _parse_header(path: Path, content: bytes) -> _Header:
+def _parse_header(path: Path, content: bytes) -> tuple[str, list[_Element], list[str], int]:
+    """Format, elements, comments, and the length of the header [bytes]."""
     if not content.startswith((b"ply\n", b"ply\r\n")):
         raise InputError(f"{path}: no PLY file: expected it to start with 'ply', got {content[:8]!r}")
     end = content.find(b"\nend_header")
@@ -223,7 +219,7 @@ def _parse_header(path: Path, content: bytes) -> _Header:
                 raise InputError(f"{path}: header line not understood: {line.strip()!r}")
     if not form:
         raise InputError(f"{path}: its header has no format line; expected one of {', '.join(BYTE_ORDERS)}")
-    return _Header(format=form, elements=elements, comments=comments, length=newline + 1)
+    return form, elements, comments, newline + 1
 
 
 def read_points(path: Path) -> PointCloud:

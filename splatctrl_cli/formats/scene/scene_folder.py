@@ -33,6 +33,7 @@ from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid, SeenVoxels
 FORMAT = "splatctrl-scene 1"
 SELF_MODEL = "self.npz"  # what `robot learn` finds in the recording
 SHELL_FILE = "shell.ply"
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,30 +52,29 @@ class Snapshot:
 
     def occupancy(self) -> OccupancyGrid | None:
         """The grid of that moment, as coarse as `write_states` keeps it; None in a scene of an older version."""
-        return read_states(self._checked(self.occupancy_path)) if self._has_voxels else None
+        return self._of_voxels(read_states)
 
     def seen(self) -> SeenVoxels | None:
         """When each voxel was last seen; None in a scene of an older version."""
-        return read_seen(self._checked(self.occupancy_path)) if self._has_voxels else None
+        return self._of_voxels(read_seen)
 
     def unrepresented(self) -> Balls | None:
         """The occupied voxels that had no splat then; None in a scene of an older version."""
-        return read_unrepresented(self._checked(self.occupancy_path)) if self._has_voxels else None
+        return self._of_voxels(read_unrepresented)
 
     def splats(self) -> SplatSet:
-        return read_world_splats(self._checked(self.path))
+        return read_world_splats(self.path if self.parts is None else self.parts.checked(self.path))
 
     @property
     def shell_path(self) -> Path:
         """What lay beyond the robot's reach then; not there where nothing did."""
         return self.path.with_suffix(f".{SHELL_FILE}")
 
-    @property
-    def _has_voxels(self) -> bool:
-        return self.occupancy_path.is_file() if self.parts is None else self.parts.has(self.occupancy_path)
-
-    def _checked(self, path: Path) -> Path:
-        return path if self.parts is None else self.parts.checked(path)
+    def _of_voxels(self, read: Callable[[Path], T]) -> T | None:
+        path = self.occupancy_path
+        if self.parts is None:
+            return read(path) if path.is_file() else None
+        return read(self.parts.checked(path)) if self.parts.has(path) else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,9 +87,6 @@ class ViewCorrection:
     T_world_camera: Float64 | None
     gain: Float64 | None
     bend: Float64 | None = None
-
-
-T = TypeVar("T")
 
 
 def run_value(
@@ -112,10 +109,6 @@ def run_value(
             f"{where}: {'.'.join(keys)}: expected what reconstruct writes, got {said}",
             remedy="reconstruct the scene again",
         ) from None
-
-
-def _names(value: list[Any]) -> tuple[str, ...]:
-    return tuple(str(name) for name in value)
 
 
 def _color(value: list[Any]) -> tuple[float, float, float]:
@@ -191,7 +184,7 @@ class SceneFolder:
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras that trained the scene."""
-        return self._metric("cameras", _names)
+        return self._metric("cameras", lambda names: tuple(map(str, names)))
 
     @property
     def names_its_views(self) -> bool:
@@ -243,49 +236,36 @@ class SceneFolder:
         return gaussians
 
     def splats(self) -> SplatSet:
-        self._expect_isotropic()
-        return read_world_splats(self.parts.checked(self.path / "splats.ply"))
+        return read_world_splats(self._isotropic("splats.ply"))
 
-    def _expect_isotropic(self) -> None:
+    def _isotropic(self, name: str) -> Path:
+        """A file of the scene, checked. Raises InputError where the splats are not isotropic."""
         if self.is_anisotropic:
             raise InputError(
                 f"{self.path}: made by 3D Gaussian splatting; distances are defined on isotropic splats",
                 remedy="reconstruct the recording, or 'splatctrl score' this scene",
             )
+        return self.parts.checked(self.path / name)
 
     def occupancy(self) -> OccupancyGrid:
         """The final occupancy grid."""
-        self._expect_isotropic()
-        return read_occupancy(self.parts.checked(self.path / "occupancy.npz"))
+        return read_occupancy(self._isotropic("occupancy.npz"))
 
     def known(self) -> KnownVoxels | None:
         """What was known at the end, and when it was last seen; None in a scene of an older version."""
-        self._expect_isotropic()
-        return read_known_occupancy(self.parts.checked(self.path / "occupancy.npz"))
+        return read_known_occupancy(self._isotropic("occupancy.npz"))
 
     def seen(self) -> SeenVoxels | None:
         """When each voxel was last seen, at the end; None in a scene of an older version."""
-        self._expect_isotropic()
-        return read_seen(self.parts.checked(self.path / "occupancy.npz"))
+        return read_seen(self._isotropic("occupancy.npz"))
 
     @cached_property
     def snapshots(self) -> tuple[Snapshot, ...]:
         """By time. Raises InputError for a table that is not the one written, or whose stamps do not ascend."""
-        self._expect_isotropic()
-        path = self.parts.checked(self.path / "snapshots.csv")
-        taken = self._snapshots_in(path)
-        for before, after in pairwise(taken):
-            if after.stamp_ns <= before.stamp_ns:
-                raise InputError(
-                    f"{path}: stamp {after.stamp_ns} after {before.stamp_ns}: expected stamps that ascend",
-                    remedy="reconstruct the scene again",
-                )
-        return taken
-
-    def _snapshots_in(self, path: Path) -> tuple[Snapshot, ...]:
+        path = self._isotropic("snapshots.csv")
         try:
             with path.open(encoding="utf-8", newline="") as stream:
-                return tuple(
+                taken = tuple(
                     Snapshot(
                         stamp_ns=int(row["stamp_ns"]),
                         path=self.path / _inside(row["file"]),
@@ -296,6 +276,13 @@ class SceneFolder:
                 )
         except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
             raise InputError(f"{path}: cannot be read: {error}") from None
+        for before, after in pairwise(taken):
+            if after.stamp_ns <= before.stamp_ns:
+                raise InputError(
+                    f"{path}: stamp {after.stamp_ns} after {before.stamp_ns}: expected stamps that ascend",
+                    remedy="reconstruct the scene again",
+                )
+        return taken
 
     def snapshot_at(self, stamp_ns: int) -> Snapshot:
         """The newest snapshot not later than `stamp_ns`; NotEvaluableError before the first."""

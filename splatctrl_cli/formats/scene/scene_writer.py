@@ -67,8 +67,7 @@ class SceneWriter:
     """
 
     def __init__(self, folder: Path, comments: Mapping[str, str], checkpoint: Checkpoint | None = None) -> None:
-        self.folder = folder
-        self.comments = dict(comments)
+        self.folder, self.comments = folder, dict(comments)
         self.snapshots: list[Snapshot] = []
         self._audit = folder / AUDIT
         self._thread, self._unwritten = ThreadPoolExecutor(1), deque[Future[None]]()
@@ -84,8 +83,10 @@ class SceneWriter:
 
     def _go_back_to(self, checkpoint: Checkpoint) -> None:
         """Drop what was written after the checkpoint."""
-        for index, (stamp_ns, num_splats) in enumerate(checkpoint.snapshots):
-            self.snapshots.append(Snapshot(stamp_ns=stamp_ns, path=self._place(index), num_splats=num_splats))
+        self.snapshots += [
+            Snapshot(stamp_ns=stamp_ns, path=self._place(index), num_splats=num_splats)
+            for index, (stamp_ns, num_splats) in enumerate(checkpoint.snapshots)
+        ]
         self._num_flushed = len(self.snapshots)
         kept = {self._audit, self.folder / CHECKPOINT}
         kept |= {path for s in self.snapshots for path in (s.path, s.occupancy_path)}
@@ -95,9 +96,7 @@ class SceneWriter:
             raise InputError(
                 f"{self.folder}: {missing[0] if missing else AUDIT}: not as the checkpoint left it", remedy=START_OVER
             )
-        written = Parts(
-            folder=self.folder, digests=checkpoint.parts, remedy="start over: the same command without --resume"
-        )
+        written = Parts(folder=self.folder, digests=checkpoint.parts, remedy=START_OVER)
         for path in sorted(kept - {self._audit, self.folder / CHECKPOINT}):
             written.checked(path)
         self._digests = dict(checkpoint.parts or {})

@@ -38,27 +38,16 @@ Arrays = Mapping[str, NDArray[Any]]
 
 def write_occupancy(path: Path, known: KnownVoxels) -> None:
     """Write ``occupancy.npz``: log_odds, num_updates, entity, what `_evidence` says, and a JSON header."""
-    header = {
-        "format": "splatctrl-occupancy 2",
-        "values": "log_odds of occupancy; num_updates 0 = never seen; entity bits 001 robot, 010 human, 100 swept",
-    }
-    arrays: dict[str, NDArray[np.generic]] = {
-        "header": _header(known, header),
-        "log_odds": known.grid.log_odds,
-        "num_updates": known.grid.num_updates,
-        "entity": known.grid.entity,
-        **_evidence(known),
-    }
-    savez(path, arrays)
+    values = "log_odds of occupancy; num_updates 0 = never seen; entity bits 001 robot, 010 human, 100 swept"
+    header = _header(known, {"format": "splatctrl-occupancy 2", "values": values})
+    savez(path, {"header": header, **{name: getattr(known.grid, name) for name in _GRID}, **_evidence(known)})
 
 
 def write_states(path: Path, known: KnownVoxels, states: UInt8) -> None:
     """Write `states` (X, Y, Z) of the voxels instead of their log-odds: a tenth of the size."""
-    header = {
-        "format": "splatctrl-voxel-states 2",
-        "values": {state.name.lower(): int(state) for state in VoxelState},
-    }
-    savez(path, {"header": _header(known, header), "states": states, **_evidence(known)}, level=3)
+    values = {state.name.lower(): int(state) for state in VoxelState}
+    header = _header(known, {"format": "splatctrl-voxel-states 2", "values": values})
+    savez(path, {"header": header, "states": states, **_evidence(known)}, level=3)
 
 
 def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.generic]:
@@ -115,30 +104,19 @@ def read_seen(path: Path) -> SeenVoxels | None:
 
     None where an older version wrote the file. Raises InputError for anything else.
     """
-    try:
-        with _refused(path, _OURS):
-            header = _read_header(path)
-            arrays = read_arrays(path, ("last_seen", *_edges_in(header)), most=2 * MOST_VOXELS + _MOST_EDGES)
-            stamps_ns = np.array(header["step_stamps_ns"], np.int64)
-            return SeenVoxels(
-                origin=np.array(header["origin"], np.float64),
-                voxel=float(header["voxel"]),
-                last_seen=_last_seen(arrays["last_seen"], header, len(stamps_ns)),
-                step_stamps_ns=stamps_ns,
-                edges=_edges(arrays),
-            )
-    except InputError:
-        if _is_older(path):
+    with _refused(path, _OURS):
+        header = _read_header(path)
+        if "step_stamps_ns" not in header:
             return None
-        raise
-
-
-def _is_older(path: Path) -> bool:
-    """Whether a file of ours says nothing of evidence."""
-    try:
-        return "step_stamps_ns" not in _read_header(path)
-    except Exception:
-        return False
+        arrays = read_arrays(path, ("last_seen", *_edges_in(header)), most=2 * MOST_VOXELS + _MOST_EDGES)
+        stamps_ns = np.array(header["step_stamps_ns"], np.int64)
+        return SeenVoxels(
+            origin=np.array(header["origin"], np.float64),
+            voxel=float(header["voxel"]),
+            last_seen=_last_seen(arrays["last_seen"], header, len(stamps_ns)),
+            step_stamps_ns=stamps_ns,
+            edges=_edges(arrays),
+        )
 
 
 def _read_header(path: Path) -> dict[str, Any]:
@@ -162,10 +140,16 @@ def read_known_occupancy(path: Path) -> KnownVoxels | None:
         arrays = read_arrays(path, (*_GRID, *_EVIDENCE, *_edges_in(header)), most=22 * MOST_VOXELS + _MOST_EDGES)
         grid = _grid_of(arrays, header)
         stamps_ns = np.array(header["step_stamps_ns"], np.int64)
-        last_seen = _widened(_last_seen(arrays["last_seen"], header, len(stamps_ns)))
-        balls = _balls(arrays, grid.voxel)
+        last_seen = _last_seen(arrays["last_seen"], header, len(stamps_ns))
+        wide = last_seen.astype(np.uint16)
+        if last_seen.dtype == np.uint8:
+            wide[last_seen >= FIRST_REASON] += _WIDE
         return KnownVoxels(
-            grid=grid, last_seen=last_seen, step_stamps_ns=stamps_ns, unrepresented=balls, edges=_edges(arrays)
+            grid=grid,
+            last_seen=wide,
+            step_stamps_ns=stamps_ns,
+            unrepresented=_balls(arrays, grid.voxel),
+            edges=_edges(arrays),
         )
 
 
@@ -207,14 +191,6 @@ def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) 
     return stored
 
 
-def _widened(last_seen: NDArray[Any]) -> NDArray[np.uint16]:
-    """In two bytes."""
-    wide = last_seen.astype(np.uint16)
-    if last_seen.dtype == np.uint8:
-        wide[last_seen >= FIRST_REASON] += _WIDE
-    return wide
-
-
 def _balls(arrays: Arrays, voxel: float) -> Balls:
     """Raises ValueError for other types or shapes."""
     centers, labels = arrays["unrepresented"], arrays["unrepresented_labels"]
@@ -227,9 +203,9 @@ def _balls(arrays: Arrays, voxel: float) -> Balls:
     return Balls.of_voxels(centers, voxel, labels)
 
 
-def _edges_in(header: Mapping[str, Any]) -> tuple[str, ...]:
+def _edges_in(header: Mapping[str, Any]) -> set[str]:
     """The array of lost edges, which older versions did not write."""
-    return ("edges",) if "edges" in header else ()
+    return {"edges"} & header.keys()
 
 
 def _edges(arrays: Arrays) -> LostEdges:

@@ -8,7 +8,8 @@ JSON document, one buffer, and tables of numbers in it.
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,53 +37,31 @@ PROPERTIES = {
 }
 
 
-class GlbWriter:
-    """Collects tables of attributes and writes them with a document."""
-
-    def __init__(self) -> None:
-        self._parts: list[bytes] = []
-        self._length = 0
-        self._views: list[dict[str, Any]] = []
-        self._accessors: list[dict[str, Any]] = []
-
-    def add(self, table: NDArray[Any], *, with_range: bool = False) -> int:
-        """Add a table (N, 1 | 3 | 4) of float32, or of uint8 that stand for 0 to 1; returns its accessor's index."""
-        content = np.ascontiguousarray(table).tobytes()
-        is_float = table.dtype == np.float32
-        accessor = {
-            "bufferView": len(self._views),
-            "componentType": 5126 if is_float else 5121,
-            "count": len(table),
-            "type": TYPES[table.shape[1]],
-        }
-        if not is_float:
-            accessor["normalized"] = True
-        if with_range:
-            accessor |= {"min": table.min(axis=0).tolist(), "max": table.max(axis=0).tolist()}
-        view = {"buffer": 0, "byteOffset": self._length, "byteLength": len(content), "target": ARRAY_BUFFER}
-        self._views.append(view)
-        self._accessors.append(accessor)
-        self._parts.append(content)
-        self._length += len(content)
-        return len(self._accessors) - 1
-
-    def write(self, path: Path, document: Mapping[str, Any]) -> None:
-        """Write `document` and the tables. Same input, same bytes."""
-        whole = {
-            **document,
-            "buffers": [{"byteLength": self._length}],
-            "bufferViews": self._views,
-            "accessors": self._accessors,
-        }
-        text = json.dumps(whole, separators=(",", ":"), allow_nan=False).encode()
-        text += b" " * (-len(text) % 4)
-        binary = b"".join(self._parts)
-        binary += bytes(-len(binary) % 4)
-        length = 12 + 8 + len(text) + 8 + len(binary)
-        with path.open("wb") as stream:
-            stream.write(struct.pack("<III", MAGIC, 2, length))
-            stream.write(struct.pack("<II", len(text), JSON_CHUNK) + text)
-            stream.write(struct.pack("<II", len(binary), BINARY_CHUNK) + binary)
+def _write(path: Path, document: Mapping[str, Any], tables: Sequence[NDArray[Any]]) -> None:
+    """Write a document and its tables (N, 1 | 3 | 4) of float32, or of uint8 that stand for 0 to 1."""
+    views, accessors, binary = list[dict[str, Any]](), list[dict[str, Any]](), bytearray()
+    for table in tables:
+        is_float, content = table.dtype == np.float32, np.ascontiguousarray(table).tobytes()
+        accessors.append(
+            {
+                "bufferView": len(views),
+                "componentType": 5126 if is_float else 5121,
+                "count": len(table),
+                "type": TYPES[table.shape[1]],
+                **({} if is_float else {"normalized": True}),
+                **({} if views else {"min": table.min(axis=0).tolist(), "max": table.max(axis=0).tolist()}),
+            }
+        )
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(content), "target": ARRAY_BUFFER})
+        binary += content
+    whole = {**document, "buffers": [{"byteLength": len(binary)}], "bufferViews": views, "accessors": accessors}
+    text = json.dumps(whole, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary += bytes(-len(binary) % 4)
+    with path.open("wb") as stream:
+        stream.write(struct.pack("<III", MAGIC, 2, 12 + 8 + len(text) + 8 + len(binary)))
+        stream.write(struct.pack("<II", len(text), JSON_CHUNK) + text)
+        stream.write(struct.pack("<II", len(binary), BINARY_CHUNK) + binary)
 
 
 def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
@@ -103,46 +82,31 @@ def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
         raise InputError(f"{path}: its JSON cannot be read: {error}") from None
     if not isinstance(document, dict):
         raise InputError(f"{path}: expected a JSON object, got {type(document).__name__}")
-    return document, _buffer(path, content[20 + json_length :])
-
-
-def _buffer(path: Path, rest: bytes) -> bytes:
-    if not rest:
-        return b""
+    rest = content[20 + json_length :]
     length, kind = struct.unpack_from("<II", rest) if len(rest) >= 8 else (0, 0)
-    if kind != BINARY_CHUNK or 8 + length > len(rest):
+    if rest and (kind != BINARY_CHUNK or 8 + length > len(rest)):
         raise InputError(f"{path}: expected a chunk BIN of {length} bytes after the JSON, got {len(rest)} bytes")
-    return rest[8 : 8 + length]
+    return document, rest[8 : 8 + length]
 
 
-class Accessors:
-    """The tables of numbers of a document, by accessor."""
-
-    def __init__(self, path: Path, document: Mapping[str, Any], binary: bytes) -> None:
-        self._path = path
-        self._document = document
-        self._binary = binary
-
-    def table(self, index: int, width: int) -> Float32:
-        """(N, width) float32 values of an accessor. Raises InputError for a table of another width or cut short."""
-        accessor = self._document["accessors"][index]
-        dtype = np.dtype(COMPONENTS[accessor["componentType"]])
-        if accessor["type"] != TYPES[width] or "sparse" in accessor or "bufferView" not in accessor:
-            raise InputError(
-                f"{self._path}: accessor {index}: expected a plain {TYPES[width]}, got {accessor['type']}"
-            )
-        view = self._document["bufferViews"][accessor["bufferView"]]
-        if view["buffer"] != 0 or "uri" in self._document["buffers"][0]:
-            raise InputError(f"{self._path}: accessor {index}: expected its data inside the file")
-        num, row = int(accessor["count"]), width * dtype.itemsize
-        start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
-        stride = int(view.get("byteStride", row))
-        if min(num, start, stride - row) < 0 or start + (num - 1) * stride + row > len(self._binary):
-            raise InputError(f"{self._path}: accessor {index}: reaches beyond the {len(self._binary)} bytes of data")
-        values = np.ndarray((num, width), dtype, self._binary, start, (stride, dtype.itemsize))
-        if accessor.get("normalized", False):
-            return np.maximum(values / np.float32(np.iinfo(dtype).max), np.float32(-1.0)).astype(np.float32)
-        return values.astype(np.float32)
+def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, width: int) -> Float32:
+    """(N, width) float32 values of an accessor. Raises InputError for a table of another width or cut short."""
+    accessor, where = document["accessors"][index], f"{path}: accessor {index}"
+    dtype = np.dtype(COMPONENTS[accessor["componentType"]])
+    if accessor["type"] != TYPES[width] or "sparse" in accessor or "bufferView" not in accessor:
+        raise InputError(f"{where}: expected a plain {TYPES[width]}, got {accessor['type']}")
+    view = document["bufferViews"][accessor["bufferView"]]
+    if view["buffer"] != 0 or "uri" in document["buffers"][0]:
+        raise InputError(f"{where}: expected its data inside the file")
+    num, row = int(accessor["count"]), width * dtype.itemsize
+    start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
+    stride = int(view.get("byteStride", row))
+    if min(num, start, stride - row) < 0 or start + (num - 1) * stride + row > len(binary):
+        raise InputError(f"{where}: reaches beyond the {len(binary)} bytes of data")
+    values = np.ndarray((num, width), dtype, binary, start, (stride, dtype.itemsize))
+    if accessor.get("normalized", False):
+        return np.maximum(values / np.float32(np.iinfo(dtype).max), np.float32(-1.0)).astype(np.float32)
+    return values.astype(np.float32)
 
 
 def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
@@ -152,16 +116,17 @@ def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
     Raises InputError for a value that no Gaussian can have, naming its index.
     """
     check_gaussians("Gaussians to write", gaussians)
-    writer = GlbWriter()
-    attributes = {"POSITION": writer.add(gaussians.centers, with_range=True)}
-    attributes["COLOR_0"] = writer.add(_point_colors(gaussians))
-    attributes[ROTATION] = writer.add(np.roll(gaussians.quats_wxyz, -1, axis=1))
-    attributes[SCALE] = writer.add(gaussians.scales)
-    attributes[OPACITY] = writer.add(gaussians.opacities[:, None])
-    for index in range(gaussians.harmonics.shape[1]):
-        attributes[coefficient_name(index)] = writer.add(gaussians.harmonics[:, index])
+    tables: dict[str, NDArray[Any]] = {  # the first has its range beside it
+        "POSITION": gaussians.centers,
+        "COLOR_0": _point_colors(gaussians),
+        ROTATION: np.roll(gaussians.quats_wxyz, -1, axis=1),
+        SCALE: gaussians.scales,
+        OPACITY: gaussians.opacities[:, None],
+        **{coefficient_name(k): gaussians.harmonics[:, k] for k in range(gaussians.harmonics.shape[1])},
+    }
     if (gaussians.labels != Label.OBJECT).any():
-        attributes["_LABEL"] = writer.add(gaussians.labels[:, None].astype(np.float32))
+        tables["_LABEL"] = gaussians.labels[:, None].astype(np.float32)
+    attributes = {name: number for number, name in enumerate(tables)}
     primitive = {"mode": 0, "attributes": attributes, "extensions": {EXTENSION: PROPERTIES}}
     document = {
         "asset": {"version": "2.0", "generator": "splatctrl", "extras": {"frame": "world", **comments}},
@@ -171,7 +136,7 @@ def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
         "nodes": [{"name": "splats", "mesh": 0, "rotation": Z_UP_TO_Y_UP}],
         "meshes": [{"primitives": [primitive]}],
     }
-    writer.write(path, document)
+    _write(path, document, [*tables.values()])
 
 
 def read_gltf(path: Path) -> tuple[GaussianSet, dict[str, str]]:
@@ -181,9 +146,8 @@ def read_gltf(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """
     document, binary = read_glb(path)
     primitive = _primitive(path, document)
-    accessors = Accessors(path, document, binary)
     try:
-        gaussians = _gaussians(path, primitive["attributes"], accessors)
+        gaussians = _gaussians(path, primitive["attributes"], partial(_table, path, document, binary))
         extras = document["asset"].get("extras", {})
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: glTF not understood: {type(error).__name__}: {error}") from None
@@ -222,7 +186,7 @@ def _primitive(path: Path, document: Mapping[str, Any]) -> dict[str, Any]:
     return primitive
 
 
-def _gaussians(path: Path, attributes: Mapping[str, int], accessors: Accessors) -> GaussianSet:
+def _gaussians(path: Path, attributes: Mapping[str, int], table: Callable[[int, int], Float32]) -> GaussianSet:
     required = ("POSITION", ROTATION, SCALE, OPACITY, coefficient_name(0))
     missing = [name for name in required if name not in attributes]
     if missing:
@@ -232,21 +196,21 @@ def _gaussians(path: Path, attributes: Mapping[str, int], accessors: Accessors) 
         num += 1
     if num not in (1, 4, 9, 16):
         raise InputError(f"{path}: harmonics: expected 1, 4, 9 or 16 coefficients, got {num}")
-    centers, scales = accessors.table(attributes["POSITION"], 3), accessors.table(attributes[SCALE], 3)
+    centers, scales = table(attributes["POSITION"], 3), table(attributes[SCALE], 3)
     if (scales < 0).any():
         where = np.flatnonzero((scales < 0).any(axis=1))[0]
         raise InputError(
             f"{path}: splat {where}: {SCALE}: expected no negative sigma, got {scales[where]}",
             remedy="drafts of the extension held logarithms there: write it again with a newer tool",
         )
-    labels = accessors.table(attributes["_LABEL"], 1)[:, 0] if "_LABEL" in attributes else np.zeros(len(centers))
+    labels = table(attributes["_LABEL"], 1)[:, 0] if "_LABEL" in attributes else np.zeros(len(centers))
     refuse(str(path), "_LABEL", labels, (labels < 0) | (labels > 255) | (labels % 1 != 0), "a whole number 0 to 255")
     return GaussianSet(
         centers=centers,
         scales=scales,
-        quats_wxyz=unit_quaternions(str(path), np.roll(accessors.table(attributes[ROTATION], 4), 1, axis=1)),
-        opacities=accessors.table(attributes[OPACITY], 1)[:, 0],
-        harmonics=np.stack([accessors.table(attributes[coefficient_name(k)], 3) for k in range(num)], axis=1),
+        quats_wxyz=unit_quaternions(str(path), np.roll(table(attributes[ROTATION], 4), 1, axis=1)),
+        opacities=table(attributes[OPACITY], 1)[:, 0],
+        harmonics=np.stack([table(attributes[coefficient_name(k)], 3) for k in range(num)], axis=1),
         labels=labels.astype(np.uint8),
     )
 

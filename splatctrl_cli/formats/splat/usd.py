@@ -33,7 +33,7 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
     Raises InputError for a value that no Gaussian can have, naming its index; UsageError without the library.
     """
     check_gaussians("Gaussians to write", gaussians)
-    usd, geometry, volume, arrays = _library()
+    usd, geometry, volume, arrays, kinds = _library()
     stage = usd.Stage.CreateInMemory(suffix)
     geometry.SetStageUpAxis(stage, geometry.Tokens.z)
     geometry.SetStageMetersPerUnit(stage, 1.0)
@@ -48,7 +48,7 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(to_float3(g.harmonics.reshape(-1, 3)))
     field.CreateExtentAttr(to_float3(_extent(g)))
     if (g.labels != Label.OBJECT).any():
-        primvar = geometry.PrimvarsAPI(field).CreatePrimvar("label", _int_array_type(), geometry.Tokens.vertex)
+        primvar = geometry.PrimvarsAPI(field).CreatePrimvar("label", kinds.IntArray, geometry.Tokens.vertex)
         primvar.Set(arrays.IntArray.FromNumpy(g.labels.astype(np.int32)))
     layer = stage.GetRootLayer()
     layer.customLayerData = {"frame": "world", **comments}
@@ -68,7 +68,7 @@ def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
     Raises InputError for a file that cannot be opened or does not have exactly one such field; UsageError without
     the library.
     """
-    usd, geometry, _, _ = _library()
+    usd, geometry, *_ = _library()
     if not path.is_file():
         raise InputError(f"{path}: cannot be read: no such file")
     with tempfile.TemporaryDirectory() as folder:
@@ -87,10 +87,10 @@ def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
     return gaussians, comments
 
 
-def _library() -> tuple[Any, Any, Any, Any]:
-    """The modules Usd, UsdGeom, UsdVol and Vt. Raises UsageError where they are missing or older than the schema."""
+def _library() -> tuple[Any, Any, Any, Any, Any]:
+    """Usd, UsdGeom, UsdVol, Vt and the types. Raises UsageError where they are missing or older than the schema."""
     try:
-        from pxr import Usd, UsdGeom, UsdVol, Vt
+        from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
     except ImportError:
         raise UsageError(
             "USD: the library usd-core is not installed", remedy="pip install 'splatctrl-cli[usd]'"
@@ -100,13 +100,7 @@ def _library() -> tuple[Any, Any, Any, Any]:
             f"USD: expected usd-core 26.3 or later, which knows {PRIM_TYPE}, got {Usd.GetVersion()}",
             remedy="pip install 'splatctrl-cli[usd]'",
         )
-    return Usd, UsdGeom, UsdVol, Vt
-
-
-def _int_array_type() -> Any:
-    from pxr import Sdf
-
-    return Sdf.ValueTypeNames.IntArray
+    return Usd, UsdGeom, UsdVol, Vt, Sdf.ValueTypeNames
 
 
 def _extent(gaussians: GaussianSet) -> Float32:
