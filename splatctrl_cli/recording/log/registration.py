@@ -70,7 +70,7 @@ class _Edge:
 
     def _at(self, sample: int) -> Float64:
         number = self.numbers[sample]
-        return self._transforms.read(number, number + 1)[0]
+        return np.asarray(self._transforms.read(number, number + 1)[0])
 
     def _sort(self) -> None:
         if not self._is_sorted:

@@ -113,7 +113,9 @@ class StateColumns(Sequence[JointState]):
 
     def _changed(self, change: Callable[[Table, str], Table], names: Collection[str], **others: Any) -> Self:
         """With what `change` makes of the named columns that there are."""
-        changed = {name: change(table, name) for name, table in self.tables().items() if name in names}
+        changed: dict[str, Any] = {
+            name: change(table, name) for name, table in self.tables().items() if name in names
+        }
         return replace(self, **others, **changed)
 
 
