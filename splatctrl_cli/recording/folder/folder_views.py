@@ -157,7 +157,7 @@ def _pose(table: PosesTable | None, view: ListedView, lens: CameraTable, options
     given = options.camera_poses.get(lens.name)
     if given is not None:
         return transform_from(given[:3], given[3:])
-    if view.matrix is None:
+    if view.matrix is None or not np.isfinite(view.matrix).all():  # so trackers write that they were lost
         return None
     assert table is not None
     return world_camera(view.matrix, table.convention, table.axes, f"{table.file}: pose of {view.name}")

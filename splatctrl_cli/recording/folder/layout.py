@@ -59,6 +59,19 @@ def marked(*alternatives: str) -> Callable[[Path], bool]:
     return lambda folder: any(all(has(folder, mark) for mark in marks.split()) for marks in alternatives)
 
 
+def by_description(name: str, *examples: str) -> Callable[[Path, SourceOptions], Description]:
+    """Return a reader that refuses a folder: a person has to describe it, beginning with one of the examples."""
+
+    def refuse(folder: Path, _: SourceOptions) -> Description:
+        raise InputError(
+            f"{folder}: laid out as {name}, whose lens and poses a description names",
+            remedy=f"write {' or '.join(examples)} as `splatctrl help input` shows it ({name}), and give it with"
+            f" --root {folder}",
+        )
+
+    return refuse
+
+
 class Lenses:
     """The different lenses of a layout's views, as cameras ``camera``, ``camera-1``, ``camera-2``, ..."""
 

@@ -4,7 +4,7 @@
 
 Depth in millimetres with 65535 for none, poses camera to world. Three calibrations:
 
-- an ``info.txt`` of ScanNet's SensReader (12-Scenes, BundleFusion, 3RScan; `layout_scannet`);
+- an ``info.txt`` of ScanNet's SensReader (12-Scenes, BundleFusion, 3RScan), from which a person describes the folder;
 - ``camera-intrinsics.txt``, one 3x3 matrix for both (3DMatch, Zeng et al., CVPR 2017);
 - none: 7-Scenes, which publishes the depth camera's default of 585, 585, 320, 240, whose poses are those of the depth
   camera, and whose colour is not registered to depth (Shotton et al., CVPR 2013, and the dataset's page). Colour is
@@ -20,20 +20,12 @@ order, as in Open3D's reconstruction system
 (examples/python/reconstruction_system/open3d_example.py, get_rgbd_file_lists); where the trajectory has more poses
 than there are images, by the number in the file name.
 
-Replica as rendered for NICE-SLAM and for Semantic-NeRF: a 4x4 matrix a line, camera to world, by image number.
-
-NICE-SLAM: ``results/frame000000.jpg``, ``results/depth000000.png``, ``traj.txt``, and ``cam_params.json`` in the
-folder or above it, else 1200x680 of 600, 600, 599.5, 339.5 and 6553.5 counts a metre (cvg/nice-slam,
-configs/Replica/replica.yaml; its src/utils/datasets.py turns these poses to OpenGL's axes, so they are OpenCV's).
-Semantic-NeRF: ``rgb/rgb_0.png``, ``depth/depth_0.png``, ``traj_w_c.txt``, millimetres, a field of view of 90 degrees
-(as ethz-asl/autolabel, scripts/convert_replica.py, reads it).
+Replica as rendered for NICE-SLAM and for Semantic-NeRF, ICL-NUIM in its TUM-compatible form, and ScanNet as its
+SensReader exports it are known, and described by hand (docs/input.md).
 """
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -43,17 +35,16 @@ from splatctrl_cli.recording.folder.folder_description import (
     CameraTable,
     DepthTable,
     Description,
-    ImageFile,
     ListedView,
     PosesTable,
 )
 from splatctrl_cli.recording.folder.layout import (
     Layout,
     Pairs,
+    by_description,
     by_numbers,
     described,
     given_lens,
-    image_size,
     images_of,
     marked,
     own_depth_camera,
@@ -63,10 +54,8 @@ from splatctrl_cli.recording.folder.layout import (
     read_K,
     read_pose,
 )
-from splatctrl_cli.recording.folder.layout_scannet import find_info, read_info
-from splatctrl_cli.recording.folder.poses import read_matrix_lines, read_trajectory_log, rigid
+from splatctrl_cli.recording.folder.poses import read_trajectory_log, rigid
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import MILLIMETRE, Float64
 
 DEPTH_LENS = (585.0, 585.0, 320.0, 240.0)
 COLOR_LENS = (525.0, 525.0, 320.0, 240.0)
@@ -88,34 +77,32 @@ _NOTE = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Cameras:
-    """The colour camera, depth's own where it has one, the colour camera in the frame of the poses."""
-
-    color: CameraTable
-    depth: CameraTable | None = None
-    T_pose_color: Float64 = field(default_factory=lambda: np.eye(4))
-    depth_scale: float = MILLIMETRE
-    notes: tuple[str, ...] = ()
-
-
 def read_frames(folder: Path, options: SourceOptions) -> Description:
     """The folder, or all its sequences, as a description."""
     sequence = next(s for s in _SEQUENCES if next(folder.glob(f"{s}frame-*.pose.txt"), None) is not None)
     colors = _files(folder, f"{sequence}frame-*.color.*", ".color")
     depths = _files(folder, f"{sequence}frame-*.depth.*", ".depth")
     pairs = paired_by_name(folder, colors, depths, lambda name: read_pose(folder / f"{name}.pose.txt"))
-    first = pairs.views[0].name
-    cameras = _cameras(folder, colors[first], depths[first], options)
+    first = pairs.views[0]
+    places = (colors[first.name].parent, folder, folder.parent)
+    if any((place / name).is_file() for place in places for name in ("_info.txt", "info.txt")):
+        return by_description("12-Scenes", "twelve_scenes.toml")(folder, options)
+    published = (place / "camera-intrinsics.txt" for place in (folder, folder.parent))
+    values = next((read_K(file) for file in published if file.is_file()), DEPTH_LENS)
+    depth_camera = None
+    if is_7_scenes := given_lens(options, first.color) is None and values == DEPTH_LENS:
+        values, lens = COLOR_LENS, pinhole(COLOR_LENS, first.color)
+        depth_camera = own_depth_camera(lens, pinhole(DEPTH_LENS, depths[first.name]), T_COLOR_DEPTH)
+        pairs = pairs.moved(lambda T: T @ invert_transform(T_COLOR_DEPTH))
     return described(
-        pairs.moved(lambda T: T @ cameras.T_pose_color),
+        pairs,
         folder,
         options,
         poses=PosesTable(format="matrix-files", file=f"{sequence}frame-*.pose.txt"),
-        lens=lambda _: cameras.color,
-        depth_camera=cameras.depth,
-        depth=DepthTable(scale=cameras.depth_scale, invalid=65535),
-        notes=cameras.notes,
+        lens=lambda image: pinhole(values, image),
+        depth_camera=depth_camera,
+        depth=DepthTable(invalid=65535),
+        notes=(_NOTE,) if is_7_scenes else (),
     )
 
 
@@ -123,28 +110,6 @@ def _files(folder: Path, pattern: str, kind: str) -> dict[str, Path]:
     """Files by their path up to `kind`, in the order of their numbers."""
     paths = sorted(folder.glob(pattern), key=lambda p: by_numbers(p.relative_to(folder).as_posix()))
     return {path.relative_to(folder).as_posix().partition(kind)[0]: path for path in paths}
-
-
-def _cameras(folder: Path, color: Path, depth: Path, options: SourceOptions) -> _Cameras:
-    """By what the folder says, else as 7-Scenes."""
-    info = find_info(color.parent) or find_info(folder)
-    if info is not None:
-        calibration = read_info(info)
-        lens, own = calibration.cameras(color, depth, options)
-        scale = calibration.depth_scale
-        return _Cameras(color=lens, depth=own, T_pose_color=calibration.T_base_color, depth_scale=scale)
-    given = given_lens(options, color)
-    published = (folder / "camera-intrinsics.txt", folder.parent / "camera-intrinsics.txt")
-    values = next((read_K(file) for file in published if file.is_file()), DEPTH_LENS)
-    if given is not None or values != DEPTH_LENS:
-        return _Cameras(color=given or pinhole(values, color))
-    lens = pinhole(COLOR_LENS, color)
-    return _Cameras(
-        color=lens,
-        depth=own_depth_camera(lens, pinhole(DEPTH_LENS, depth), T_COLOR_DEPTH),
-        T_pose_color=invert_transform(T_COLOR_DEPTH),
-        notes=(_NOTE,),
-    )
 
 
 _FRAMES_DOCS = """
@@ -155,9 +120,8 @@ _FRAMES_DOCS = """
 3DMatch | the same, `camera-intrinsics.txt` | a file a frame | as above, not registered | that file; 585, 585,
     320, 240 in it counts as 7-Scenes
 
-12-Scenes, BundleFusion, 3RScan | the same, also in `data/`, `sequence/`, and `info.txt` or `_info.txt` | a file a
-    frame, INF = none | `m_depthShift`; PNG or PGM, registered to colour | `m_calibrationColorIntrinsic`,
-    `m_calibrationDepthIntrinsic`, extrinsics
+12-Scenes, BundleFusion, 3RScan | the same, also in `data/`, `sequence/`, and `info.txt` or `_info.txt` | by a
+    [description](#12-scenes) | of the description | of the description
 """
 
 
@@ -257,81 +221,19 @@ Open3D, Redwood | `color/` (`colors/`, `image/`, `rgb/`), `depth/`, `trajectory.
 """
 
 
-PARAMETERS = "cam_params.json"
-NICE_SLAM: Mapping[str, float] = {"fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}
-_FORMS = (  # trajectory, colour, depth
-    ("traj.txt", "results/frame*", "results/depth*"),
-    ("traj_w_c.txt", "rgb/rgb_*", "depth/depth_*"),
-)
-
-
-def read_replica(folder: Path, options: SourceOptions) -> Description:
-    """The folder as a description."""
-    form = _form(folder)
-    assert form is not None
-    name, color_pattern, depth_pattern = form
-    colors, depths = _by_number(folder, color_pattern), _by_number(folder, depth_pattern)
-    poses = read_matrix_lines(folder / name)
-    pairs = paired_by_name(
-        folder / name,
-        colors,
-        depths,
-        lambda number: poses[number] if number < len(poses) else None,
-        lambda number: colors[number].stem,
-    )
-    lens, scale = _replica_lens(folder, name, pairs.views[0].color, options)
-    return described(
-        pairs,
-        folder,
-        options,
-        poses=PosesTable(format="matrix-lines", file=name),
-        lens=lambda _: lens,
-        depth=DepthTable(scale=scale),
-    )
-
-
-def _form(folder: Path) -> tuple[str, str, str] | None:
-    return next((f for f in _FORMS if (folder / f[0]).is_file() and next(folder.glob(f[1]), None) is not None), None)
-
-
-def _by_number(folder: Path, pattern: str) -> dict[int, Path]:
-    found = sorted(folder.glob(pattern), key=lambda path: by_numbers(path.name))
-    return {numbers[-1]: path for path in found if (numbers := by_numbers(path.stem)[0])}
-
-
-def _replica_lens(
-    folder: Path, trajectory: str, image: ImageFile, options: SourceOptions
-) -> tuple[CameraTable, float]:
-    """The lens, and metres per count."""
-    given = given_lens(options, image)
-    width, height = image_size(image)
-    if trajectory == _FORMS[1][0]:
-        square = (width / 2, width / 2, (width - 1) / 2, (height - 1) / 2)
-        return given or pinhole(square, image), MILLIMETRE
-    file = next((path for parent in (folder, folder.parent) if (path := parent / PARAMETERS).is_file()), None)
-    content: Any = dict(NICE_SLAM) if file is None else read_json(file)
-    try:
-        values = content if file is None else content["camera"]
-        lens = tuple(float(values[key]) for key in ("fx", "fy", "cx", "cy"))
-        scale = 1.0 / float(values["scale"])
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise InputError(
-            f"{file}: expected camera.fx, fy, cx, cy, scale, got no usable {error}", remedy="copy the file again"
-        ) from None
-    if file is None and given is None and (width, height) != (1200, 680):
-        raise InputError(
-            f"{folder}: no {PARAMETERS} in it or above it, and images of {width}x{height} instead of 1200x680",
-            remedy="give --intrinsics camera=FX,FY,CX,CY and --depth-scale",
-        )
-    return given or pinhole(lens, image), scale
-
-
 _REPLICA_DOCS = """
-Replica of NICE-SLAM | `traj.txt`, `results/frame*`, `results/depth*` | a matrix a line, by number | `scale` of
-    `cam_params.json`, else 1/6553.5 m | `cam_params.json`, else 600, 600, 599.5, 339.5
+Replica of NICE-SLAM or Semantic-NeRF | `traj.txt`, `results/frame*`; `traj_w_c.txt`, `rgb/rgb_*` | by a
+    [description](#replica) | of the description | of the description
+"""
 
-Replica of Semantic-NeRF | `traj_w_c.txt`, `rgb/rgb_*`, `depth/depth_*` | a matrix a line, by number | 1 mm | a
-    field of view of 90°
+_SCANNET_DOCS = """
+ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color.txt`) | by a
+    [description](#scannet-export) | of the description | of the description
+"""
+
+_ICL_DOCS = """
+ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by a [description](#icl-nuim) | of the description |
+    of the description
 """
 
 ENTRIES = (
@@ -344,10 +246,24 @@ ENTRIES = (
     ),
     Layout(name="Open3D scene", order=9, matches=is_redwood, read=read_redwood, docs=_REDWOOD_DOCS),
     Layout(
+        name="ScanNet export",
+        order=2,
+        matches=marked(*(f"color/ depth/ pose/ {lens}" for lens in ("intrinsic/", "intrinsics_color.txt"))),
+        read=by_description("ScanNet export", "scannet.toml"),
+        docs=_SCANNET_DOCS,
+    ),
+    Layout(
+        name="ICL-NUIM",
+        order=5,
+        matches=marked("rgb/ depth/ *.gt.freiburg"),
+        read=by_description("ICL-NUIM", "icl_nuim.toml"),
+        docs=_ICL_DOCS,
+    ),
+    Layout(
         name="Replica",
         order=6,
-        matches=lambda folder: _form(folder) is not None,
-        read=read_replica,
+        matches=marked("traj.txt results/frame*", "traj_w_c.txt rgb/rgb_*"),
+        read=by_description("Replica", "replica_nice_slam.toml", "replica_semantic_nerf.toml"),
         docs=_REPLICA_DOCS,
     ),
 )

@@ -11,11 +11,6 @@ Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): its page gives the lens, and t
 that groundtruth.txt follows, T_camera = T_ros^-1 T_groundtruth T_ros T_m. The rotation of T_m has a scale of 1.059
 there, which is left out. ETH3D SLAM (Schöps et al., CVPR 2019): ``calibration.txt`` with fx, fy, cx, cy.
 
-ICL-NUIM in its TUM-compatible form: ``rgb/N.png``, ``depth/N.png`` and a ``*.gt.freiburg``, all by the number N. The
-renderer's camera is left-handed, which its page writes as a negative focal length (481.20, -480.00, 319.50, 239.50):
-y points up, in the camera and in the world. Both are mirrored here, so that poses stay rigid and fy is positive, as
-in theNded/MeshHashing (src/io/config_manager.cc). The trajectory begins with image 1; image 0 has no pose.
-
 SUN3D: ``image/NUMBER-MICROSECONDS.jpg``, ``depth/NUMBER-MICROSECONDS.png``, ``intrinsics.txt``, ``extrinsics/``.
 
 As the dataset's own reader takes them (SUN3DreaderWithAnnotation, readSUN3Dannotation.m): depth with its bits rotated
@@ -42,20 +37,16 @@ from splatctrl_cli.recording.folder.layout import (
     described,
     images_of,
     marked,
-    paired_by_name,
     paired_by_stamp,
     pinhole,
     pose_or_none,
     read_K,
 )
-from splatctrl_cli.recording.folder.poses import Trajectory, read_numbers, read_tum, rigid, stamp_of_text, tum_rows
+from splatctrl_cli.recording.folder.poses import Trajectory, read_numbers, rigid, stamp_of_text, tum_rows
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 SCALE = 1.0 / 5000.0  # [m] per count
-ICL_LENS = (481.2, 480.0, 319.5, 239.5)
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
-_TRAJECTORY = "*.gt.freiburg"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,34 +172,6 @@ def marker_to_camera(T_ground_truth: Float64) -> Float64:
     return np.asarray(_BONN_T_ROS.T @ T_ground_truth @ _BONN_T_ROS @ rigid(_BONN_T_M, "Bonn's T_m"))
 
 
-def read_icl(folder: Path, options: SourceOptions) -> Description:
-    """The folder as a description, right-handed."""
-    colors, depths = images_of(folder / "rgb"), images_of(folder / "depth")
-    file = sorted(folder.glob(_TRAJECTORY))[0]
-    poses = {_number(name): MIRROR @ T @ MIRROR for name, T in read_tum(file).items()}
-    return described(
-        paired_by_name(file, colors, depths, lambda name: poses.get(_number(name))),
-        folder,
-        options,
-        poses=PosesTable(format="tum", file=file.name),
-        lens=lambda image: pinhole(ICL_LENS, image),
-        depth=DepthTable(scale=SCALE),
-    )
-
-
-def _number(name: str) -> int:
-    """The number that a stem or a stamp is, -1 where it is none."""
-    try:
-        return int(float(name))
-    except (ValueError, OverflowError):
-        return -1
-
-
-_ICL_DOCS = """
-ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by number; mirrored to right-handed | 1/5000 m |
-    481.2, 480, 319.5, 239.5
-"""
-
 _TUM_DOCS = """
 TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated at the colour's stamp | 1/5000 m, paired
     within 20 ms | by freiburg1, 2 or 3 (fr1, ...) in the folder's name or the heads of its lists, else
@@ -260,7 +223,6 @@ SUN3D | `image/`, `depth/`, `extrinsics/`, `intrinsics.txt` | the newest file of
 
 ENTRIES = (
     Layout(name="TUM RGB-D", order=0, matches=marked("rgb.txt depth.txt"), read=read_tum_folder, docs=_TUM_DOCS),
-    Layout(name="ICL-NUIM", order=5, matches=marked(f"rgb/ depth/ {_TRAJECTORY}"), read=read_icl, docs=_ICL_DOCS),
     Layout(
         name="SUN3D",
         order=8,

@@ -16,9 +16,10 @@ from splatctrl_cli.geometry import invert_transform, pose_at, quat_from_rotation
 from splatctrl_cli.recording.log.registration import TfTree
 from splatctrl_cli.records import Float64
 
-FORMATS = ("matrix-blocks", "trajectory-log", "tum", "nerfstudio", "matrix-files")
+FORMATS = ("matrix-blocks", "matrix-lines", "trajectory-log", "tum", "nerfstudio", "matrix-files")
 CONVENTIONS = ("camera_to_world", "world_to_camera")
-AXES = ("opencv", "opengl")
+AXES = ("opencv", "opengl", "left-handed")
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])  # y up, in the camera and in the world (ICL-NUIM)
 OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
 _MOST_NS = 1 << 62
 _MSVC_NAN = re.compile(r"[+-]?1\.#(INF|IND|QNAN|SNAN)\d*")  # how Windows writes NaN and infinity (12-Scenes)
@@ -34,6 +35,8 @@ def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Flo
     T = rigid(matrix, where)
     if convention == "world_to_camera":
         T = invert_transform(T)
+    if axes == "left-handed":
+        return MIRROR @ T @ MIRROR
     return T @ OPENGL_FROM_OPTICAL if axes == "opengl" else T
 
 
@@ -99,15 +102,15 @@ def tum_rows(path: Path) -> dict[str, Float64 | None]:
     return poses
 
 
-def read_matrix_lines(path: Path) -> list[Float64]:
-    """A 4x4 matrix in each line, by rows."""
-    poses = []
+def read_matrix_lines(path: Path) -> dict[str, Float64]:
+    """A 4x4 matrix in each line, by rows, or its first three rows (KITTI); by the number of the line, from 0."""
+    poses: dict[str, Float64] = {}
     for where, _, values in read_rows(path):
-        if len(values) != 16:
+        if len(values) not in {12, 16}:
             raise InputError(
-                f"{where}: expected the 16 numbers of a 4x4 matrix, got {len(values)}", remedy="copy the file again"
+                f"{where}: expected the 16 or 12 numbers of a matrix, got {len(values)}", remedy=_CORRECT
             )
-        poses.append(np.array(values).reshape(4, 4))
+        poses[str(len(poses))] = np.array([*values, 0.0, 0.0, 0.0, 1.0][:16]).reshape(4, 4)
     return poses
 
 
@@ -183,6 +186,7 @@ def stamp_of_text(text: str, unit_ns: int = 1_000_000_000) -> int | None:
 
 
 READERS: dict[str, Callable[[Path], dict[str, Float64]]] = {
+    "matrix-lines": read_matrix_lines,
     "trajectory-log": read_trajectory_log,
     "tum": read_tum,
     "nerfstudio": lambda path: read_nerfstudio(path)[1],

@@ -12,8 +12,8 @@ import cv2
 import lzf
 import numpy as np
 import pytest
-from splatctrl_cli.formats.image_file import write_pfm
 
+from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, quat_from_rotation
 from splatctrl_cli.recording.folder.dtu import DtuView
 from splatctrl_cli.recording.folder.dtu_source import shrunk
@@ -113,20 +113,13 @@ def make_frames(folder: Path, sequence: str = "seq-01") -> Path:
     return folder
 
 
-def make_scannet(folder: Path, depth_size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+def make_scannet(folder: Path) -> Path:
     for index, T in enumerate(POSES):
         name = 8 + index  # 8, 9, 10: by number, not by letter
         write_pair(folder / f"color/{name}.png", folder / f"depth/{name}.png", index)
-        if depth_size != (WIDTH, HEIGHT):
-            cv2.imwrite(str(folder / f"depth/{name}.png"), np.full(depth_size[::-1], 1500, np.uint16))
         (folder / "pose").mkdir(exist_ok=True)
         (folder / f"pose/{name}.txt").write_text(matrix_text(T))
     (folder / "intrinsic").mkdir()
-    for name, scale in (("color", 1.0), ("depth", depth_size[0] / WIDTH)):
-        matrix = np.eye(4)
-        matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2] = (scale * value for value in K)
-        (folder / f"intrinsic/intrinsic_{name}.txt").write_text(matrix_text(matrix))
-        (folder / f"intrinsic/extrinsic_{name}.txt").write_text(matrix_text(np.eye(4)))
     return folder
 
 
@@ -176,15 +169,14 @@ def make_icl(folder: Path) -> Path:
     return folder
 
 
-def make_replica(folder: Path) -> Path:
-    for index in range(3):
-        stems = (f"frame{index + 9:06d}.png", f"depth{index + 9:06d}.png")
-        write_pair(folder / "results" / stems[0], folder / "results" / stems[1], index, 1 / 6553.5)
-    matrices = [np.eye(4)] * 9 + POSES
-    (folder / "traj.txt").write_text("".join(matrix_text(T).replace("\n", " ") + "\n" for T in matrices))
-    lens = dict(zip(("fx", "fy", "cx", "cy"), K, strict=True))
-    text = json.dumps({"camera": {"w": WIDTH, "h": HEIGHT, **lens, "scale": 6553.5}})
-    (folder / "cam_params.json").write_text(text)
+def make_replica(folder: Path, *, is_slam: bool = True) -> Path:
+    """As NICE-SLAM has it, or Semantic-NeRF."""
+    of_slam, of_nerf = ("results/frame{}.png", "results/depth{}.png"), ("rgb/rgb_{}.png", "depth/depth_{}.png")
+    for index in range(3):  # 8, 9, 10: by number, not by letter
+        names = (form.format(f"{index + 8:0{6 if is_slam else 1}d}") for form in (of_slam if is_slam else of_nerf))
+        write_pair(*(folder / name for name in names), index, 1 / 6553.5 if is_slam else 1e-3)
+    text = "".join(matrix_text(T).replace("\n", " ") + "\n" for T in [np.eye(4)] * 8 + POSES)
+    (folder / ("traj.txt" if is_slam else "traj_w_c.txt")).write_text(text)
     return folder
 
 
@@ -337,11 +329,8 @@ EXAMPLES = {  # by the layout's name
         make=make_tum, options=GIVEN, unit=1 / 5000, stamps_ns=(1_305_031_102_000_000_000, 100_000_000)
     ),
     "BOP scene": Example(make=make_bop, unit=1e-4),
-    "ScanNet export": Example(make=make_scannet),
     "7-Scenes": Example(make=make_frames, options=GIVEN),
     "nerfstudio": Example(make=make_nerfstudio),
-    "ICL-NUIM": Example(make=make_icl, options=GIVEN, unit=1 / 5000),
-    "Replica": Example(make=make_replica, unit=1 / 6553.5),
     "ARKitScenes": Example(make=make_arkit, stamps_ns=(305_367_000_000, 100_000_000)),
     "SUN3D": Example(make=make_sun3d, stamps_ns=(0, 33_000_000)),
     "MVSNet scene": Example(make=make_mvsnet),

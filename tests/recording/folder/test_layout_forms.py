@@ -2,6 +2,9 @@
 
 import json
 import math
+import re
+import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 from tests.recording.folder.make_layout import (
+    GIVEN,
     HEIGHT,
     POSES,
     WIDTH,
@@ -39,27 +43,13 @@ from tests.recording.folder.make_layout import (
     write_pair,
 )
 
-IDENTITY = " ".join(str(int(value)) for value in np.eye(4).ravel())
+DOCS = Path(__file__).parents[3] / "docs"
 
 
-def lens_text(fx: float, fy: float, cx: float, cy: float) -> str:
-    return f"{fx} 0 {cx} 0 0 {fy} {cy} 0 0 0 1 0 0 0 0 1"
-
-
-def write_info(path: Path, *, scale: float = 1.0, extrinsic: str = IDENTITY, shift: int = 1000) -> None:
-    """As sensorData.h writes it; the depth lens is `scale` of the colour lens."""
-    lines = (
-        "m_versionNumber = 4",
-        "m_sensorName = StructureSensor",
-        f"m_colorWidth = {WIDTH}",
-        f"m_depthShift = {shift}",
-        f"m_calibrationColorIntrinsic = {lens_text(*K)} ",
-        f"m_calibrationColorExtrinsic = {IDENTITY} ",
-        f"m_calibrationDepthIntrinsic = {lens_text(*(scale * value for value in K))} ",
-        f"m_calibrationDepthExtrinsic = {extrinsic} ",
-        "m_frames.size = 3",
-    )
-    path.write_text("\n".join(lines) + "\n")
+def write_info(folder: Path) -> Path:
+    """As sensorData.h writes it."""
+    (folder / "info.txt").write_text("m_depthShift = 1000\n")
+    return folder
 
 
 def seen_by(frame: RgbdFrame) -> Float64:
@@ -93,33 +83,57 @@ def test_poses_of_bonn_are_moved_from_the_markers_to_the_camera(tmp_path: Path) 
     assert invert_transform(T_m)[:3, 3] == pytest.approx([0.0113, -0.0098, 0.0111])
 
 
+DESCRIBED: dict[str, tuple[Callable[[Path], Path], float]] = {  # by the example's name: a folder, its unit of depth
+    "replica_nice_slam": (make_replica, 1 / 6553.5),
+    "replica_semantic_nerf": (lambda folder: make_replica(folder, is_slam=False), 1e-3),
+    "icl_nuim": (make_icl, 1 / 5000),
+    "scannet": (make_scannet, 1e-3),
+    "twelve_scenes": (lambda folder: write_info(make_frames(folder, "data")), 1e-3),
+}
+
+
+def described(folder: Path, name: str) -> Path:
+    """An example with the size and the lens of our images."""
+    text = (DOCS / f"examples/{name}.toml").read_text().replace(".jpg", ".png")
+    for key, value in zip(("width", "height", "fx", "fy", "cx", "cy"), (WIDTH, HEIGHT, *K), strict=True):
+        text = re.sub(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
+    (folder / "own.toml").write_text(text)
+    return folder / "own.toml"
+
+
+@pytest.mark.parametrize("name", DESCRIBED)
+def test_a_layout_is_read_by_the_description_that_its_refusal_names(tmp_path: Path, name: str) -> None:
+    make, unit = DESCRIBED[name]
+    folder = make(tmp_path / name)
+    with pytest.raises(InputError, match=rf"write .*{name}.toml.* as `splatctrl help input`.*--root {folder}"):
+        open_source(folder)
+    source = open_source(described(tmp_path, name), SourceOptions(root=folder))
+    check([r for r in source.records() if isinstance(r, RgbdFrame)], unit)
+    assert source.loss.without_pose == (name == "icl_nuim")  # image 0
+
+
+def test_the_page_shows_each_description_as_it_is_in_the_examples() -> None:
+    page = (DOCS / "input.md").read_text()
+    shown = [tomllib.loads(text) for text in re.findall(r"```toml\n(camera = .*?)```", page, re.DOTALL)]
+    assert shown == [tomllib.loads((DOCS / f"examples/{name}.toml").read_text()) for name in DESCRIBED]
+
+
 def test_a_point_of_icl_nuim_is_where_its_negative_focal_length_says(tmp_path: Path) -> None:
-    folder = make_icl(tmp_path)
-    source = open_source(folder)
-    frame = next(record for record in source.records() if isinstance(record, RgbdFrame))
-    assert source.loss.without_pose == 1  # image 0
+    frame = frames_of(described(tmp_path, "icl_nuim"), SourceOptions(root=make_icl(tmp_path / "icl")))[0]
     z, v, u = float(frame.depth[1, 2]), 1, 2
-    left = np.array([(u - 319.5) / 481.2 * z, (v - 239.5) / -480.0 * z, z])  # the page's own camera
+    left = np.array([(u - K[2]) / K[0] * z, (v - K[3]) / -K[1] * z, z])  # the page's own camera
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
     world_left = transform_points(mirror @ POSES[0] @ mirror, left[None])[0]
     ours = transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[v, u][None])[0]
     assert ours * [1, -1, 1] == pytest.approx(world_left, abs=1e-6)
 
 
-def test_replica_without_parameters_must_have_the_size_of_nice_slam(tmp_path: Path) -> None:
-    folder = make_replica(tmp_path)
-    (folder / "cam_params.json").unlink()
-    with pytest.raises(InputError, match=r"images of 8x6 instead of 1200x680; give --intrinsics camera="):
-        open_source(folder)
-    check(frames_of(folder, SourceOptions(intrinsics={"camera": K})), 1 / 6553.5)
-
-
-def test_replica_of_semantic_nerf_has_a_right_angle_of_view(tmp_path: Path) -> None:
-    for index in range(3):
-        write_pair(tmp_path / f"rgb/rgb_{index}.png", tmp_path / f"depth/depth_{index}.png", index)
-    lines = [matrix_text(T).replace("\n", " ") + "\n" for T in POSES]
-    (tmp_path / "traj_w_c.txt").write_text("".join(lines))
-    check(frames_of(tmp_path), k=(4.0, 4.0, 3.5, 2.5))
+def test_a_pose_of_a_description_that_is_not_finite_is_none(tmp_path: Path) -> None:
+    folder = make_replica(tmp_path / "replica")
+    lines = (folder / "traj.txt").read_text().splitlines()
+    (folder / "traj.txt").write_text("\n".join([*lines[:-1], " ".join(["-inf"] * 12)]))
+    source = open_source(described(tmp_path, "replica_nice_slam"), SourceOptions(root=folder))
+    assert (len(list(source.records())), source.loss.without_pose) == (2, 1)
 
 
 def test_smaller_depth_of_arkit_scenes_is_fitted_to_colour(tmp_path: Path) -> None:
@@ -157,60 +171,22 @@ def test_seven_scenes_register_depth_and_its_poses_to_colour(tmp_path: Path) -> 
     assert "registered to colour by another Kinect's" in source.loss.notes[0]
 
 
-def test_frames_with_an_info_file_bring_both_lenses_and_the_depth_unit(tmp_path: Path) -> None:
-    folder = make_frames(tmp_path / "kitchen", "data")
-    write_info(folder / "info.txt", shift=1000)
-    check(frames_of(folder))
-    write_info(folder / "info.txt", shift=500)
-    assert frames_of(folder)[0].depth[1, 1] == pytest.approx(1.09 * 2, abs=1e-6)
-
-
 def test_a_pose_that_windows_writes_as_infinite_is_lost(tmp_path: Path) -> None:
     folder = make_frames(tmp_path, "data")
-    write_info(folder / "info.txt")
     (folder / "data/frame-000001.pose.txt").write_text("-1.#INF -1.#INF00 1.#QNAN -1.#IND\n" * 4)
-    source = open_source(folder)
+    source = open_source(folder, GIVEN)
     assert len(list(source.records())) == 2 and source.loss.without_pose == 1
 
 
 def test_depth_in_a_pgm_is_read_as_sensreader_writes_it(tmp_path: Path) -> None:
     folder = make_frames(tmp_path, "sequence")
-    write_info(folder / "sequence/_info.txt")
     for index in range(3):
         (folder / f"sequence/frame-{index:06d}.depth.png").unlink()
         head = b"P5\n# data values are 16-bit each; depth shift is 1000\n%d %d\n65535\n" % (WIDTH, HEIGHT)
         (folder / f"sequence/frame-{index:06d}.depth.pgm").write_bytes(
             head + counts_of(index).astype(">u2").tobytes()
         )
-    check(frames_of(folder))
-
-
-def test_scannet_extrinsics_register_depth_to_colour(tmp_path: Path) -> None:
-    """Colour sits 0.2 m to the right of the base, depth 0.1 m above it; a wall 2 m before the base."""
-    folder = make_scannet(tmp_path)
-    T_base_color, T_base_depth = np.eye(4), np.eye(4)
-    T_base_color[0, 3], T_base_depth[1, 3] = 0.2, -0.1
-    (folder / "intrinsic/extrinsic_color.txt").write_text(matrix_text(T_base_color))
-    (folder / "intrinsic/extrinsic_depth.txt").write_text(matrix_text(T_base_depth))
-    depth = np.zeros((HEIGHT, WIDTH), np.uint16)
-    depth[3, 4] = 2000
-    cv2.imwrite(str(folder / "depth/8.png"), depth)
-    frame = frames_of(folder)[0]
-    assert frame.T_world_camera == pytest.approx(POSES[0] @ T_base_color, abs=1e-9)
-    own = np.array([(4 - K[2]) / K[0] * 2.0, (3 - K[3]) / K[1] * 2.0 - 0.1, 2.0])  # in the base
-    u, v = K[0] * (own[0] - 0.2) / 2.0 + K[2], K[1] * own[1] / 2.0 + K[3]
-    rows, columns = np.nonzero(frame.depth)
-    assert [list(rows), list(columns)] == [[round(v)], [round(u)]]
-    assert frame.depth.max() == pytest.approx(2.0)
-
-
-def test_the_small_scannet_has_its_lenses_beside_the_images(tmp_path: Path) -> None:
-    folder = make_scannet(tmp_path)
-    for name in ("color", "depth"):
-        (folder / f"intrinsic/intrinsic_{name}.txt").rename(folder / f"intrinsics_{name}.txt")
-        (folder / f"intrinsic/extrinsic_{name}.txt").unlink()
-    (folder / "intrinsic").rmdir()
-    check(frames_of(folder))
+    check(frames_of(folder, GIVEN))
 
 
 @pytest.mark.parametrize("trajectory", ["livingroom1-traj.txt", "lounge_trajectory.log", "scene/trajectory.log"])
@@ -374,8 +350,7 @@ def test_a_lens_of_arkit_scenes_that_is_none_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_focal_length_of_next_to_nothing_is_refused(tmp_path: Path) -> None:
-    folder = make_scannet(tmp_path, (WIDTH // 2, HEIGHT // 2))
-    file = folder / "intrinsic/intrinsic_depth.txt"
-    file.write_text(file.read_text().replace("5.0", "1e-320"))
+    folder = make_arkit(tmp_path)
+    next((folder / "41069021_frames/lowres_wide_intrinsics").iterdir()).write_text("8 6 1e-320 11 3.5 2.5")
     with pytest.raises(InputError, match="expected a positive number of pixels, got 1e-320"):
         open_source(folder)
