@@ -135,8 +135,13 @@ class CalibratedSource:
         self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
         self.has_clock, self.world_frame = source.has_clock, source.world_frame
         self.states = correction.states(source.states)
-        for _, camera, T in self._first_poses():
-            correction.pose(camera, T)
+        unseen = set(self.cameras)
+        for _, camera, T in source.poses():
+            if camera in unseen:
+                correction.pose(camera, T)
+                unseen.remove(camera)
+            if not unseen:
+                break
 
     @property
     def joint_topics(self) -> JointTopics | None:
@@ -220,16 +225,6 @@ class CalibratedSource:
             stamps.append(stamp)
             poses.append(T)
         return paths
-
-    def _first_poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Of each camera."""
-        seen: set[str] = set()
-        for stamp, camera, T in self.inner.poses():
-            if camera not in seen:
-                seen.add(camera)
-                yield stamp, camera, T
-                if len(seen) == len(self.cameras):
-                    return
 
 
 def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_ns: int) -> Float64 | None:

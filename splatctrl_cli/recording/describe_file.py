@@ -64,7 +64,11 @@ def _npz(path: Path, _head: bytes) -> Summary:
             arrays = {n: _npy_header(archive, n) for n in archive.namelist() if n.endswith(".npy")}
         if not arrays:
             raise InputError(f"{path}: a zip file without arrays", remedy="expected .npz")
-        short = [name.removesuffix(".npy") for name, (shape, dtype) in arrays.items() if _is_short(shape, dtype)]
+        short = [
+            name.removesuffix(".npy")
+            for name, (shape, dtype) in arrays.items()
+            if (shape == () if dtype.kind in "US" else dtype.kind in "fiub" and prod(shape) <= _LIST_LIMIT)
+        ]
         facts: dict[str, object] = {
             name: _text_or_json(str(array)) if array.dtype.kind in "US" else array.tolist()
             for name, array in read_arrays(path, short, most=1 << 24).items()
@@ -87,10 +91,6 @@ def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], n
     with archive.open(name) as stream:
         shape, _, dtype = npy_head(stream)
     return shape, dtype
-
-
-def _is_short(shape: tuple[int, ...], dtype: np.dtype[Any]) -> bool:
-    return shape == () if dtype.kind in "US" else dtype.kind in "fiub" and prod(shape) <= _LIST_LIMIT
 
 
 def _parsed(path: Path, parse: Callable[[], Any], what: str) -> Any:

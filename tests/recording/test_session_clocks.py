@@ -211,11 +211,11 @@ def test_images_that_did_not_come_are_counted(tmp_path: Path) -> None:
 
 def test_drops_are_not_guessed_where_there_is_no_rate() -> None:
     rng = np.random.default_rng(0)
-    assert dropped(np.cumsum(rng.exponential(1e8, 200)).astype(np.int64).tolist()).num_images == 0
+    assert dropped(np.cumsum(rng.exponential(1e8, 200)).astype(np.int64).tolist())[1] == 0
     jitter = (np.arange(200) * 1e8 + rng.normal(0, 3e6, 200)).astype(np.int64).tolist()
-    assert dropped(jitter).num_images == 0
-    assert dropped([*jitter[:50], *jitter[53:]]).num_images == 3
-    assert dropped(jitter[:3]).num_images == 0
+    assert dropped(jitter)[1] == 0
+    assert dropped([*jitter[:50], *jitter[53:]])[1] == 3
+    assert dropped(jitter[:3])[1] == 0
     assert first_of_each(np.array([5, 7, 5, 5, 9, 7])).tolist() == [0, 1, 4]
 
 

@@ -47,10 +47,6 @@ def _are_names(value: object) -> bool:
     return isinstance(value, list) and all(map(_is_text, value))
 
 
-def _are_cameras(value: object) -> bool:
-    return isinstance(value, dict) and all(map(_is_camera, value.values()))
-
-
 def _is_camera(value: object) -> bool:
     if not isinstance(value, dict):
         return False
@@ -76,7 +72,11 @@ _ENTRIES: tuple[tuple[str, Callable[[object], bool], str], ...] = (
     ("world_frame", _is_text, "a name"),
     ("has_clock", lambda value: isinstance(value, bool), "true or false"),
     ("joint_names", _are_names, "a list of names"),
-    ("cameras", _are_cameras, "by name width, height, fx, fy, cx, cy and depth_scale of each"),
+    (
+        "cameras",
+        lambda value: isinstance(value, dict) and all(map(_is_camera, value.values())),
+        "by name width, height, fx, fy, cx, cy and depth_scale of each",
+    ),
     ("loss", _is_loss, "counts by name, and notes"),
     ("sources", lambda value: isinstance(value, dict), "sha256 by name"),
     ("name", _is_text, "a name"),

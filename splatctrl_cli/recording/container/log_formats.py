@@ -143,7 +143,9 @@ def open_raw_log(path: Path) -> RawLog:
     kind = next((kind for kind in CONTAINERS if magic.startswith(kind.magic)), None)
     if kind is not None:
         log = kind.open(path)
-        return UnpackedMessagesLog(log) if _begins_compressed(log) else log
+        first = () if isinstance(log, Bag1Log) else islice(log.messages(Damage()), 5)  # some may be damaged
+        is_packed = any(m.topic.encoding == "cdr" and m.data.startswith(_ZSTD) for m in first)  # CDR begins with a 0
+        return UnpackedMessagesLog(log) if is_packed else log
     if magic.startswith(_ZSTD):
         return _open_compressed(path)
     if path.suffix in SUFFIXES:
@@ -189,12 +191,6 @@ def told_formats(path: Path) -> set[str]:
         return {str(topic["topic_metadata"]["serialization_format"]) for topic in topics}
     except (KeyError, TypeError):
         return set()
-
-
-def _begins_compressed(log: RawLog) -> bool:
-    """Whether one of the first messages, of which some may be damaged, is a zstd frame: CDR begins with a 0."""
-    first = () if isinstance(log, Bag1Log) else islice(log.messages(Damage()), 5)
-    return any(message.topic.encoding == "cdr" and message.data.startswith(_ZSTD) for message in first)
 
 
 def _open_compressed(path: Path) -> RawLog:

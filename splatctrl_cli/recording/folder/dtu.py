@@ -70,9 +70,9 @@ def read_dtu(
 
     def camera(number: int, size: tuple[int, int]) -> tuple[Intrinsics, Float64]:
         path = _camera_file(root, number)
-        found = read_camera_file(path)
-        found.T_camera_world[:3, 3] /= MILLIMETRES
-        return fitted_intrinsics(found.K, size, path), invert_transform(found.T_camera_world)
+        K, T_camera_world, _ = read_camera_file(path)
+        T_camera_world[:3, 3] /= MILLIMETRES
+        return fitted_intrinsics(K, size, path), invert_transform(T_camera_world)
 
     found = read_views(
         scan,
@@ -259,17 +259,8 @@ def _camera_file(root: Path, number: int) -> Path:
     raise InputError(f"{candidates[-1]}: missing", remedy="every image needs its camera file")
 
 
-@dataclass(frozen=True, kw_only=True)
-class CameraFile:
-    """K (3, 3) [px] and T_camera_world (4, 4) as written, in any length, and the least depth, 0 where none is."""
-
-    K: Float64
-    T_camera_world: Float64
-    nearest: float
-
-
-def read_camera_file(path: Path) -> CameraFile:
-    """A camera file of MVSNet: extrinsic, intrinsic, and a line that begins with the least depth."""
+def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
+    """K (3, 3) [px], T_camera_world (4, 4) in any length and the least depth (0: none) of a camera file of MVSNet."""
     words = path.read_text(encoding="utf-8", errors="replace").split()
     try:
         extrinsic = np.array(words[words.index("extrinsic") + 1 :][:16], dtype=np.float64).reshape(4, 4)
@@ -283,7 +274,7 @@ def read_camera_file(path: Path) -> CameraFile:
     R = extrinsic[:3, :3]
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
         raise InputError(f"{path}: extrinsic: expected a rotation in its first three columns")
-    return CameraFile(K=K, T_camera_world=extrinsic, nearest=nearest)
+    return K, extrinsic, nearest
 
 
 def fitted_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:

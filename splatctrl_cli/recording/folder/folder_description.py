@@ -216,7 +216,9 @@ def read_table(
     _check_keys(content, {name, *beside}, str(path), "")
     if fill is not None and isinstance(content.get(name), dict):
         content[name] = fill(content[name])
-    return _required(kind, content, name, path)
+    if (table := _optional(kind, content, name, path)) is None:
+        raise _refused(f"{path}: [{name}] is missing")
+    return table
 
 
 def has_table(path: Path, name: str) -> bool:
@@ -315,13 +317,6 @@ def check_camera(camera: CameraTable, where: str) -> None:
     if camera.distortion_model not in DISTORTION_MODELS:
         names = ", ".join(DISTORTION_MODELS)
         raise _refused(f"{where}.distortion_model: expected one of {names}, got {camera.distortion_model!r}")
-
-
-def _required(kind: type[T], content: dict[str, Any], name: str, path: Path) -> T:
-    table = _optional(kind, content, name, path)
-    if table is None:
-        raise _refused(f"{path}: [{name}] is missing")
-    return table
 
 
 def _optional(kind: type[T], content: dict[str, Any], name: str, path: Path) -> T | None:

@@ -191,7 +191,8 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
             continue
         where = f"{path}: image {int(name)}"
         try:
-            lens = _bop_lens(entry, size, prefix or CAMERA)
+            fx, _, cx, _, fy, cy, _, _, _ = (float(value) for value in entry["cam_K"])
+            lens = CameraTable(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy, name=prefix or CAMERA)
             view = ListedView(
                 name=f"{prefix}/{name}" if prefix else name,
                 color=color,
@@ -204,11 +205,6 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
             raise InputError(f"{where}: expected BOP's fields, got no usable {error}", remedy=_REMEDY) from None
         views.append(view)
     return views
-
-
-def _bop_lens(entry: dict[str, Any], size: tuple[int, int], name: str) -> CameraTable:
-    fx, _, cx, _, fy, cy, _, _, _ = (float(value) for value in entry["cam_K"])
-    return CameraTable(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy, name=name)
 
 
 def _pose(entry: dict[str, Any]) -> Float64 | None:
@@ -237,7 +233,7 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
     options.refuse(("intrinsics",), "an MVSNet scene", folder)
     files = {path.name.removesuffix("_cam.txt"): path for path in sorted(folder.glob(_CAMERAS))}
     cameras = {stem: read_camera_file(path) for stem, path in files.items()}
-    nearest = float(np.median([camera.nearest for camera in cameras.values()]))
+    nearest = float(np.median([nearest for _, _, nearest in cameras.values()]))
     unit, notes = options.depth_scale, []
     if unit is None:
         unit = MILLIMETRE if nearest > PLAUSIBLE_DEPTH[1] else 1.0
@@ -251,15 +247,14 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
     notes += without
     lenses, views = Lenses(), []
     for stem, color in colors.items():
-        camera, depth = cameras[stem], depths.get(int(stem) if stem.isdigit() else -1)
+        (K, T_camera_world, _), depth = cameras[stem], depths.get(int(stem) if stem.isdigit() else -1)
         if depth is None and depths:
             continue
-        k = fitted_intrinsics(camera.K, image_size(color), files[stem])
-        matrix = camera.T_camera_world.copy()
-        matrix[:3, 3] *= unit
+        k = fitted_intrinsics(K, image_size(color), files[stem])
+        T_camera_world[:3, 3] *= unit
         lens = CameraTable(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
         lens = lenses.named(lens, str(files[stem]))
-        views.append(ListedView(name=stem, color=color, depth=depth, matrix=matrix, camera=lens))
+        views.append(ListedView(name=stem, color=color, depth=depth, matrix=T_camera_world, camera=lens))
     return described(
         Pairs(path=folder, views=views, unpaired=(len(colors) - len(views), len(depths) - len(views))),
         folder,

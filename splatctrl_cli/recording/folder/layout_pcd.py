@@ -55,15 +55,6 @@ class Cloud:
         return transform_points(invert_transform(self.T_world_camera), self.points) if is_world else self.points
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Camera:
-    """The camera of all clouds, whether their points are in the world, and the cloud that it was fitted to."""
-
-    intrinsics: Intrinsics
-    is_world: bool
-    first: Path
-
-
 def read_cloud(path: Path) -> Cloud:
     """An organised cloud with colour. Raises InputError for any other file."""
     said = _head(path)
@@ -107,14 +98,14 @@ def read(path: Path, options: SourceOptions) -> Description:
     """A cloud, or those of a folder, as a description; --depth-scale is metres per length of points and VIEWPOINT."""
     files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"), key=lambda p: by_numbers(p.stem))
     heads, unit = [_head(file) for file in files], options.depth_scale or 1.0
-    camera, notes = _fitted(files[0], options)
+    k, is_world, notes = _fitted(files[0], options)
     stamps = [stamp_of_text(file.stem) if "." in file.stem else None for file in files]
     has_stamps = None not in stamps
     views = []
     for number, (file, head) in enumerate(zip(files, heads, strict=True)):
         T, size = _viewpoint(head), (head.width, head.height)
         T[:3, 3] *= unit
-        color, depth = partial(_color_file, file), partial(_depth_file, file, camera)
+        color, depth = partial(_color_file, file), partial(_depth_file, file, k, files[0], is_world=is_world)
         views.append(
             ListedView(
                 name=file.stem,
@@ -133,7 +124,6 @@ def read(path: Path, options: SourceOptions) -> Description:
         notes.append("VIEWPOINT is the origin: the camera's own frame is the world")
     others = sorted({name for head in heads for name in head.fields} - {"x", "y", "z", "rgb", "rgba"})
     notes += [f"fields {', '.join(others)} are not used"] if others else []
-    k = camera.intrinsics
     lens = CameraTable(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
     return described(
         Pairs(path=path, views=views, unpaired=(0, 0)),
@@ -147,8 +137,8 @@ def read(path: Path, options: SourceOptions) -> Description:
     )
 
 
-def _fitted(path: Path, options: SourceOptions) -> tuple[_Camera, list[str]]:
-    """The camera that a cloud's grid is of, or that --intrinsics gives, and what to say of it."""
+def _fitted(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[str]]:
+    """The camera that a cloud's grid is of, or that --intrinsics gives, whether points are in the world; notes."""
     cloud, given = read_cloud(path), options.intrinsics.get(CAMERA)
     fits = []
     for is_world in (False, True):
@@ -164,7 +154,7 @@ def _fitted(path: Path, options: SourceOptions) -> tuple[_Camera, list[str]]:
         raise _unfit(path, far, "of a pinhole camera" if given is None else "that of --intrinsics")
     k = f"fx {camera.fx:.2f}, fy {camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f} px"
     note = f"intrinsics are those of the grid of {path.name}: {k}, within {far:.2g} px"
-    return _Camera(intrinsics=camera, is_world=is_world, first=path), [] if given is not None else [note]
+    return camera, is_world, [] if given is not None else [note]
 
 
 def _unfit(path: Path, far: float, what: str) -> InputError:
@@ -233,16 +223,18 @@ def _color_file(path: Path) -> bytes:
     return cv2.imencode(".png", color[..., ::-1], _FAST)[1].tobytes()
 
 
-def _depth_file(path: Path, camera: _Camera) -> bytes:
-    """The depth of a cloud in its own length, 0 for none, as .npy. Raises InputError for another camera."""
+def _depth_file(path: Path, camera: Intrinsics, first: Path, *, is_world: bool) -> bytes:
+    """The depth of a cloud in its own length, 0 for none, as .npy. Raises InputError for another camera than that of
+    the first cloud.
+    """
     try:
-        points = read_cloud(path).in_camera(is_world=camera.is_world)
+        points = read_cloud(path).in_camera(is_world=is_world)
     except InputError:
         return b""
     seen = _is_seen(points)
-    far = residual(points, camera.intrinsics)
+    far = residual(points, camera)
     if seen.any() and far > CLOUD_RESIDUAL:
-        raise _unfit(path, far, f"that of {camera.first.name}")
+        raise _unfit(path, far, f"that of {first.name}")
     stream = BytesIO()
     np.save(stream, np.where(seen, points[..., 2], 0.0).astype(np.float32), allow_pickle=False)
     return stream.getvalue()

@@ -138,19 +138,9 @@ TRAJECTORIES = (
 INTRINSICS = ("camera_intrinsic.json", "camera_intrinsics.json", "intrinsic.json", "camera_primesense.json")
 
 
-def is_redwood(folder: Path) -> bool:
-    """Whether the folder has colour, depth and a trajectory of Open3D's form."""
-    return (
-        (folder / "depth").is_dir()
-        and any((folder / name).is_dir() for name in COLOR_FOLDERS)
-        and _trajectory(folder) is not None
-    )
-
-
 def read_redwood(folder: Path, options: SourceOptions) -> Description:
     """The folder as a description; depth in millimetres."""
-    trajectory = _trajectory(folder)
-    assert trajectory is not None
+    trajectory = next(path for pattern in TRAJECTORIES for path in sorted(folder.glob(pattern)))
     colors = images_of(next(folder / name for name in COLOR_FOLDERS if (folder / name).is_dir()))
     depths = images_of(folder / "depth")
     pairs = _pairs(list(colors), list(depths))
@@ -172,10 +162,6 @@ def read_redwood(folder: Path, options: SourceOptions) -> Description:
         poses=PosesTable(format="trajectory-log", file=trajectory.relative_to(folder).as_posix()),
         lens=lambda _: _redwood_lens(folder),
     )
-
-
-def _trajectory(folder: Path) -> Path | None:
-    return next((path for pattern in TRAJECTORIES for path in sorted(folder.glob(pattern))), None)
 
 
 def _pairs(colors: list[str], depths: list[str]) -> list[tuple[str, str]]:
@@ -244,7 +230,13 @@ ENTRIES = (
         read=read_frames,
         docs=_FRAMES_DOCS,
     ),
-    Layout(name="Open3D scene", order=9, matches=is_redwood, read=read_redwood, docs=_REDWOOD_DOCS),
+    Layout(
+        name="Open3D scene",
+        order=9,
+        matches=marked(*(f"{color}/ depth/ {path}" for color in COLOR_FOLDERS for path in TRAJECTORIES)),
+        read=read_redwood,
+        docs=_REDWOOD_DOCS,
+    ),
     Layout(
         name="ScanNet export",
         order=2,

@@ -7,7 +7,7 @@ geometry_msgs/PoseStamped, PoseWithCovarianceStamped and TransformStamped.
 
 import re
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import takewhile
 from typing import Any
 
@@ -326,15 +326,8 @@ POSE_TYPES = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class StampedPose:
-    """T_parent_child as one message says it; child is "" where the message names none."""
-
-    stamp_ns: int
-    parent: str
-    child: str
-    position: Float64
-    quat_xyzw: Float64
+StampedPose = tuple[str, str, int, Float64, Float64]
+"""Parent, child ("" where a message names none), stamp [ns], position (3,) [m], quat_xyzw (4,) of T_parent_child."""
 
 
 def join_pose_topics(
@@ -369,8 +362,8 @@ def _child_of(log: RawLog, survey: Survey, camera: str, given: PoseTopic, frame:
             remedy=f"expected {', '.join(name.rpartition('/')[2] for name in POSE_TYPES)}; pose topics there:"
             f" {', '.join(pose_topics(survey)) or 'none'}",
         )
-    first = next(_poses(log, survey, given.topic, Damage()), None)
-    child = given.frame or (first.child if first is not None and first.child else frame)
+    _, first_child, *_ = next(_poses(log, survey, given.topic, Damage()), ("", ""))
+    child = given.frame or first_child or frame
     tf = survey.tf
     if child != frame and not tf.connects(child, frame):
         raise InputError(
@@ -389,22 +382,16 @@ def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set
     known = set(survey.tf.frames)
     found: dict[str, str] = {}
     for topic in survey.of_type(ODOMETRY):
-        first = next(_poses(log, survey, topic.topic.name, Damage()), None)
-        if (
-            first is None
-            or not first.child
-            or first.child == first.parent
-            or survey.tf.root_of(first.child) != first.child
-        ):
+        parent, child, *_ = next(_poses(log, survey, topic.topic.name, Damage()), ("", ""))
+        if not child or child == parent or survey.tf.root_of(child) != child:
             continue
-        places_camera = first.child in frames - known
-        reaches_world = options.world_frame not in known and options.world_frame == first.parent
-        if places_camera or (reaches_world and first.child in known | frames):
-            found[topic.topic.name] = first.child
-        elif first.child in known and any(survey.tf.root_of(frame) == first.child for frame in frames & known):
+        places_camera = child in frames - known
+        reaches_world = options.world_frame not in known and options.world_frame == parent
+        if places_camera or (reaches_world and child in known | frames):
+            found[topic.topic.name] = child
+        elif child in known and any(survey.tf.root_of(frame) == child for frame in frames & known):
             survey.tf.note(
-                f"{topic.topic.name} says where {first.child!r} is in {first.parent!r}; to use it give"
-                f" --world-frame {first.parent}"
+                f"{topic.topic.name} says where {child!r} is in {parent!r}; to use it give --world-frame {parent}"
             )
     for child in sorted(set(found.values())):
         topics = sorted(name for name, posed in found.items() if posed == child)
@@ -422,11 +409,9 @@ def _add(log: RawLog, survey: Survey, topic: str, child: str, *, only_first: boo
     """The poses of a topic as those of a frame."""
     if survey.tf.root_of(child) != child:
         return  # added before
-    for pose in _poses(log, survey, topic, survey.damage):
+    for parent, _, stamp, position, quat_xyzw in _poses(log, survey, topic, survey.damage):
         try:
-            survey.tf.add(
-                pose.parent, child, pose.stamp_ns, pose.position, pose.quat_xyzw, static=False, holds=only_first
-            )
+            survey.tf.add(parent, child, stamp, position, quat_xyzw, static=False, holds=only_first)
         except ValueError as error:
             survey.damage.add(f"{topic}: {error}")
         if only_first:
@@ -450,10 +435,10 @@ def _pose(message: RawMessage, decoded: Any, *, by_log_time: bool) -> StampedPos
     else:
         pose = decoded.pose if kind == "geometry_msgs/msg/PoseStamped" else decoded.pose.pose
         position, orientation = pose.position, pose.orientation
-    return StampedPose(
-        stamp_ns=message.log_time_ns if by_log_time else stamp_ns(decoded.header),
-        parent=decoded.header.frame_id.strip("/") or "world",
-        child=str(getattr(decoded, "child_frame_id", "")).strip("/"),
-        position=np.array([position.x, position.y, position.z], dtype=np.float64),
-        quat_xyzw=np.array([orientation.x, orientation.y, orientation.z, orientation.w], dtype=np.float64),
+    return (
+        decoded.header.frame_id.strip("/") or "world",
+        str(getattr(decoded, "child_frame_id", "")).strip("/"),
+        message.log_time_ns if by_log_time else stamp_ns(decoded.header),
+        np.array([position.x, position.y, position.z], dtype=np.float64),
+        np.array([orientation.x, orientation.y, orientation.z, orientation.w], dtype=np.float64),
     )

@@ -187,7 +187,7 @@ def _names(description: Any) -> list[str]:
 
 def _check_fields(store: Any) -> None:
     """Raise ValueError where a type with a standard name lacks a standard field; cases, lengths and more are free."""
-    standard = _standard().fielddefs
+    standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
     for name in sorted(_KNOWN & store.fielddefs.keys()):
         there = {key.lower(): _kind(description) for key, description in store.fielddefs[name][1]}
         for key, description in standard[name][1]:
@@ -201,11 +201,6 @@ def _foxglove_store() -> Any:
     for name, definition in DEFINITIONS.items():
         store.register(get_types_from_msg(definition, name))
     return store
-
-
-@lru_cache(maxsize=1)
-def _standard() -> Any:
-    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def _kind(description: Any) -> object:

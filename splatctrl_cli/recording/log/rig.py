@@ -356,18 +356,15 @@ class _Builder:
             )
         if frame_id not in tf.frames or not tf.connects(world, frame_id):
             target = f" in {world!r}" if world != frame_id else ""
+            topics = pose_topics(self._survey)
+            instead = f", or NAME=TOPIC[@FRAME] of a pose topic ({listed(topics)})" if topics else ""
             raise InputError(
                 f"{self._where}: no tf for frame {frame_id!r} of topic {self._topics.color}{target};"
                 f" frames tf knows: {listed(tf.frames)}",
                 remedy=f"record /tf and /tf_static, or give --camera-pose {self._topics.name}=x,y,z,qx,qy,qz,qw"
-                f"{self._instead()}",
+                f"{instead}",
             )
         return world
-
-    def _instead(self) -> str:
-        """What else could place the camera, in words; empty where nothing."""
-        topics = pose_topics(self._survey)
-        return f", or NAME=TOPIC[@FRAME] of a pose topic ({listed(topics)})" if topics else ""
 
     def _undistortion(self, calibration: Calibration, info: str) -> Undistortion | None:
         try:

@@ -136,13 +136,13 @@ class RosLogSource:
                 remedy="give --stamps log to take the times of logging",
             )
         kept = first_of_each(stamps)
-        drops = dropped(stamps)
+        num_gaps, num_images, period_ns = dropped(stamps)
         self._loss.duplicate_images += len(stamps) - len(kept)
-        self._loss.dropped_images += drops.num_images
-        if drops.num_images:
+        self._loss.dropped_images += num_images
+        if num_images:
             self._loss.notes.append(
-                f"{topic}: about {drops.num_images} images were dropped in {drops.num_gaps} gaps of a period of"
-                f" {drops.period_ns / 1e6:.4g} ms"
+                f"{topic}: about {num_images} images were dropped in {num_gaps} gaps of a period of"
+                f" {period_ns / 1e6:.4g} ms"
             )
         return kept, stamps[kept]
 

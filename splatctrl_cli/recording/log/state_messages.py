@@ -50,7 +50,9 @@ class RawJoints:
 def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoints]:
     """The joint states of a message of `STATE_TYPES`, log time [ns]. Raises UndecodableMessageError."""
     if type_name == JOINT_STATE:
-        return [_joint_state(message, log_time_ns)]
+        names, position = tuple(str(name) for name in message.name), _array(message.position)
+        velocity = _array(message.velocity)
+        return [_checked("a JointState", message, names, position, velocity, _none(), log_time_ns, None)]
     if type_name in FRANKA_STATES:
         return [_franka(message, log_time_ns)]
     if type_name == CONTROLLER_STATE:
@@ -75,12 +77,6 @@ def pose_of_quat(position: Float64, quat_xyzw: Float64) -> Float64 | None:
     if not (np.isfinite(position).all() and abs(float(np.linalg.norm(quat_xyzw)) - 1.0) < _MAX_SKEW):
         return None
     return transform_from(position, quat_xyzw)
-
-
-def _joint_state(message: Any, log_time_ns: int) -> RawJoints:
-    names = tuple(str(name) for name in message.name)
-    position, velocity = _array(message.position), _array(message.velocity)
-    return _checked("a JointState", message, names, position, velocity, _none(), log_time_ns, None)
 
 
 def _franka(message: Any, log_time_ns: int) -> RawJoints:

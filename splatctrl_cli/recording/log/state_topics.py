@@ -43,10 +43,6 @@ class _Stream:
     names: tuple[str, ...]
     states: JointStream
 
-    @property
-    def has_poses(self) -> bool:
-        return "T_base_ee" in self.states.columns()
-
 
 def joint_records(
     survey: Survey, options: SourceOptions, loss: LossReport, wanted: Sequence[str] | None = None
@@ -160,7 +156,7 @@ def _base(streams: Sequence[_Stream], wanted: Sequence[str]) -> _Stream:
         covered, where = len(set(stream.names) & set(wanted)), stream.where
         return (
             covered,
-            stream.has_poses,
+            "T_base_ee" in stream.states.columns(),
             where == "/joint_states",
             not _is_command(where),
             len(stream.states),

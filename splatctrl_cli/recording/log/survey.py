@@ -5,7 +5,7 @@ Images are paired by their stamps; those that came twice or not at all, and cloc
 """
 
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any
@@ -100,34 +100,26 @@ class StampClock:
         return self.num_back >= IMAGES_FEWEST_BACK
 
 
-@dataclass(frozen=True, kw_only=True)
-class Drops:
-    """Gaps of a topic of steady rate: how many, the images missing in them, and the period [ns]."""
-
-    num_gaps: int
-    num_images: int
-    period_ns: float
-
-
 def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
     """Numbers (K,) of the images whose stamp none before them has."""
     return np.sort(np.unique(stamps_ns, return_index=True)[1]).astype(np.int64)
 
 
-def dropped(stamps_ns: Stamps) -> Drops:
-    """What is missing between different stamps; nothing where there are few, or most intervals differ.
+def dropped(stamps_ns: Stamps) -> tuple[int, int, float]:
+    """Gaps between different stamps, the images that are missing in them, and the period [ns]; none where there are
+    few stamps, or most intervals differ.
 
     The period is the median interval, and steady within a quarter of it must be three intervals of four.
     """
     intervals = np.diff(np.unique(stamps_ns)).astype(np.float64)
     if len(intervals) < IMAGES_FEWEST:
-        return Drops(num_gaps=0, num_images=0, period_ns=0.0)
+        return 0, 0, 0.0
     period = float(np.median(intervals))
     is_steady = np.abs(intervals - period) <= IMAGES_STEADY * period
     gaps = intervals[intervals > IMAGES_GAP * period]
     if is_steady.mean() < 0.75:
         gaps = gaps[:0]
-    return Drops(num_gaps=len(gaps), num_images=int((np.rint(gaps / period) - 1).sum()), period_ns=period)
+    return len(gaps), int((np.rint(gaps / period) - 1).sum()), period
 
 
 LARGE = 1 << 30  # bytes from which on an MCAP is described by its index
@@ -259,8 +251,17 @@ def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: 
     elif kind in TRANSFORMS:
         is_static = message.topic.name.endswith("tf_static")
         holds = message.topic.schema != ""  # Foxglove has no static transforms: one that comes once holds always
-        log_time_ns = message.log_time_ns if result.by_log_time else None
-        _add_transforms(result.tf, decoder.decode(message), log_time_ns, static=is_static, holds=holds)
+        for item in decoder.decode(message).transforms:
+            t, r = item.transform.translation, item.transform.rotation
+            result.tf.add(
+                item.header.frame_id,
+                item.child_frame_id,
+                message.log_time_ns if result.by_log_time else stamp_ns(item.header),
+                np.array([t.x, t.y, t.z], dtype=np.float64),
+                np.array([r.x, r.y, r.z, r.w], dtype=np.float64),
+                static=is_static,
+                holds=holds,
+            )
 
 
 def _calibration(message: Any) -> Calibration | None:
@@ -314,20 +315,6 @@ def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints
         return states
     late_ns = message.log_time_ns - stamp_ns(decoded.header)
     return [replace(state, stamp_ns=state.stamp_ns + late_ns) for state in states]
-
-
-def _add_transforms(tree: TfTree, message: Any, log_time_ns: int | None, *, static: bool, holds: bool) -> None:
-    for item in message.transforms:
-        t, r = item.transform.translation, item.transform.rotation
-        tree.add(
-            item.header.frame_id,
-            item.child_frame_id,
-            stamp_ns(item.header) if log_time_ns is None else log_time_ns,
-            np.array([t.x, t.y, t.z], dtype=np.float64),
-            np.array([r.x, r.y, r.z, r.w], dtype=np.float64),
-            static=static,
-            holds=holds,
-        )
 
 
 def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
@@ -409,15 +396,10 @@ def robot_descriptions(log: RawLog) -> list[RobotDescription]:
         if message.topic.type_name == STRING:
             found.setdefault(message.topic.name, str(said.data))
         elif message.topic.type_name == EVENT:
-            found.update(_parameters(said))
+            set_now = (*said.new_parameters, *said.changed_parameters)
+            texts = [str(p.value.string_value) for p in set_now if p.name == NAME and p.value.type == _TEXT]
+            found |= {str(said.node): text for text in texts}
         if own and own <= found.keys():
             break
     where = {text: name for name, text in reversed(found.items()) if text.strip()}
     return [RobotDescription(where=name, text=text) for text, name in reversed(where.items())]
-
-
-def _parameters(event: Any) -> Iterator[tuple[str, str]]:
-    """Node and text of the parameters of that name that an event sets."""
-    for parameter in (*event.new_parameters, *event.changed_parameters):
-        if parameter.name == NAME and parameter.value.type == _TEXT:
-            yield str(event.node), str(parameter.value.string_value)

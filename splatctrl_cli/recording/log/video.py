@@ -99,13 +99,6 @@ class VideoLog:
                 _count(name, stream, damage)
 
 
-def with_video(log: RawLog) -> RawLog:
-    """The log, with the images of its video where it has any and the library is installed."""
-    topics = log.topics()  # none where there is no index
-    has_video = any(map(is_video, topics)) or not topics
-    return VideoLog(log) if has_video and is_installed(LIBRARY) else log
-
-
 def _stream(name: str) -> _Stream | None:
     codec = next((codec for word, codec in CODECS.items() if word in name.lower()), None)
     if codec is None:
@@ -192,9 +185,17 @@ _TIME = re.compile("time|stamp", re.IGNORECASE)
 
 
 def open_log(path: Path) -> RawLog:
-    """A log, or a video file with its stamps beside it. Raises InputError."""
+    """A log, with the images of its video where the library is installed, or a video file with its stamps beside it.
+
+    Raises InputError.
+    """
     refuse_foreign(path)
-    return VideoFileLog(path) if path.suffix.lower() in SUFFIXES else with_video(open_raw_log(path))
+    if path.suffix.lower() in SUFFIXES:
+        return VideoFileLog(path)
+    log = open_raw_log(path)
+    topics = log.topics()  # none where there is no index
+    has_video = any(map(is_video, topics)) or not topics
+    return VideoLog(log) if has_video and is_installed(LIBRARY) else log
 
 
 class VideoFileLog:
