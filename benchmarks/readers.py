@@ -28,7 +28,7 @@ from splatctrl_cli.recording.container.foxglove import MessageTypes
 from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.raw_log import Damage
 from splatctrl_cli.recording.folder.folder_description import read_description
-from splatctrl_cli.recording.folder.poses import read_nerfstudio, read_trajectory_log, read_tum
+from splatctrl_cli.recording.folder.poses import read_nerfstudio, read_trajectory_log, tum_rows
 from splatctrl_cli.recording.log.decoder import IMAGE, UndecodableMessageError
 from splatctrl_cli.recording.log.messages import decode_rvl, read_image
 from splatctrl_cli.recording.source_options import SourceOptions
@@ -206,7 +206,7 @@ def _texts(made: Path, folder: Path) -> list[Reader]:
         "x.urdf": (read_urdf, (ROBOT / "robot.urdf").read_bytes()),
         "x.yaml": (read_spheres, (ROBOT / "robot_spheres.yaml").read_bytes()),
         "x.toml": (read_description, toml),
-        "x.tum": (read_tum, (made / "tum/groundtruth.txt").read_bytes()),
+        "x.tum": (tum_rows, (made / "tum/groundtruth.txt").read_bytes()),
         "x.log": (read_trajectory_log, (made / "redwood/trajectory.log").read_bytes()),
         "transforms.json": (read_nerfstudio, (made / "nerfstudio/transforms.json").read_bytes()),
     }

@@ -12,7 +12,7 @@ from splatctrl_cli.config.fixed import TF_GAP_NS
 from splatctrl_cli.recording.log.decoder import CAMERA_INFO
 from splatctrl_cli.recording.log.registration import DISTORTION_MODELS, is_distorted, lens_model
 from splatctrl_cli.recording.log.rig import Camera, ImageLens, image_lens, intrinsics_of, nearest_gap_ns
-from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey, pair_by_stamp
+from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey, paired
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics, SourceOptions
 from splatctrl_cli.records import Float64, Intrinsics
 
@@ -202,7 +202,7 @@ def camera_findings(
 def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> list[Finding]:
     where = f"camera {camera.name}"
     color, depth = (found.topics[t].stamps_ns[: limits.PAIRED_STAMPS] for t in (camera.color, camera.depth))
-    pairs = pair_by_stamp(color, depth, round(options.pairing_tolerance_s * 1e9))
+    pairs = paired(color, depth, round(options.pairing_tolerance_s * 1e9)).tolist()
     rarer, other = sorted((len(color), len(depth)))
     if not pairs or not rarer:
         gap = nearest_gap_ns(color, depth) * 1e-9

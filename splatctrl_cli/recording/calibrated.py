@@ -20,9 +20,9 @@ from splatctrl_cli.recording.folder.folder_views import HOLDOUT
 from splatctrl_cli.recording.log.messages import metres
 from splatctrl_cli.recording.log.ros_log import RosLogSource
 from splatctrl_cli.recording.log.state_columns import StateColumns
-from splatctrl_cli.recording.log.stored_frame import FrameSource, JointTopics, StoredFrame, decoded
+from splatctrl_cli.recording.log.stored_frame import FrameSource, JointTopics, Recording, StoredFrame
 from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB, SourceOptions
-from splatctrl_cli.records import SECOND_NS, Float32, Float64, JointState, LossReport, Record, RgbdFrame, by_stamp
+from splatctrl_cli.records import SECOND_NS, Float32, Float64, LossReport, RgbdFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,15 +106,15 @@ def correction_of(options: SourceOptions, where: str) -> Correction | None:
 def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
     """The source, corrected where the options have a calibration, then perturbed where they ask for it.
 
-    Raises InputError where the calibration is not of it.
+    Raises InputError where the calibration is not of it, UsageError as `Perturbation.of`.
     """
-    correction = correction_of(options, source.name)
+    correction, perturbation = correction_of(options, source.name), Perturbation.of(options.perturb)
     if correction is not None:
         source = CalibratedSource(source, correction, round(options.pose_tolerance_s * SECOND_NS))
-    return perturbed(source, options.perturb)
+    return source if perturbation is None else PerturbedSource(source, perturbation)
 
 
-class CalibratedSource:
+class CalibratedSource(Recording):
     """Records of another source as a calibration corrects them.
 
     Joint states are moved to the clock of the frames. A moving camera is where the recording has it at the time of
@@ -156,12 +156,6 @@ class CalibratedSource:
         loss = self.inner.loss
         notes = self._correction.notes(list(self.inner.digests().values()))
         return replace(loss, without_pose=loss.without_pose + self._num_without_pose, notes=[*loss.notes, *notes])
-
-    def records(self) -> Iterator[Record]:
-        return decoded(self.stored())
-
-    def stored(self) -> Iterator[StoredFrame | JointState]:
-        return by_stamp(self.states, self._frames())
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp."""
@@ -292,18 +286,13 @@ class Perturbation:
         return np.random.default_rng([self.seed, zlib.crc32(camera.encode()), stamp_ns % 2**63])
 
 
-class PerturbedSource:
+class PerturbedSource(Recording):
     """Records of another source, perturbed; nothing is written."""
 
     def __init__(self, source: FrameSource, perturbation: Perturbation) -> None:
         self.inner, self._perturbation = source, perturbation
         self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
-        self.has_clock, self.world_frame = source.has_clock, source.world_frame
-
-    @property
-    def states(self) -> StateColumns:
-        """The joint states, as recorded."""
-        return self.inner.states
+        self.has_clock, self.world_frame, self.states = source.has_clock, source.world_frame, source.states
 
     @property
     def joint_topics(self) -> JointTopics | None:
@@ -317,13 +306,6 @@ class PerturbedSource:
         loss = self.inner.loss
         return replace(loss, notes=[*loss.notes, f"perturbed: {self._perturbation.words()}"])
 
-    def records(self) -> Iterator[Record]:
-        return decoded(self.stored())
-
-    def stored(self) -> Iterator[StoredFrame | JointState]:
-        for item in self.inner.stored():
-            yield self._perturbed(item) if isinstance(item, StoredFrame) else item
-
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp."""
         for stamp_ns, camera, T in self.inner.poses():
@@ -333,6 +315,11 @@ class PerturbedSource:
         """sha256 of the source's files, and what is done to them."""
         words = self._perturbation.words()
         return {**self.inner.digests(), f"{PERTURB}{words}": words}
+
+    def _frames(self) -> Iterator[StoredFrame]:
+        for stored in self.inner.stored():
+            if isinstance(stored, StoredFrame):
+                yield self._perturbed(stored)
 
     def _perturbed(self, stored: StoredFrame) -> StoredFrame:
         asked, T = self._perturbation, self._perturbation.pose(stored.camera, stored.T_world_camera)
@@ -345,12 +332,6 @@ class PerturbedSource:
             depth_unit=None,
             depth_file=None,
         )
-
-
-def perturbed(source: FrameSource, given: Mapping[str, float]) -> FrameSource:
-    """The source, with what is to be done to it. Raises UsageError as `Perturbation.of`."""
-    perturbation = Perturbation.of(given)
-    return source if perturbation is None else PerturbedSource(source, perturbation)
 
 
 LOGGED = RosLogSource | CaptureSource | CalibratedSource | PerturbedSource  # a log's or a capture's records

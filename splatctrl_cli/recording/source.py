@@ -27,7 +27,7 @@ from splatctrl_cli.recording.container.log_formats import (
 )
 from splatctrl_cli.recording.container.raw_log import RawLog
 from splatctrl_cli.recording.describe_file import describe_file
-from splatctrl_cli.recording.folder.image_folder import ImageFolderSource, RigFolderSource, open_image_folder
+from splatctrl_cli.recording.folder.image_folder import ImageFolderSource, open_image_folder
 from splatctrl_cli.recording.folder.layouts import (
     BARE_REMEDY,
     bare_images,
@@ -312,7 +312,7 @@ def _describe_capture(path: Path) -> Summary:
     return Summary(path=str(path), kind="capture", facts=facts, grids=(grid,), notes=tuple(loss.get("notes", ())))
 
 
-def _describe_images(path: Path, source: ImageFolderSource | RigFolderSource, kind: str) -> Summary:
+def _describe_images(path: Path, source: ImageFolderSource, kind: str) -> Summary:
     first = next((item for item in source.stored() if isinstance(item, StoredFrame)), None)
     counts = source.count_views()
     facts: dict[str, object] = {"has_clock": source.has_clock}

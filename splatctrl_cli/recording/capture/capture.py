@@ -16,19 +16,19 @@ from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.recording.capture.capture_header import COLUMNS, ROBOT, FileSums, FrameRows, read_capture_header
 from splatctrl_cli.recording.log.messages import metres
 from splatctrl_cli.recording.log.state_columns import NO_STATES, StateColumns
+from splatctrl_cli.recording.log.state_topics import joint_records
 from splatctrl_cli.recording.log.stored_frame import (
     AGAIN,
+    Recording,
     StoredFrame,
-    decoded,
     human_mask,
-    joints_again,
     read_topics,
     with_joints,
     without_joints,
 )
-from splatctrl_cli.recording.log.survey import RobotDescription
+from splatctrl_cli.recording.log.survey import RobotDescription, Survey
 from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB, SourceOptions, refuse_unknown_cameras
-from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, UInt8, by_stamp
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, LossReport, UInt8
 
 NEEDED = ("stamp_ns", "position", "velocity")
 OPTIONAL = ("commanded_velocity", "T_base_ee", "T_world_ee")  # NaN where a state has none, absent where none has one
@@ -38,7 +38,7 @@ _NOT_FOR_CAPTURES = (
 )
 
 
-class CaptureSource:
+class CaptureSource(Recording):
     """Records of a capture folder; a file whose checksum differs is counted as damage and left out.
 
     joints: a robot's, to be brought together from the topics that the capture kept, as from those of the log itself;
@@ -66,13 +66,14 @@ class CaptureSource:
         self._loss = LossReport(**header["loss"])
         described = header.get("joint_topics")
         self.joint_topics = None if described is None else read_topics(path, described, self._checked)
-        self.states = NO_STATES
         if joints is None or self.joint_topics is None:
             options.refuse(("joint_topic",), "the states of one topic in a capture", path)
             self.states = _read_joints(path) if self.joint_names else NO_STATES
         else:
-            kept = self.joint_topics
-            self.joint_names, self.states, loss = joints_again(kept, options, joints)
+            kept, loss = self.joint_topics, LossReport()
+            found = Survey(topics={topic.topic.name: topic for topic in kept.topics})
+            chosen = options if options.joint_topic is not None else replace(options, joint_topic=kept.chosen)
+            self.joint_names, self.states = joint_records(found, chosen, loss, joints)
             others = without_joints(self._loss, kept.loss, kept.first_note)
             self._loss = with_joints(others, loss, kept.first_note)
 
@@ -83,13 +84,6 @@ class CaptureSource:
         damaged = max(self._damaged, self._damaged_before, key=len)
         return replace(loss, damaged=loss.damaged + len(damaged), notes=[*loss.notes, *damaged])
 
-    def records(self) -> Iterator[Record]:
-        return decoded(self.stored())
-
-    def stored(self) -> Iterator[StoredFrame | JointState]:
-        self._damaged, self._damaged_before = [], max(self._damaged, self._damaged_before, key=len)
-        return by_stamp(self.states, self._stored_frames())
-
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every row of frames.csv."""
         return ((int(row["stamp_ns"]), row["camera"], _pose(row)) for row in self._rows)
@@ -98,11 +92,9 @@ class CaptureSource:
         """sha256 of SHA256SUMS, which covers every file, and what was applied to it."""
         return {f"{self.name}/SHA256SUMS": sha256(self._path / "SHA256SUMS"), **self._applied}
 
-    def _stored_frames(self) -> Iterator[StoredFrame]:
-        for row in self._rows:
-            stored = self._stored_frame(row)
-            if stored is not None:
-                yield stored
+    def _frames(self) -> Iterator[StoredFrame]:
+        self._damaged, self._damaged_before = [], max(self._damaged, self._damaged_before, key=len)
+        yield from filter(None, map(self._stored_frame, self._rows))
 
     def _stored_frame(self, row: Mapping[str, str]) -> StoredFrame | None:
         """The frame of a row; None, and counted, where an image is not as it was written."""

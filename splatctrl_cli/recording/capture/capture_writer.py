@@ -8,11 +8,10 @@ import json
 import shutil
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,36 +53,32 @@ class Journal:
     def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
         """identity: what decides the bytes; kept for whoever goes on."""
         self._path = folder / JOURNAL
-        self._files = ExitStack()
         self.num_entries = 0
-        self.masks: set[str] = set()  # the columns that some frame has
-        self.has_provenance = False
         folder.mkdir(parents=True, exist_ok=True)
         if not self._path.is_file():
             self._path.write_text(json.dumps({"identity": identity}) + "\n", encoding="utf-8")
         self._cut()
         self._kept = _lines(self._path)
         next(self._kept, None)
-        self._stream: TextIO = self._files.enter_context(self._path.open("a", encoding="utf-8"))
+        self._stream = self._path.open("a", encoding="utf-8")
 
     def __enter__(self) -> "Journal":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._files.close()
+        self._stream.close()
 
     def kept(self) -> Entry | None:
         """The next frame of the earlier run; None after the last."""
         found = next(self._kept, None)
         if found is None:
             return None
-        entry = Entry(**found)
-        self._count(entry)
-        return entry
+        self.num_entries += 1
+        return Entry(**found)
 
     def add(self, entry: Entry) -> None:
         """A frame whose files are written."""
-        self._count(entry)
+        self.num_entries += 1
         self._stream.write(json.dumps(vars(entry)) + "\n")
         self._stream.flush()
 
@@ -95,13 +90,8 @@ class Journal:
 
     def remove(self) -> None:
         """Once everything is written."""
-        self._files.close()
+        self._stream.close()
         self._path.unlink()
-
-    def _count(self, entry: Entry) -> None:
-        self.num_entries += 1
-        self.masks |= set(MASKS) & entry.row.keys()
-        self.has_provenance |= bool(entry.provenance)
 
     def _cut(self) -> None:
         """Leave out a last line that was not finished."""
@@ -232,9 +222,9 @@ def _write_index(
     if robot:
         (folder / ROBOT).write_text(robot, encoding="utf-8", newline="")
         names.append(ROBOT)
-    columns = (*COLUMNS, *(name for name in MASKS if name in journal.masks))
+    columns = (*COLUMNS, *(name for name in MASKS if any(name in entry.row for entry in journal.entries())))
     _write_table(folder / "frames.csv", columns, (entry.row for entry in journal.entries()))
-    if journal.has_provenance:
+    if any(entry.provenance for entry in journal.entries()):
         names.append(PROVENANCE)
         _write_table(folder / PROVENANCE, PROVENANCE_COLUMNS, (entry.provenance for entry in journal.entries()))
     if topics is not None and topics.topics:

@@ -315,11 +315,8 @@ def _is_centered(K: Float64, width: float, height: float) -> bool:
 
 
 def _depth_file(root: Path, scan: str, number: int) -> Path | None:
-    for folder in (f"Depths_raw/{scan}", f"Depths/{scan}_train", f"Depths/{scan}"):
-        path = root / folder / f"depth_map_{number:04d}.pfm"
-        if path.is_file():
-            return path
-    return None
+    folders = (root / f"Depths_raw/{scan}", root / f"Depths/{scan}_train", root / f"Depths/{scan}")
+    return next((path for folder in folders if (path := folder / f"depth_map_{number:04d}.pfm").is_file()), None)
 
 
 def read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:

@@ -195,7 +195,8 @@ def _listed(description: Description, options: SourceOptions, loss: LossReport) 
             f" ({next(iter(colors))!r}, {next(iter(depths))!r}, ...)",
             remedy="the * of [frames] color and depth must stand for the same text",
         )
-    loss.unpaired_color, loss.unpaired_depth = len(colors) - len(names), len(depths) - len(names)
+    loss.unpaired_color += len(colors) - len(names)
+    loss.unpaired_depth += len(depths) - len(names)
     poses = {} if camera.name in options.camera_poses else _poses(description, {name: colors[name] for name in names})
     return [
         ListedView(name=name, color=colors[name], depth=depths[name], human=masks.get(name), matrix=poses.get(name))

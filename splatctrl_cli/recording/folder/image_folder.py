@@ -2,7 +2,7 @@
 
 import heapq
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,10 @@ from splatctrl_cli.recording.folder.folder_description import (
 from splatctrl_cli.recording.folder.folder_views import HOLDOUT, UNITS, View, find_files, length_unit, views_of
 from splatctrl_cli.recording.folder.layout_nerfstudio import with_transforms
 from splatctrl_cli.recording.log.messages import measured, metres, num_invalid
-from splatctrl_cli.recording.log.registration import DepthToColor, Undistortion, undistortion_of
-from splatctrl_cli.recording.log.state_columns import NO_STATES
-from splatctrl_cli.recording.log.stored_frame import StoredFrame, check_depth, decoded, human_mask, is_kept, is_png
+from splatctrl_cli.recording.log.registration import DepthToColor, Lens, Undistortion, undistortion_of
+from splatctrl_cli.recording.log.stored_frame import Recording, StoredFrame, check_depth, human_mask, is_kept, is_png
 from splatctrl_cli.recording.source_options import SourceOptions, refuse_unknown_cameras
-from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, UInt8, by_stamp
+from splatctrl_cli.records import Bool, Float32, Float64, LossReport, UInt8
 
 __all__ = ["HOLDOUT", "ImageFolderSource"]
 _NOT_FOR_FOLDERS = (
@@ -39,39 +38,31 @@ _NOT_FOR_FOLDERS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Lens:
-    """What a camera's images go through: undistortion and registration, where it needs them."""
-
-    intrinsics: Intrinsics
-    undistortion: Undistortion | None
-    registration: DepthToColor | None
-
-
-class ImageFolderSource:
-    """Records of an image folder; no joint states."""
+class ImageFolderSource(Recording):
+    """Records of an image folder, of one camera or of several, each with a description that differs in its files, its
+    lens and its poses alone; no joint states.
+    """
 
     joint_names: tuple[str, ...] = ()
-    states = NO_STATES
     world_frame = "world"
 
-    def __init__(self, path: Path, options: SourceOptions, description: Description | None = None) -> None:
+    def __init__(self, path: Path, options: SourceOptions, *descriptions: Description) -> None:
         options.refuse(_NOT_FOR_FOLDERS, "an image folder", path)
-        if description is None:
-            options.refuse(("intrinsics",), "a folder whose description has [camera]", path)
         self.name = path.name
-        self._description = with_transforms(description or read_description(path, options.root))
+        self._descriptions = tuple(map(with_transforms, descriptions))
+        self._description = self._descriptions[0]
         self._loss = LossReport()
         self._damaged: list[str] = []
         self._num_invalid = 0
-        self._views = views_of(self._description, options, self._loss)
-        self._lenses: dict[str, _Lens] = {}
+        of_each = [views_of(description, options, self._loss) for description in self._descriptions]
+        self._views = list(heapq.merge(*of_each, key=lambda view: view.stamp_ns))
+        self._lenses: dict[str, Lens] = {}
         self.guess = "" if self.has_clock else self._in_metres()
         """In which unit lengths look to be, in words; empty where they may be metres."""
         lenses = sorted({view.lens.name for view in self._views})
         refuse_unknown_cameras(path, (*options.camera_poses, *options.intrinsics), lenses)
-        names = tuple(sorted({view.camera for view in self._views}))
-        self.cameras = names if options.cameras is None else options.cameras
+        names = sorted({view.camera for view in self._views})
+        self.cameras = tuple(names) if options.cameras is None else options.cameras
         refuse_unknown_cameras(path, self.cameras, names)
         self._views = [view for view in self._views if view.camera in self.cameras]
 
@@ -125,10 +116,7 @@ class ImageFolderSource:
             return words
         return ""
 
-    def records(self) -> Iterator[Record]:
-        return decoded(self.stored())
-
-    def stored(self) -> Iterator[StoredFrame | JointState]:
+    def _frames(self) -> Iterator[StoredFrame]:
         self._damaged, self._num_invalid = [], 0
         checked: set[str] = set()
         for view in self._views:
@@ -152,19 +140,23 @@ class ImageFolderSource:
         return {name: sum(view.camera == name for view in self._views) for name in self.cameras}
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the description, the pose file and the images, by path below the root."""
+        """sha256 of the description, the pose files and the images, by path below the root."""
         return dict(self._digests)
 
     @cached_property
     def _digests(self) -> dict[str, str]:
-        description = self._description
-        of_views = ((view.color, view.depth, view.human, view.valid) for view in self._views)
-        files = [path for paths in of_views for path in paths if path is not None]
-        if description.poses is not None:
-            files.extend(path for _, path in find_files(description.root, description.poses.file))
-        named = {str(path.relative_to(description.root)): path.absolute() for path in files}
-        first = {description.path.name: description.path} if description.path.is_file() else {}
-        return {name: sha256(path) for name, path in {**first, **dict(sorted(named.items()))}.items()}
+        found: dict[str, Path] = {}
+        for description in self._descriptions:
+            lens = None if len(self._descriptions) == 1 else description.camera
+            views = [view for view in self._views if lens is None or view.lens == lens]
+            of_views = ((view.color, view.depth, view.human, view.valid) for view in views)
+            files = [path for paths in of_views for path in paths if path is not None]
+            if description.poses is not None:
+                files.extend(path for _, path in find_files(description.root, description.poses.file))
+            named = {str(path.relative_to(description.root)): path.absolute() for path in files}
+            first = {description.path.name: description.path} if description.path.is_file() else {}
+            found |= {**first, **dict(sorted(named.items()))}
+        return {name: sha256(path) for name, path in found.items()}
 
     def _stored_frame(self, view: View) -> StoredFrame | None:
         color_bytes = view.color.read_bytes()
@@ -176,12 +168,11 @@ class ImageFolderSource:
             self._damaged.append(f"{broken}: not an image that can be read")
             return None
         _check_size(view.color, color, view.lens)
-        if lens.undistortion is not None:
-            color = lens.undistortion.color(np.asarray(color))
+        color = lens.color(np.asarray(color))
         human = None if view.human is None else self._human(view.human, lens)
         valid = self._valid(view, lens)
         depth = depth if valid is None else np.where(valid, depth, np.float32(0))
-        is_counts = lens.registration is None and not (
+        is_counts = lens.depth_to_color is None and not (
             view.depth is None or _is_float(self._description.depth.encoding, view.depth)
         )
         is_plain = lens.undistortion is None
@@ -213,27 +204,28 @@ class ImageFolderSource:
         data = view.depth.read_bytes()
         return data if is_png(data) else None
 
-    def _lens(self, view: View) -> _Lens:
+    def _lens(self, view: View) -> Lens:
         """That of a view's camera, made once."""
         table = view.lens
         if table.name not in self._lenses:
             undistortion, depth_camera = _undistortion(table), self._description.depth_camera
-            intrinsics = table.intrinsics if undistortion is None else undistortion.intrinsics
-            registration = None
+            lens = Lens(
+                intrinsics=table.intrinsics if undistortion is None else undistortion.intrinsics,
+                undistortion=undistortion,
+            )
             if depth_camera is not None:
                 bent = _undistortion(depth_camera)
-                registration = DepthToColor(
+                warp = DepthToColor(
                     depth_intrinsics=depth_camera.intrinsics if bent is None else bent.intrinsics,
-                    color_intrinsics=intrinsics,
+                    color_intrinsics=lens.intrinsics,
                     T_color_depth=self._description.T_color_depth,
                     undistortion=bent,
                 )
-            self._lenses[table.name] = _Lens(
-                intrinsics=intrinsics, undistortion=undistortion, registration=registration
-            )
+                lens = replace(lens, depth_to_color=warp)
+            self._lenses[table.name] = lens
         return self._lenses[table.name]
 
-    def _valid(self, view: View, lens: _Lens) -> Bool | None:
+    def _valid(self, view: View, lens: Lens) -> Bool | None:
         """Pixels that the lens saw and the view's mask leaves; a mask that cannot be read leaves none."""
         seen = None if lens.undistortion is None else lens.undistortion.valid
         if view.valid is None:
@@ -243,15 +235,14 @@ class ImageFolderSource:
             return np.zeros((lens.intrinsics.height, lens.intrinsics.width), np.bool_)
         return np.asarray((mask > 0) if seen is None else (mask > 0) & seen)
 
-    def _human(self, path: Path, lens: _Lens) -> UInt8 | None:
+    def _human(self, path: Path, lens: Lens) -> UInt8 | None:
         pixels = decode_file(path.read_bytes(), color=False)
         if pixels is None:
             self._damaged.append(f"{path}: not an image that can be read")
             return None
-        human = human_mask(pixels, lens.intrinsics, str(path))
-        return human if lens.undistortion is None else lens.undistortion.labels(human)
+        return lens.labels(human_mask(pixels, lens.intrinsics, str(path)))
 
-    def _depth(self, view: View, lens: _Lens) -> Float32 | None:
+    def _depth(self, view: View, lens: Lens) -> Float32 | None:
         """Depth (H, W) [m] at the pixels of colour, 0 where there is none; None where its file cannot be read."""
         if view.depth is None:
             return np.zeros((view.lens.height, view.lens.width), np.float32)
@@ -262,9 +253,7 @@ class ImageFolderSource:
             size = (view.lens.width, view.lens.height)
             depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
         _check_size(view.depth, depth, self._description.depth_camera or view.lens)
-        if lens.registration is not None:
-            return lens.registration.warp(depth)
-        return depth if lens.undistortion is None else lens.undistortion.depth(depth)
+        return lens.depth(depth)
 
     def _recorded_depth(self, path: ImageFile, scale: float) -> Float32 | None:
         table = self._description.depth
@@ -321,58 +310,15 @@ def _check_size(path: ImageFile, pixels: NDArray[Any], camera: CameraTable) -> N
         )
 
 
-def open_image_folder(path: Path, options: SourceOptions) -> "ImageFolderSource | RigFolderSource":
+def open_image_folder(path: Path, options: SourceOptions) -> ImageFolderSource:
     """The records that a TOML description names."""
-    return RigFolderSource(path, options) if read_rig(path, options.root) else ImageFolderSource(path, options)
-
-
-class RigFolderSource:
-    """Records of several cameras by stamp, each camera an image folder of its own; no joint states."""
-
-    joint_names: tuple[str, ...] = ()
-    states = NO_STATES
-    world_frame = "world"
-
-    def __init__(self, path: Path, options: SourceOptions) -> None:
-        options.refuse(("holdout", "intrinsics", "camera_pose_topics"), "a description with several cameras", path)
-        self.name = path.name
-        by_name = {}
-        for description in read_rig(path, options.root):
-            assert description.camera is not None
-            name = description.camera.name
-            pose = {name: options.camera_poses[name]} if name in options.camera_poses else {}
-            by_name[name] = ImageFolderSource(path, replace(options, cameras=None, camera_poses=pose), description)
-        refuse_unknown_cameras(path, (*(options.cameras or ()), *options.camera_poses), by_name)
-        self.cameras = options.cameras or tuple(by_name)
-        self._parts = [by_name[name] for name in self.cameras]
-
-    @property
-    def has_clock(self) -> bool:
-        """Whether the description says when the images were taken."""
-        return self._parts[0].has_clock
-
-    @property
-    def loss(self) -> LossReport:
-        """That of all cameras together."""
-        total = LossReport()
-        for loss in (part.loss for part in self._parts):
-            total = total.plus(loss, [*total.notes, *loss.notes])
-        return total
-
-    def records(self) -> Iterator[Record]:
-        return decoded(self.stored())
-
-    def stored(self) -> Iterator[StoredFrame | JointState]:
-        return by_stamp(*(part.stored() for part in self._parts))
-
-    def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Of every view."""
-        return heapq.merge(*(part.poses() for part in self._parts), key=lambda pose: pose[0])
-
-    def count_views(self) -> dict[str, int]:
-        """Views by camera."""
-        return {name: count for part in self._parts for name, count in part.count_views().items()}
-
-    def digests(self) -> dict[str, str]:
-        """sha256 of the description, the pose files and the images, by path below the root."""
-        return {name: digest for part in self._parts for name, digest in part.digests().items()}
+    rig = {part.camera.name: part for part in read_rig(path, options.root) if part.camera is not None}
+    if not rig:
+        options.refuse(("intrinsics",), "a folder whose description has [camera]", path)
+        return ImageFolderSource(path, options, read_description(path, options.root))
+    options.refuse(("holdout", "intrinsics", "camera_pose_topics"), "a description with several cameras", path)
+    refuse_unknown_cameras(path, (*(options.cameras or ()), *options.camera_poses), rig)
+    names = options.cameras or tuple(rig)
+    poses = {name: pose for name, pose in options.camera_poses.items() if name in names}
+    chosen = replace(options, cameras=names, camera_poses=poses)
+    return ImageFolderSource(path, chosen, *(rig[name] for name in names))

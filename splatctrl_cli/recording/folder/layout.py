@@ -23,7 +23,7 @@ from splatctrl_cli.recording.folder.folder_description import (
     check_camera,
 )
 from splatctrl_cli.recording.folder.poses import read_matrix_file, read_numbers
-from splatctrl_cli.recording.log.survey import pair_by_stamp
+from splatctrl_cli.recording.log.survey import paired
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
@@ -138,7 +138,7 @@ def paired_by_stamp(
 ) -> Pairs:
     """Stamps [ns] and files that lie within the pairing tolerance, posed at the colour's stamp."""
     tolerance_ns = round(options.pairing_tolerance_s * 1e9)
-    pairs = pair_by_stamp([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns)
+    pairs = paired([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns).tolist()
     views = [
         ListedView(
             name=f"{colors[i][0] / 1e9:.6f}",

@@ -69,7 +69,11 @@ def with_transforms(description: Description) -> Description:
                 remedy="leave [frames] out, or give [camera]",
             )
         return replace(description, camera=views[0].camera)
-    listed = tuple(sorted(_short(views), key=lambda v: v.name))
+    stems = [Path(view.name).stem for view in views]
+    is_short = len(set(stems)) == len(stems)  # else the path without suffix
+    names = stems if is_short else [str(Path(view.name).with_suffix("")) for view in views]
+    named = (replace(view, name=name) for view, name in zip(views, names, strict=True))
+    listed = tuple(sorted(named, key=lambda v: v.name))
     return replace(description, camera=views[0].camera, listed=listed, is_depth_resized=True, supply=SUPPLY)
 
 
@@ -161,14 +165,6 @@ def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         remedy = "give [camera] and [frames] in a description"
         raise InputError(f"{path}: no usable {error} in the intrinsics", remedy=remedy) from None
-
-
-def _short(views: list[ListedView]) -> list[ListedView]:
-    """Views by the stem of their colour file where that is theirs alone, else by its path without suffix."""
-    stems = [Path(view.name).stem for view in views]
-    if len(set(stems)) == len(stems):
-        return [replace(view, name=stem) for view, stem in zip(views, stems, strict=True)]
-    return [replace(view, name=str(Path(view.name).with_suffix(""))) for view in views]
 
 
 _DOCS = """

@@ -81,13 +81,8 @@ def read_trajectory_log(path: Path) -> dict[str, Float64]:
     return poses
 
 
-def read_tum(path: Path) -> dict[str, Float64]:
-    """``stamp tx ty tz qx qy qz qw`` lines, by stamp [s] as written; a line with NaN is no pose."""
-    return {stamp: T for stamp, T in tum_rows(path).items() if T is not None}
-
-
 def tum_rows(path: Path) -> dict[str, Float64 | None]:
-    """The lines that `read_tum` reads, None for one whose pose is NaN."""
+    """``stamp tx ty tz qx qy qz qw`` lines, by stamp [s] as written; None for a line with NaN, which is no pose."""
     poses: dict[str, Float64 | None] = {}
     for where, words, values in read_rows(path):
         if len(values) == 8 and np.isfinite(values[0]) and np.isnan(values[1:]).any():
@@ -188,7 +183,7 @@ def stamp_of_text(text: str, unit_ns: int = 1_000_000_000) -> int | None:
 READERS: dict[str, Callable[[Path], dict[str, Float64]]] = {
     "matrix-lines": read_matrix_lines,
     "trajectory-log": read_trajectory_log,
-    "tum": read_tum,
+    "tum": lambda path: {stamp: T for stamp, T in tum_rows(path).items() if T is not None},
     "nerfstudio": lambda path: read_nerfstudio(path)[1],
 }
 

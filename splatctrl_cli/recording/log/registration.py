@@ -285,7 +285,13 @@ class Undistortion:
         self._map_u, self._map_v = _maps(lens or intrinsics, model, coefficients, R, intrinsics)
         is_seen = (self._map_u >= 0) & (self._map_u <= intrinsics.width - 1)
         is_seen &= (self._map_v >= 0) & (self._map_v <= intrinsics.height - 1)
-        is_seen &= _radii(intrinsics, R) < _largest_radius(model, coefficients)
+        x, y, z = np.moveaxis(back_project(intrinsics, np.ones((intrinsics.height, intrinsics.width))) @ R, 2, 0)
+        radii = np.where(
+            z > 0, np.hypot(x, y) / np.maximum(z, 1e-9), np.inf
+        )  # (H, W) from the axis, at a depth of one
+        r, bent = _bent(model, coefficients)
+        folds = np.flatnonzero(np.diff(bent) <= 0)  # beyond the first, the lens would show things twice
+        is_seen &= radii < (r[folds[0]] if folds.size else np.inf)
         if is_seen.mean() < REGISTERED_SHARE:
             raise InputError(
                 f"distortion {model} {np.round(coefficients, 6).tolist()}: the camera saw {is_seen.mean():.0%} of the"
@@ -308,6 +314,29 @@ class Undistortion:
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.float32)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """What a camera's images go through: the intrinsics (of the result), and what its lens and its depth need."""
+
+    intrinsics: Intrinsics
+    undistortion: Undistortion | None = None
+    depth_to_color: DepthToColor | None = None
+
+    def color(self, image: UInt8) -> UInt8:
+        """Colour (H, W, 3) as recorded -> without distortion."""
+        return image if self.undistortion is None else self.undistortion.color(image)
+
+    def labels(self, image: UInt8) -> UInt8:
+        """Labels (H, W) of colour as recorded -> without distortion."""
+        return image if self.undistortion is None else self.undistortion.labels(image)
+
+    def depth(self, image: Float32) -> Float32:
+        """Depth [m] as recorded -> (H, W) at the pixels of colour."""
+        if self.depth_to_color is not None:
+            return self.depth_to_color.warp(image)
+        return image if self.undistortion is None else self.undistortion.depth(image)
+
+
 def _maps(
     lens: Intrinsics, model: str, coefficients: Float64, R: Float64, result: Intrinsics
 ) -> tuple[Float32, Float32]:
@@ -319,19 +348,6 @@ def _maps(
     else:
         maps = cv2.initUndistortRectifyMap(K, coefficients, R, P, size, cv2.CV_32FC1)
     return np.asarray(maps[0]), np.asarray(maps[1])
-
-
-def _radii(result: Intrinsics, R: Float64) -> Float64:
-    """Distance of each pixel (H, W) of the result from the lens's axis, at a depth of one."""
-    x, y, z = np.moveaxis(back_project(result, np.ones((result.height, result.width))) @ R, 2, 0)
-    return np.asarray(np.where(z > 0, np.hypot(x, y) / np.maximum(z, 1e-9), np.inf))
-
-
-def _largest_radius(model: str, coefficients: Float64) -> float:
-    """Up to which distance from the axis a lens's polynomial still grows: beyond, it would show things twice."""
-    r, bent = _bent(model, coefficients)
-    folds = np.flatnonzero(np.diff(bent) <= 0)
-    return float(r[folds[0]]) if folds.size else np.inf
 
 
 def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:

@@ -27,6 +27,7 @@ from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, I
 from splatctrl_cli.recording.log.registration import (
     DISTORTION_MODELS,
     DepthToColor,
+    Lens,
     TfTree,
     Undistortion,
     is_distorted,
@@ -41,7 +42,7 @@ _RECTIFIED = frozenset({"rect", "rectified", "undistorted"})  # words in the nam
 
 
 @dataclass(frozen=True, kw_only=True)
-class Camera:
+class Camera(Lens):
     """One RGB-D camera of a log; valid (H, W) is False where its lens did not see the pixel, fixed_pose is
     T_world_camera where a person gave it, human_topic its masks, depth_scale [m per count] what a person or the log
     says of it.
@@ -52,10 +53,7 @@ class Camera:
     depth_topic: str
     frame_id: str
     world_frame: str
-    intrinsics: Intrinsics
-    undistortion: Undistortion | None = None
     valid: Bool | None = None
-    depth_to_color: DepthToColor | None = None
     fixed_pose: Float64 | None = None
     depth_scale: float | None = None
     human_topic: str = ""

@@ -7,7 +7,7 @@ files that a capture can hold as they are stay undecoded.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from splatctrl_cli.recording.log.state_messages import STATE_TYPES
 from splatctrl_cli.recording.log.state_topics import joint_records
 from splatctrl_cli.recording.log.stored_frame import (
     JointTopics,
+    Recording,
     StoredFrame,
     check_depth,
     decoded,
@@ -30,9 +31,9 @@ from splatctrl_cli.recording.log.stored_frame import (
     is_png,
     with_joints,
 )
-from splatctrl_cli.recording.log.survey import Survey, dropped, first_of_each, pair_by_stamp, paired, survey
+from splatctrl_cli.recording.log.survey import Survey, dropped, first_of_each, paired, survey
 from splatctrl_cli.recording.source_options import SourceOptions, still_note
-from splatctrl_cli.records import SECOND_NS, Float32, Float64, Index, JointState, LossReport, Record, UInt8, by_stamp
+from splatctrl_cli.records import SECOND_NS, Float64, Index, LossReport, Record, UInt8, by_stamp
 
 
 @dataclass(kw_only=True)
@@ -43,7 +44,7 @@ class _Pass:
     num_invalid: int = 0
 
 
-class RosLogSource:
+class RosLogSource(Recording):
     """Records of an MCAP, ROS 1 bag or ROS 2 bag."""
 
     has_clock = True
@@ -54,7 +55,13 @@ class RosLogSource:
         self._log = log
         self._options = options
         found = survey(log, by_log_time=options.stamps == "log")
-        _check_not_empty(log, found)
+        if not found.num_messages and found.damage.count:
+            raise InputError(
+                f"{log.path}: nothing usable before the damage ({found.damage.notes[0]})",
+                remedy="copy the file again",
+            )
+        if not found.num_messages:
+            raise InputError(f"{log.path}: the log holds no messages", remedy="record it again, or give another file")
         self._rig = _rig(log, found, options)
         self._tf = found.tf
         self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.all_notes, *found.tf.notes])
@@ -81,11 +88,7 @@ class RosLogSource:
         )
 
     def records(self) -> Iterator[Record]:
-        return decoded(by_stamp(self.states, self._stored_frames(lazily=False)))
-
-    def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Joint states and stored frames by stamp; image files that need no change are only decoded on demand."""
-        return by_stamp(self.states, self._stored_frames(lazily=True))
+        return decoded(by_stamp(self.states, self._frames(lazily=False)))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every planned frame."""
@@ -163,7 +166,8 @@ class RosLogSource:
             )
         self._loss.without_pose += len(color) - num
 
-    def _stored_frames(self, *, lazily: bool) -> Iterator[StoredFrame]:
+    def _frames(self, *, lazily: bool = True) -> Iterator[StoredFrame]:
+        """lazily: files of images that need no change are only decoded on demand."""
         lost, decoder, checked = _Pass(), MessageDecoder(), set[str]()
         self._passes.append(lost)
         for planned, messages in PlannedImages(self._log, self._plan).of_frames(lost.damage):
@@ -174,19 +178,16 @@ class RosLogSource:
             except UndecodableMessageError as error:
                 lost.damage.add(f"camera {camera.name} at {planned.stamp_ns} ns: {error}")
                 continue
-            human = self._human(camera, masks[0]) if masks else None
+            where = f"{self._log.path}: topic {camera.human_topic}"
+            human = [camera.labels(human_mask(mask.pixels, camera.intrinsics, where)) for mask in masks]
             if depth.compressed is None:
                 lost.num_invalid += num_invalid(depth.pixels)
-            stored = _stored_frame(planned, color, depth, human, messages)
+            stored = _stored_frame(planned, color, depth, human[0] if human else None, messages)
             if camera.name not in checked:
                 scale = depth.unit(camera.depth_scale)
                 if check_depth(stored.depth, f"{self._log.path}: topic {camera.depth_topic}", scale):
                     checked.add(camera.name)
             yield stored
-
-    def _human(self, camera: Camera, mask: ImageMessage) -> UInt8:
-        human = human_mask(mask.pixels, camera.intrinsics, f"{self._log.path}: topic {camera.human_topic}")
-        return human if camera.undistortion is None else camera.undistortion.labels(human)
 
 
 def _images(
@@ -227,8 +228,8 @@ def _stored_frame(
         camera=camera.name,
         intrinsics=camera.intrinsics,
         T_world_camera=planned.T_world_camera,
-        read_color=partial(_color, camera, color),
-        read_depth=partial(_depth, camera, depth),
+        read_color=lambda: camera.color(color_of(color)),
+        read_depth=lambda: camera.depth(depth_of(depth, camera.depth_scale)),
         human=human,
         valid=camera.valid,
         color_file=color.compressed if keeps_color and is_kept(color.compressed) else None,
@@ -237,18 +238,6 @@ def _stored_frame(
         origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
         places=tuple(replace(message, data=b"") for message in messages),
     )
-
-
-def _color(camera: Camera, image: ImageMessage) -> UInt8:
-    pixels = color_of(image)
-    return pixels if camera.undistortion is None else camera.undistortion.color(pixels)
-
-
-def _depth(camera: Camera, image: ImageMessage) -> Float32:
-    metres = depth_of(image, camera.depth_scale)
-    if camera.depth_to_color is not None:
-        return camera.depth_to_color.warp(metres)
-    return metres if camera.undistortion is None else camera.undistortion.depth(metres)
 
 
 def _rig(log: RawLog, found: Survey, options: SourceOptions) -> tuple[Camera, ...]:
@@ -262,16 +251,6 @@ def _rig(log: RawLog, found: Survey, options: SourceOptions) -> tuple[Camera, ..
             f"{error.message}; but the log is damaged: {found.damage.notes[0]}",
             remedy=f"copy the file again; if this is all there is: {error.remedy}",
         ) from None
-
-
-def _check_not_empty(log: RawLog, found: Survey) -> None:
-    if found.num_messages:
-        return
-    if found.damage.count:
-        raise InputError(
-            f"{log.path}: nothing usable before the damage ({found.damage.notes[0]})", remedy="copy the file again"
-        )
-    raise InputError(f"{log.path}: the log holds no messages", remedy="record it again, or give another file")
 
 
 def _times(found: Survey, camera: Camera) -> str:
@@ -288,7 +267,7 @@ def _mask_by_color(
     if not mask_topic:
         return {}
     color_ns, mask_ns = survey.topics[color_topic].stamps_ns, survey.topics[mask_topic].stamps_ns
-    pairs = dict(pair_by_stamp(color_ns, mask_ns, tolerance_ns))
+    pairs = dict(paired(color_ns, mask_ns, tolerance_ns).tolist())
     if len(pairs) < len(color_ns):
         loss.notes.append(
             f"camera {camera}: {len(color_ns) - len(pairs)} of {len(color_ns)} images have no mask on {mask_topic}"

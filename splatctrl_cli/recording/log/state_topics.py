@@ -92,13 +92,19 @@ def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
     """/joint_states, else the JointState topic with most messages, else the fullest of another type; one that names
     commands last.
     """
-
-    def rank(topic: TopicSurvey) -> tuple[bool, bool, bool, int, str]:
-        name = topic.topic.name
-        is_of_type = topic.topic.type_name == JOINT_STATE
-        return (name == "/joint_states", not _is_command(name), is_of_type, topic.count, name)
-
-    chosen = max(topics, key=rank)
+    by_name = {topic.topic.name: topic for topic in topics}
+    chosen = by_name[
+        max(
+            by_name,
+            key=lambda name: (
+                name == "/joint_states",
+                not _is_command(name),
+                by_name[name].topic.type_name == JOINT_STATE,
+                by_name[name].count,
+                name,
+            ),
+        )
+    ]
     others = sorted(t.topic.name for t in topics if t is not chosen)
     if others:
         loss.notes.append(f"joint states are taken from {chosen.topic.name}, not from {', '.join(others)}")
@@ -151,19 +157,17 @@ def _streams(topics: Sequence[TopicSurvey]) -> list[_Stream]:
 
 def _base(streams: Sequence[_Stream], wanted: Sequence[str]) -> _Stream:
     """The stream with most of the joints `wanted`, of equals one with end-effector poses, then /joint_states."""
-
-    def rank(stream: _Stream) -> tuple[int, bool, bool, bool, int, str]:
-        covered, where = len(set(stream.names) & set(wanted)), stream.where
-        return (
-            covered,
+    return max(
+        streams,
+        key=lambda stream: (
+            len(set(stream.names) & set(wanted)),
             "T_base_ee" in stream.states.columns(),
-            where == "/joint_states",
-            not _is_command(where),
+            stream.where == "/joint_states",
+            not _is_command(stream.where),
             len(stream.states),
-            where,
-        )
-
-    return max(streams, key=rank)
+            stream.where,
+        ),
+    )
 
 
 def _is_command(topic: str) -> bool:

@@ -6,12 +6,11 @@ T_base_ee.npy (T, 4, 4) float64; what K is stands in capture.json.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from math import prod
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +22,9 @@ from splatctrl_cli.formats.arrays import npy_head, npy_of
 from splatctrl_cli.formats.image_file import JPEG, PNG
 from splatctrl_cli.recording.container.raw_log import RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import UndecodableMessageError
-from splatctrl_cli.recording.log.state_columns import StateColumns
+from splatctrl_cli.recording.log.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.recording.log.state_messages import JointLog, JointStream
-from splatctrl_cli.recording.log.state_topics import joint_records
-from splatctrl_cli.recording.log.survey import Survey, TopicSurvey
-from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.log.survey import TopicSurvey
 from splatctrl_cli.records import (
     Bool,
     Float32,
@@ -39,8 +36,10 @@ from splatctrl_cli.records import (
     RecordSource,
     RgbdFrame,
     UInt8,
+    by_stamp,
 )
 
+_Image = TypeVar("_Image")
 FOLDER = "joint_topics"
 AGAIN = "run `splatctrl ingest` again"
 
@@ -114,17 +113,6 @@ def read_topics(folder: Path, described: Mapping[str, Any], checked: Callable[[s
     return JointTopics(topics=topics, loss=loss, first_note=first_note, chosen=chosen)
 
 
-def joints_again(
-    kept: JointTopics, options: SourceOptions, wanted: Sequence[str]
-) -> tuple[tuple[str, ...], StateColumns, LossReport]:
-    """Names and states of a robot's joints as the log itself would give them, and what became of the others."""
-    loss = LossReport()
-    found = Survey(topics={topic.topic.name: topic for topic in kept.topics})
-    chosen = options if options.joint_topic is not None else replace(options, joint_topic=kept.chosen)
-    names, states = joint_records(found, chosen, loss, wanted)
-    return names, states, loss
-
-
 def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSurvey:
     streams = []
     for stream in entry["streams"]:
@@ -192,14 +180,12 @@ class StoredFrame:
     @cached_property
     def color(self) -> UInt8:
         """Of the frame. Raises InputError where the image does not decode."""
-        with self._refused():
-            return self.read_color()
+        return self._read(self.read_color)
 
     @cached_property
     def depth(self) -> Float32:
         """Of the frame. Raises InputError where the image does not decode."""
-        with self._refused():
-            return self.read_depth()
+        return self._read(self.read_depth)
 
     @property
     def frame(self) -> RgbdFrame:
@@ -215,10 +201,9 @@ class StoredFrame:
             valid=self.valid,
         )
 
-    @contextmanager
-    def _refused(self) -> Iterator[None]:
+    def _read(self, read: Callable[[], _Image]) -> _Image:
         try:
-            yield
+            return read()
         except UndecodableMessageError as error:
             raise InputError(f"{self.origin}: {error}", remedy="copy the recording again") from None
 
@@ -243,6 +228,23 @@ class FrameSource(RecordSource, Protocol):
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp, without its images."""
         ...
+
+
+class Recording:
+    """Records by stamp: the joint states, and the frames that a kind of recording gives in `_frames`, if any."""
+
+    states: StateColumns = NO_STATES
+
+    def records(self) -> Iterator[Record]:
+        """Yield joint states and decoded frames."""
+        return decoded(self.stored())
+
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        """Yield joint states and frames as they are stored."""
+        return by_stamp(self.states, self._frames())
+
+    def _frames(self) -> Iterator[StoredFrame]:
+        return iter(())
 
 
 def is_kept(data: bytes | None) -> bool:

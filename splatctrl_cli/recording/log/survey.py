@@ -42,11 +42,6 @@ Stamps = Sequence[int] | NDArray[np.int64]
 _BLOCK = 1 << 14  # pairs that are Python's numbers at once
 
 
-def pair_by_stamp(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> list[tuple[int, int]]:
-    """`paired` as a list of (colour, depth)."""
-    return [(i, j) for i, j in paired(color_ns, depth_ns, tolerance_ns).tolist()]
-
-
 def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.int64]:
     """Index pairs (K, 2) of colour and depth at most `tolerance_ns` apart, each index once, the closest pairs first.
 

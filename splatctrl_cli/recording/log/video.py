@@ -92,7 +92,9 @@ class VideoLog:
             if stream is None:  # no codec that is read
                 yield message
                 continue
-            yield from _pushed(stream, message, packet)
+            number, stream.num = stream.num, stream.num + 1
+            stream.waiting[number] = replace(message, data=b""), packet.header
+            yield from _images(stream, bytes(packet.data), number)
         for name, stream in streams.items():
             if stream is not None:
                 yield from _images(stream, None)
@@ -112,16 +114,10 @@ def _decoded_topic(topic: Topic) -> Topic:
     return replace(topic, type_name=IMAGE, encoding=VIDEO, schema=topic.schema or topic.type_name, definition="")
 
 
-def _pushed(stream: _Stream, message: RawMessage, packet: Any) -> Iterator[RawMessage]:
-    """The images that a packet lets out: its own, or earlier ones of a stream that reorders."""
-    number, header = stream.num, packet.header
-    stream.num += 1
-    stream.waiting[number] = replace(message, data=b""), header
-    yield from _images(stream, bytes(packet.data), number)
-
-
 def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[RawMessage]:
-    """Whole images as messages, by the number of the packet that they came in; without data, the rest of them."""
+    """Whole images as messages, by the number of the packet that they came in: the images that a packet lets out, its
+    own, or earlier ones of a stream that reorders; without data, the rest of them.
+    """
     frames, is_broken = _decode(stream.context, data, number)
     if is_broken:
         stream.broken.append(number)

@@ -26,7 +26,11 @@ def preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
     info = read_json(folder / INFO)
     try:
         feature, num = info["features"][POSITION], int(info["total_episodes"])
-        size, names = int(feature["shape"][0]), _names(feature.get("names"))
+        size, said = int(feature["shape"][0]), feature.get("names")
+        lists = said.values() if isinstance(said, dict) else [said or []]  # by kind, as {"motors": [...]}
+        names = [
+            str(name).removesuffix(".pos") for names in lists for name in names
+        ]  # shoulder_pan.pos is shoulder_pan
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(
             f"{folder / INFO}: expected total_episodes and the feature {POSITION}, got no usable {error}",
@@ -40,12 +44,6 @@ def preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
         | ({"joints": names} if len(names) == size else {})
         | {"file": str(_file(folder, episode or 0).absolute())}
     )
-
-
-def _names(said: Any) -> list[str]:
-    """Joints of a feature: a list, or lists by kind (``{"motors": [...]}``); ``shoulder_pan.pos`` is shoulder_pan."""
-    lists = list(said.values()) if isinstance(said, dict) else [said or []]
-    return [str(name).removesuffix(".pos") for names in lists for name in names]
 
 
 def _file(folder: Path, episode: int) -> Path:

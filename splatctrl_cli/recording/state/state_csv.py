@@ -53,15 +53,6 @@ class CsvTable:
             raise InputError(f"{self.path}: expected joint states, got none", remedy="record them again")
         return np.array(stamps, dtype=np.int64), {name: Rows(file) for name, file in files.items()}
 
-    def stamps(self, name: str, unit_ns: int, epoch_ns: int) -> Stamps:
-        """Those of `read` alone."""
-        return self.read(name, unit_ns, {}, epoch_ns)[0]
-
-    def numbers(self, names: Sequence[str]) -> Float64:
-        """(T, K) float64 of the columns, all at once, as `read` has them."""
-        columns = [self.index(name) for name in names]
-        return np.vstack([self._numbers(rows, number, columns) for number, rows in self._blocks()])
-
     def _blocks(self) -> Iterator[tuple[int, list[list[str]]]]:
         """Lines of cells, and the number of the first; lines without any are not counted."""
         with self.path.open(newline="", encoding="utf-8-sig") as stream:
@@ -171,10 +162,8 @@ def poses_of(rows: Table, read: Callable[[Float64], Float64 | None]) -> Rows:
 
 
 def _first(table: CsvTable, name: str, number: int) -> int | None:
-    for full in (f"state.{name}[{number}]", f"{name}[{number}]"):
-        if full in table.names:
-            return table.names.index(full)
-    return None
+    full = (f"state.{name}[{number}]", f"{name}[{number}]")
+    return next((table.names.index(column) for column in full if column in table.names), None)
 
 
 def _block(table: CsvTable, name: str, num: int) -> list[int] | None:

@@ -1,6 +1,6 @@
 """Opens what holds a robot's motion: any recorded input, a log without cameras, libfranka's and other tables."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from splatctrl_cli.recording.log.ros_log import RosLogSource
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.log.state_topics import joint_records, with_prefix
 from splatctrl_cli.recording.log.state_track import RawTrack, cleaned
-from splatctrl_cli.recording.log.stored_frame import FrameSource
+from splatctrl_cli.recording.log.stored_frame import FrameSource, Recording
 from splatctrl_cli.recording.log.survey import survey
 from splatctrl_cli.recording.log.video import open_log
 from splatctrl_cli.recording.source import open_source
@@ -24,7 +24,7 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.lerobot import is_lerobot
 from splatctrl_cli.recording.state.state_csv import is_libfranka, libfranka_track, read_csv
 from splatctrl_cli.recording.state.state_table import ARRAY_FILES, dataset_track, described_track
-from splatctrl_cli.records import LossReport, Record
+from splatctrl_cli.records import LossReport
 
 _FOR_CAMERAS = (
     *("cameras", "camera_topics", "camera_poses", "camera_pose_topics"),
@@ -33,7 +33,7 @@ _FOR_CAMERAS = (
 _NOT_FOR_TABLES = (*_FOR_CAMERAS, "joint_topic", "root", "holdout")
 
 
-class StateSource:
+class StateSource(Recording):
     """Joint states without any frames: of a log, or of a table of states."""
 
     cameras: tuple[str, ...] = ()
@@ -51,9 +51,6 @@ class StateSource:
     @property
     def loss(self) -> LossReport:
         return replace(self._loss, notes=list(self._loss.notes))
-
-    def records(self) -> Iterator[Record]:
-        yield from self.states
 
     def digests(self) -> dict[str, str]:
         return {file.name: sha256(file) for file in self._files}

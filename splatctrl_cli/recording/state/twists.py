@@ -102,8 +102,9 @@ def _of_table(path: Path, name: str) -> LoggedTwists:
             remedy=_SEE,
         )
     columns = columns_of(path, TABLE, table.file)
-    stamps = columns.stamps(table.time, TIME_UNITS_NS[table.time_unit], table.epoch_ns)
-    twists = np.hstack([columns.numbers(table.linear), columns.numbers(table.angular)])
+    groups = {"twist": [*table.linear, *table.angular]}
+    stamps, found = columns.read(table.time, TIME_UNITS_NS[table.time_unit], groups, table.epoch_ns)
+    twists = found["twist"][: len(found["twist"])]
     if twists.shape != (len(stamps), 6):
         raise InputError(f"{path}: {TABLE}: expected 6 columns of {len(stamps)} rows, got {twists.shape[::-1]}")
     return _checked(f"{path}: {TABLE}", stamps, twists, [table.frame] * len(stamps), [])

@@ -21,16 +21,16 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def interrupted(log: Path, out: Path, monkeypatch: pytest.MonkeyPatch, after: int) -> Path:
     """The partial folder of an ingest that was stopped after some frames."""
-    frames = ros_log.RosLogSource._stored_frames
+    frames = ros_log.RosLogSource._frames
 
-    def stopping(self: ros_log.RosLogSource, *, lazily: bool) -> Iterator[StoredFrame]:
+    def stopping(self: ros_log.RosLogSource, *, lazily: bool = True) -> Iterator[StoredFrame]:
         for number, stored in enumerate(frames(self, lazily=lazily)):
             if number == after:
                 raise KeyboardInterrupt
             yield stored
 
     with monkeypatch.context() as patch:
-        patch.setattr(ros_log.RosLogSource, "_stored_frames", stopping)
+        patch.setattr(ros_log.RosLogSource, "_frames", stopping)
         assert main(["ingest", str(log), "-o", str(out), "-q"]) == 130
     assert not out.exists()
     return out.with_name(out.name + ".partial")

@@ -13,7 +13,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import npy_of, read_arrays, savez
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.recording.container.mcap_records import BadRecordError, parse_record
-from splatctrl_cli.recording.folder.poses import read_tum
+from splatctrl_cli.recording.folder.poses import READERS
 from splatctrl_cli.recording.log.messages import decode_rvl
 from splatctrl_cli.recording.log.registration import TfTree
 from tests.properties import few
@@ -75,7 +75,7 @@ def test_a_line_of_poses_is_rigid_or_refused(tmp_path_factory: pytest.TempPathFa
     path = tmp_path_factory.getbasetemp() / "poses.txt"
     path.write_text(" ".join(map(repr, numbers)) + "\n")
     try:
-        poses = read_tum(path)
+        poses = READERS["tum"](path)
     except InputError:
         return
     assert len(poses) == 1 or np.isnan(numbers[1:]).any()  # a line of NaN is no pose

@@ -11,7 +11,7 @@ from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.recording.log import frame_plan
 from splatctrl_cli.recording.log.frame_plan import HeldMessages, PlannedImages
 from splatctrl_cli.recording.log.ros_log import RosLogSource
-from splatctrl_cli.recording.log.survey import pair_by_stamp
+from splatctrl_cli.recording.log.survey import paired
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
@@ -93,6 +93,6 @@ def test_pairs_are_those_of_every_pair_tried_in_turn(seed: int) -> None:
     for gap, _, _, i, j in sorted(near):
         if gap <= tolerance and i not in expected and j not in expected.values():
             expected[i] = j
-    assert pair_by_stamp(color, depth, tolerance) == sorted(
+    assert [(i, j) for i, j in paired(color, depth, tolerance).tolist()] == sorted(
         expected.items(), key=lambda pair: (color[pair[0]], pair[0])
     )
