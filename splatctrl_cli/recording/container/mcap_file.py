@@ -55,14 +55,11 @@ class McapFile:
 
         is_known: leave out these checksums, as they were compared before.
         """
+        places = [index.chunk_start_offset for index in self.chunk_indexes()]  # where records are known to begin
+        places += [part.offset for part in self.summary()[:1]]
         with self.path.open("rb") as stream:
-            walk = _Walk(stream, self.path.name, self.size, damage, self._places(), has_crc=not is_known)
+            walk = _Walk(stream, self.path.name, self.size, damage, places, has_crc=not is_known)
             yield from walk.parts()
-
-    def state(self) -> tuple[int, int]:
-        """What changes with the file: its size and when it was written [ns]."""
-        stat = self.path.stat()
-        return stat.st_size, stat.st_mtime_ns
 
     def summary(self) -> list[Part]:
         """The records of the summary section; empty where there is none that can be read."""
@@ -83,7 +80,15 @@ class McapFile:
 
     def chunk_indexes(self) -> list[ChunkIndex]:
         """The chunks that the summary names, in the order of the file."""
-        return _chunk_indexes(self.summary())
+        found = []
+        for part in self.summary():
+            try:
+                record = parse_record(part.opcode, part.content) if part.opcode == CHUNK_INDEX else None
+            except BadRecordError:
+                continue
+            if isinstance(record, ChunkIndex):
+                found.append(record)
+        return sorted(found, key=lambda index: index.chunk_start_offset)
 
     def chunk_at(self, index: ChunkIndex) -> bytes:
         """The content of a chunk's record; what is left of it where the file is shorter."""
@@ -91,11 +96,6 @@ class McapFile:
             stream.seek(min(index.chunk_start_offset, self.size))
             opcode, length = HEAD.unpack((stream.read(HEAD.size) + bytes(HEAD.size))[: HEAD.size])
             return stream.read(min(length, MAX_BLOCK + PIECE)) if opcode == CHUNK else b""
-
-    def _places(self) -> list[int]:
-        """Where records are known to begin: chunks, and the end of the data."""
-        summary = self.summary()
-        return [index.chunk_start_offset for index in _chunk_indexes(summary)] + [p.offset for p in summary[:1]]
 
 
 class _Walk:
@@ -247,13 +247,10 @@ class _Walk:
         start = footer.summary_start or part.offset
         end = part.offset + HEAD.size + 16
         is_inside = len(MAGIC) <= start <= part.offset
-        if footer.summary_crc and not (is_inside and self._crc_of(start, end) == footer.summary_crc):
-            self._add("checksum of the summary differs")
-
-    def _crc_of(self, start: int, end: int) -> int:
-        self._stream.seek(start)
+        self._stream.seek(start if is_inside else 0)
         self._crc = None
-        return self._pass_over(end - start)
+        if footer.summary_crc and not (is_inside and self._pass_over(end - start) == footer.summary_crc):
+            self._add("checksum of the summary differs")
 
     def _pass_over(self, length: int, crc: int = 0) -> int:
         """Read over `length` bytes; their checksum, going on from `crc`."""
@@ -273,18 +270,6 @@ class _Walk:
 
     def _add(self, note: str) -> None:
         self._damage.add(f"{self._name}: {note}")
-
-
-def _chunk_indexes(summary: list[Part]) -> list[ChunkIndex]:
-    found = []
-    for part in summary:
-        try:
-            record = parse_record(part.opcode, part.content) if part.opcode == CHUNK_INDEX else None
-        except BadRecordError:
-            continue
-        if isinstance(record, ChunkIndex):
-            found.append(record)
-    return sorted(found, key=lambda index: index.chunk_start_offset)
 
 
 def _footer(stream: BinaryIO, size: int) -> Footer | None:

@@ -8,6 +8,7 @@ raises on valid files without one and yields nothing from a truncated file.
 import struct
 import zlib
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -64,9 +65,8 @@ def index_by_heads(file: McapFile) -> LogIndex:
                 break
             content = head[HEAD.size :]
             if opcode == CHUNK:
-                chunk = _chunk_index(content, offset, length)
-                if chunk is not None:
-                    chunks.append(chunk)
+                with suppress(BadRecordError):
+                    chunks.append(_chunk_index(content, offset, length))
             elif opcode == MESSAGE_INDEX and chunks:
                 channel, size = struct.unpack_from("<HI", content)
                 counts[channel] = counts.get(channel, 0) + size // 16
@@ -89,11 +89,8 @@ def index_by_heads(file: McapFile) -> LogIndex:
     )
 
 
-def _chunk_index(content: bytes, offset: int, length: int) -> ChunkIndex | None:
-    try:
-        chunk = parse_record(CHUNK, content)
-    except BadRecordError:
-        return None
+def _chunk_index(content: bytes, offset: int, length: int) -> ChunkIndex:
+    chunk = parse_record(CHUNK, content)
     assert isinstance(chunk, Chunk)
     return ChunkIndex(
         message_start_time=chunk.message_start_time,
@@ -181,7 +178,8 @@ class McapLog:
 
     def _forget_changed(self) -> tuple[int, int]:
         """The state of the file; its checksums count as unknown where it is another than when they were compared."""
-        state = self._file.state()
+        stat = self.path.stat()
+        state = stat.st_size, stat.st_mtime_ns
         self._whole = self._whole if state == self._whole else None
         return state
 

@@ -235,10 +235,9 @@ def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float
         if "" in files:  # a camera that does not move
             return dict.fromkeys(colors, read_matrix_file(files[""]))
         return {name: read_matrix_file(files[name]) for name in colors if name in files}
-    if table.format == "matrix-blocks":
-        by_key = read_matrix_blocks(root / table.file, table.heading)
-    else:
-        by_key = READERS[table.format](root / table.file)
+    is_of_blocks = table.format == "matrix-blocks"
+    file = root / table.file
+    by_key = read_matrix_blocks(file, table.heading) if is_of_blocks else READERS[table.format](file)
     if table.format == "tum":
         trajectory = Trajectory(by_key)
         at_stamp = {name: trajectory.at(stamp) for name in colors if (stamp := stamp_of_text(name)) is not None}

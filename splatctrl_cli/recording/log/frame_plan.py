@@ -152,38 +152,29 @@ class HeldMessages:
         return found
 
 
-class PlannedImages:
-    """The messages of the frames of a plan, which a log may hold in another order."""
+def planned_images(
+    log: RawLog, plan: FramePlan, damage: Damage, held: HeldMessages
+) -> Iterator[tuple[Planned, list[RawMessage]]]:
+    """Yield each frame of a plan with the messages of its colour, depth and mask, which the log may hold in another
+    order; `held` keeps those that wait. Frames that are gone go to `damage`.
+    """
+    uses, position, num = plan.uses(), 0, len(plan)
+    numbers, planned = dict.fromkeys(uses, 0), plan[0]
 
-    def __init__(self, log: RawLog, plan: FramePlan) -> None:
-        self._log = log
-        self._plan = plan
-        self._held = HeldMessages()
-        self._uses = plan.uses()
+    def take(topic: str, number: int) -> RawMessage:
+        uses[topic][number] -= 1
+        return held.get((topic, number)) if uses[topic][number] else held.pop((topic, number))
 
-    def of_frames(self, damage: Damage) -> Iterator[tuple[Planned, list[RawMessage]]]:
-        """Yield each planned frame with the messages of its colour, depth and mask; frames that are gone go to
-        `damage`.
-        """
-        numbers = dict.fromkeys(self._uses, 0)
-        position, num = 0, len(self._plan)
-        planned = self._plan[0]
-        for message in self._log.messages(Damage(), set(self._uses)):  # the survey has counted this damage
-            topic, number = message.topic.name, numbers[message.topic.name]
-            numbers[topic] = number + 1
-            if number >= len(self._uses[topic]) or not self._uses[topic][number]:
-                continue
-            self._held.add((topic, number), message)
-            while position < num and all(key in self._held for key in planned.keys):
-                yield planned, [self._take(key) for key in planned.keys]
-                position += 1
-                if position < num:
-                    planned = self._plan[position]
-        if position < num:
-            name = self._log.path.name
-            damage.add(f"{name}: {num - position} frames that were there are gone: it changed while it was read")
-
-    def _take(self, key: Key) -> RawMessage:
-        topic, number = key
-        self._uses[topic][number] -= 1
-        return self._held.get(key) if self._uses[topic][number] else self._held.pop(key)
+    for message in log.messages(Damage(), set(uses)):  # the survey has counted this damage
+        topic, number = message.topic.name, numbers[message.topic.name]
+        numbers[topic] = number + 1
+        if number >= len(uses[topic]) or not uses[topic][number]:
+            continue
+        held.add((topic, number), message)
+        while position < num and all(key in held for key in planned.keys):
+            yield planned, [take(*key) for key in planned.keys]
+            position += 1
+            if position < num:
+                planned = plan[position]
+    if position < num:
+        damage.add(f"{log.path.name}: {num - position} frames that were there are gone: it changed while it was read")

@@ -15,7 +15,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.recording.container.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.recording.log.decoder import MessageDecoder, UndecodableMessageError
-from splatctrl_cli.recording.log.frame_plan import FramePlan, Planned, PlannedImages
+from splatctrl_cli.recording.log.frame_plan import FramePlan, HeldMessages, Planned, planned_images
 from splatctrl_cli.recording.log.messages import ImageMessage, color_of, depth_of, num_invalid, read_image
 from splatctrl_cli.recording.log.rig import Camera, build_cameras, nearest_gap_ns
 from splatctrl_cli.recording.log.state_messages import STATE_TYPES
@@ -170,7 +170,7 @@ class RosLogSource(Recording):
         """lazily: files of images that need no change are only decoded on demand."""
         lost, decoder, checked = _Pass(), MessageDecoder(), set[str]()
         self._passes.append(lost)
-        for planned, messages in PlannedImages(self._log, self._plan).of_frames(lost.damage):
+        for planned, messages in planned_images(self._log, self._plan, lost.damage, HeldMessages()):
             camera = planned.camera
             is_whole = not lazily or camera.name not in checked  # the first depth is looked at
             try:

@@ -125,11 +125,16 @@ NO_STATES = StateColumns(stamp_ns=np.zeros(0, np.int64), position=np.zeros((0, 0
 class ColumnWriter:
     """Columns of states that come one after the other, a block at a time: NaN where a state has no value."""
 
-    def __init__(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """shapes: of a row of each column."""
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]], blocks: Mapping[str, Iterable[Float64]]) -> None:
+        """shapes: of a row of each column; blocks: of whole columns of states that are known already.
+
+        Raises ValueError where these are of several lengths.
+        """
         self._shapes = shapes
-        self._files: dict[str, RowFile] = {}
-        self._num = 0  # states that are in the files
+        self._files = {name: RowFile(shapes[name], of_column) for name, of_column in blocks.items()}
+        self._num, *others = {len(file) for file in self._files.values()} or {0}  # states that are in the files
+        if others:
+            raise ValueError(f"{', '.join(self._files)}: columns of several lengths")
         self._waiting: list[Mapping[str, Float64 | None]] = []
 
     def __len__(self) -> int:
@@ -140,15 +145,6 @@ class ColumnWriter:
         self._waiting.append(values)
         if len(self._waiting) == BLOCK:
             self._flush()
-
-    def add_column(self, name: str, blocks: Iterable[Float64]) -> None:
-        """A whole column of states that are known already."""
-        file = self._files.setdefault(name, RowFile(self._shapes[name]))
-        for block in blocks:
-            file.append(block)
-        if len(file) != (self._num or len(file)):
-            raise ValueError(f"{name}: {len(file)} rows, expected {self._num}")
-        self._num = len(file)
 
     def tables(self) -> dict[str, Rows]:
         """Of all states so far; a column of which no state has a value is not there."""
@@ -174,7 +170,7 @@ class StateCollector:
         self._num_joints = num_joints
         self._stamps = array("q")
         joints, pose = (num_joints,), (4, 4)
-        self._columns = ColumnWriter({name: joints if name in OF_JOINTS else pose for name in COLUMNS})
+        self._columns = ColumnWriter({name: joints if name in OF_JOINTS else pose for name in COLUMNS}, {})
 
     def add(self, state: JointState) -> None:
         """The next state. Raises InputError for one of another number of joints."""

@@ -172,22 +172,22 @@ COLUMNS = ("position", "velocity", "commanded_velocity", "T_base_ee")
 class JointStream:
     """States that name the same joints; `names` in the order of the first, which is that of the columns."""
 
-    def __init__(self, names: tuple[str, ...]) -> None:
+    def __init__(self, names: tuple[str, ...], columns: Mapping[str, Iterable[Float64]] | None = None) -> None:
+        """columns: as blocks of rows, of states that are known already."""
         self.names = names
         self._stamps, self._log_times = array("q"), array("q")
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
-        self._columns = ColumnWriter({name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS})
+        shapes = {name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS}
+        self._columns = ColumnWriter(shapes, columns or {})
 
     @classmethod
     def of(
         cls, names: tuple[str, ...], stamp_ns: Stamps, log_time_ns: Stamps, columns: Mapping[str, Iterable[Float64]]
     ) -> "JointStream":
         """The stream that had these columns, given as blocks of rows. Raises ValueError for other lengths."""
-        stream = cls(names)
+        stream = cls(names, columns)
         stream._stamps.extend(stamp_ns.tolist())
         stream._log_times.extend(log_time_ns.tolist())
-        for name, blocks in columns.items():
-            stream._columns.add_column(name, blocks)
         if columns and len(stream._columns) != len(stream):
             raise ValueError(f"columns of other lengths than {len(stream)}")
         return stream

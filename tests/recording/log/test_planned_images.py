@@ -9,7 +9,7 @@ import pytest
 
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.recording.log import frame_plan
-from splatctrl_cli.recording.log.frame_plan import HeldMessages, PlannedImages
+from splatctrl_cli.recording.log.frame_plan import HeldMessages, planned_images
 from splatctrl_cli.recording.log.ros_log import RosLogSource
 from splatctrl_cli.recording.log.survey import paired
 from splatctrl_cli.recording.source import open_source
@@ -78,8 +78,8 @@ def test_frames_come_by_stamp_then_camera_in_whatever_order_these_are_named(tmp_
 def test_images_that_no_frame_needs_any_more_are_let_go(tmp_path: Path) -> None:
     source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1"))))
     assert isinstance(source, RosLogSource)
-    images = PlannedImages(source._log, source._plan)
-    most = [len(images._held._messages) for _ in images.of_frames(Damage())]
+    held = HeldMessages()
+    most = [len(held._messages) for _ in planned_images(source._log, source._plan, Damage(), held)]
     assert len(most) == 10 and max(most) <= 4 and most[-1] == 0
 
 
