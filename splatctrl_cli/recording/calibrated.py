@@ -85,8 +85,11 @@ class Correction:
 
     def frame(self, frame: RgbdFrame) -> RgbdFrame:
         """A frame whose pose is already that of its own time by the robot's clock."""
-        T = self.pose(frame.camera, frame.T_world_camera)
-        return replace(frame, T_world_camera=T, depth=self.depth(frame.camera, frame.depth))
+        return replace(
+            frame,
+            T_world_camera=self.pose(frame.camera, frame.T_world_camera),
+            depth=self.depth(frame.camera, frame.depth),
+        )
 
     def notes(self, digests: Sequence[str]) -> list[str]:
         """What a report says of it; digests: sha256 of the recording's files."""

@@ -293,8 +293,11 @@ def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
-    sums = [(hashlib.sha256(data).hexdigest(), name) for name, data in files.items()]
-    return Entry(row=row | named, sums=sums, provenance=_provenance(stored, color_name, depth_name))
+    return Entry(
+        row=row | named,
+        sums=[(hashlib.sha256(data).hexdigest(), name) for name, data in files.items()],
+        provenance=_provenance(stored, color_name, depth_name),
+    )
 
 
 def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:

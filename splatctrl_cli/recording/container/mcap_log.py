@@ -233,8 +233,13 @@ class McapLog:
             return None
         if names is not None and topic.name not in names:
             return None
-        data = records[start + _MESSAGE.size : end]
-        return RawMessage(topic=topic, log_time_ns=log_time_ns, data=data, file=self.path.name, offset=offset)
+        return RawMessage(
+            topic=topic,
+            log_time_ns=log_time_ns,
+            data=records[start + _MESSAGE.size : end],
+            file=self.path.name,
+            offset=offset,
+        )
 
     def _declare(self, opcode: int, content: bytes, damage: Damage) -> None:
         """Take a schema, a channel or the statistics."""

@@ -100,9 +100,6 @@ class McapLog:
         )
 
     def _camera_info(self, header: Any, k: Intrinsics) -> Any:
-        region = self._new(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
         return self._new(
             "sensor_msgs/msg/CameraInfo",
             header=header,
@@ -115,7 +112,9 @@ class McapLog:
             p=np.array([k.fx, 0, k.cx, 0, 0, k.fy, k.cy, 0, 0, 0, 1, 0], dtype=np.float64),
             binning_x=0,
             binning_y=0,
-            roi=region,
+            roi=self._new(
+                "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+            ),
         )
 
     def _transform(self, T: Float64) -> Any:
@@ -128,8 +127,11 @@ class McapLog:
         )
 
     def _header(self, stamp_ns: int, frame_id: str) -> Any:
-        stamp = self._new("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-        return self._new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+        return self._new(
+            "std_msgs/msg/Header",
+            stamp=self._new("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9),
+            frame_id=frame_id,
+        )
 
     def _new(self, kind: str, **fields: Any) -> Any:
         return self._store.types[kind](**fields)

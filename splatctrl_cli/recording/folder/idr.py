@@ -110,8 +110,7 @@ def projection(view: DtuView) -> Float64:
     k = view.intrinsics
     T_camera_world = invert_transform(view.T_world_camera)
     T_camera_world[:3, 3] *= MILLIMETRES
-    K = np.array([[k.fx, 0.0, k.cx, 0.0], [0.0, k.fy, k.cy, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-    return K @ T_camera_world
+    return np.array([[k.fx, 0, k.cx, 0], [0, k.fy, k.cy, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]) @ T_camera_world
 
 
 def _sphere(views: Sequence[DtuView]) -> tuple[Float64, float]:

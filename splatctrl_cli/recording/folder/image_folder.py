@@ -320,5 +320,6 @@ def open_image_folder(path: Path, options: SourceOptions) -> ImageFolderSource:
     refuse_unknown_cameras(path, (*(options.cameras or ()), *options.camera_poses), rig)
     names = options.cameras or tuple(rig)
     poses = {name: pose for name, pose in options.camera_poses.items() if name in names}
-    chosen = replace(options, cameras=names, camera_poses=poses)
-    return ImageFolderSource(path, chosen, *(rig[name] for name in names))
+    return ImageFolderSource(
+        path, replace(options, cameras=names, camera_poses=poses), *(rig[name] for name in names)
+    )

@@ -38,10 +38,8 @@ def read(folder: Path, options: SourceOptions) -> Description:
     """The folder as a description; depth is in millimetres unless the file or --depth-scale says otherwise."""
     options.refuse(("intrinsics",), "a folder with transforms.json", folder)
     file = next(name for name in FILES if (folder / name).is_file())
-    description = Description(
-        path=folder / file, root=folder, poses=PosesTable(format="nerfstudio", file=file, axes="opengl")
-    )
-    return with_transforms(description)
+    poses = PosesTable(format="nerfstudio", file=file, axes="opengl")
+    return with_transforms(Description(path=folder / file, root=folder, poses=poses))
 
 
 def with_transforms(description: Description) -> Description:

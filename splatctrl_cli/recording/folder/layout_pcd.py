@@ -65,8 +65,11 @@ def read_cloud(path: Path) -> Cloud:
         packed = columns["rgb" if "rgb" in said.fields else "rgba"].view(np.uint32).reshape(size)
     except _DAMAGE as error:
         raise _unreadable(path, error) from None
-    rgb = np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
-    return Cloud(points=points, color=rgb, T_world_camera=_viewpoint(said))
+    return Cloud(
+        points=points,
+        color=np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8),
+        T_world_camera=_viewpoint(said),
+    )
 
 
 def pinhole_of(points: Float64) -> Intrinsics | None:

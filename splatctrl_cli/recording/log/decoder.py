@@ -157,7 +157,11 @@ def _type_store(topic: Topic) -> Any:
         return _foxglove_store()
     if not topic.definition:
         return get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.ROS2_HUMBLE)
-    _check_definition(topic.definition)
+    if len(topic.definition) > _MOST_TEXT:  # it would take much memory or time to compile
+        raise ValueError(f"{len(topic.definition)} characters, at most {_MOST_TEXT} are read")
+    largest = max((int("".join(sizes)[:12]) for sizes in _ARRAY.findall(topic.definition)), default=0)
+    if largest > _MOST_ITEMS:
+        raise ValueError(f"an array of {largest} items, at most {_MOST_ITEMS} are read")
     return _store_of(topic.definition, topic.definition_format, topic.schema or topic.type_name)
 
 
@@ -209,15 +213,6 @@ def _kind(description: Any) -> object:
     if kind == Nodetype.NAME:
         return detail
     return detail[0] if kind == Nodetype.BASE else [_kind(detail[0])]
-
-
-def _check_definition(text: str) -> None:
-    """Raise ValueError for a definition that would take much memory or time to compile."""
-    if len(text) > _MOST_TEXT:
-        raise ValueError(f"{len(text)} characters, at most {_MOST_TEXT} are read")
-    largest = max((int("".join(sizes)[:12]) for sizes in _ARRAY.findall(text)), default=0)
-    if largest > _MOST_ITEMS:
-        raise ValueError(f"an array of {largest} items, at most {_MOST_ITEMS} are read")
 
 
 TRANSFORM, OPTION = "geometry_msgs/msg/Transform", "std_msgs/msg/Float32"

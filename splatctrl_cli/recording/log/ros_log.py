@@ -96,8 +96,8 @@ class RosLogSource(Recording):
 
     def pose_at(self, camera: str, stamp_ns: int) -> Float64 | None:
         """T_world_camera (4, 4) of a camera at any time [ns]; None where tf does not know it."""
-        tolerance_ns = round(self._options.pose_tolerance_s * SECOND_NS)
-        return next(c for c in self._rig if c.name == camera).pose_at(self._tf, stamp_ns, tolerance_ns)
+        found = next(c for c in self._rig if c.name == camera)
+        return found.pose_at(self._tf, stamp_ns, round(self._options.pose_tolerance_s * SECOND_NS))
 
     def digests(self) -> dict[str, str]:
         return dict(self._digests)

@@ -269,13 +269,12 @@ def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
 def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
     """The states of a stream with `names` as columns."""
     states, columns = stream.states, stream.states.columns()
-    raw = RawTrack(
+    return RawTrack(
         where=stream.where,
         names=stream.names,
         stamp_ns=checked_stamps(states.stamp_ns, states.log_time_ns, stream.where, loss),
         **{"velocity": absent(len(states), len(stream.names)), **columns},
-    )
-    return raw.of_names(names)
+    ).of_names(names)
 
 
 def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
@@ -313,14 +312,13 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
         return Rows(file)
 
     one, two = track.commanded_velocity, other.commanded_velocity
-    filled = replace(
+    return replace(
         track,
         names=(*track.names, *other.names),
         position=joined(track.position, position, np.arange(len(at))),
         velocity=joined(track.velocity, other.velocity, order),
         commanded_velocity=None if one is None or two is None else joined(one, two, order),
-    )
-    return filled.select(np.flatnonzero(keep))
+    ).select(np.flatnonzero(keep))
 
 
 def _is_still(table: Table, before: Index, after: Index) -> Bool:

@@ -95,8 +95,11 @@ def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) 
                 "streams": streams,
             }
         )
-    loss = {"counts": asdict(kept.loss), "first_note": kept.first_note}
-    return {"topics": described, "chosen": kept.chosen, "loss": loss}
+    return {
+        "topics": described,
+        "chosen": kept.chosen,
+        "loss": {"counts": asdict(kept.loss), "first_note": kept.first_note},
+    }
 
 
 def read_topics(folder: Path, described: Mapping[str, Any], checked: Callable[[str], Path]) -> JointTopics:

@@ -264,7 +264,7 @@ def _calibration(message: Any) -> Calibration | None:
     K = np.asarray(fields["k"], dtype=np.float64).reshape(3, 3)
     if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
         return None  # an uncalibrated driver publishes zeros
-    calibration = Calibration(
+    whole = Calibration(
         width=int(message.width),
         height=int(message.height),
         K=K,
@@ -275,13 +275,8 @@ def _calibration(message: Any) -> Calibration | None:
         frame_id=message.header.frame_id.strip("/"),
         sensor_K=K,
     )
-    return _cut(calibration, message)
-
-
-def _cut(whole: Calibration, message: Any) -> Calibration:
-    """The camera of images that are binned or cut out of those of the whole sensor, as image_geometry takes it: moved
-    by the region's corner, then divided by the binning.
-    """
+    # Images that are binned or cut out of the whole sensor's are as image_geometry takes them: moved by the region's
+    # corner, then divided by the binning.
     across, down = (max(1, int(getattr(message, name, 0))) for name in ("binning_x", "binning_y"))
     roi, size = getattr(message, "roi", None), (whole.width, whole.height)
     x, y, width, height = (int(getattr(roi, name, 0)) for name in ("x_offset", "y_offset", "width", "height"))

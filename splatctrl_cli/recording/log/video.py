@@ -254,8 +254,12 @@ class VideoFileLog:
 
     def _message(self, frame: Any, stamp_ns: int) -> RawMessage:
         stamp = SimpleNamespace(sec=stamp_ns // SECOND_NS, nanosec=stamp_ns % SECOND_NS)
-        data = pack_image(SimpleNamespace(stamp=stamp, frame_id=""), frame.to_ndarray(format="rgb24"))
-        return RawMessage(topic=self._topic, log_time_ns=stamp_ns, data=data, file=self.path.name)
+        return RawMessage(
+            topic=self._topic,
+            log_time_ns=stamp_ns,
+            data=pack_image(SimpleNamespace(stamp=stamp, frame_id=""), frame.to_ndarray(format="rgb24")),
+            file=self.path.name,
+        )
 
 
 def _read_stamps(path: Path) -> Stamps:
