@@ -91,19 +91,14 @@ class FramePlan:
 
     def uses(self) -> dict[str, Index]:
         """How many frames need each image, by topic and number."""
-        found: dict[str, Index] = {}
+        found: dict[str, list[Index]] = {}
         for number, camera in enumerate(self._cameras):
             of_camera = self._columns[:, self._columns[1] == number]
             for topic, row in ((camera.color_topic, 2), (camera.depth_topic, 3), (camera.human_topic, 4)):
-                indices = of_camera[row][of_camera[row] != NO_MASK]
-                if len(indices):
-                    counts = np.bincount(indices)
-                    before = found.get(topic, np.zeros(0, dtype=np.int64))
-                    longer = np.zeros(max(len(before), len(counts)), dtype=np.int64)
-                    longer[: len(before)] = before
-                    longer[: len(counts)] += counts
-                    found[topic] = longer
-        return found
+                found.setdefault(topic, []).append(of_camera[row][of_camera[row] != NO_MASK])
+        return {
+            topic: np.bincount(np.concatenate(indices)) for topic, indices in found.items() if any(map(len, indices))
+        }
 
 
 HELD_BYTES = 96 << 20  # of images that wait for others, in memory; more of them wait in a file without a name

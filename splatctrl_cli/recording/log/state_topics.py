@@ -323,11 +323,8 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
 
 def _is_still(table: Table, before: Index, after: Index) -> Bool:
     """Pairs of states (T,) of which no joint differs."""
-    is_still = np.zeros(len(before), dtype=np.bool_)
-    for first, last in ranges(len(before)):
-        change = np.abs(table[after[first:last]] - table[before[first:last]])
-        is_still[first:last] = change.max(axis=1) < STATES_STILL
-    return is_still
+    changes = (table[after[first:last]] - table[before[first:last]] for first, last in ranges(len(before)))
+    return np.concatenate([np.zeros(0, np.bool_), *(np.abs(c).max(axis=1) < STATES_STILL for c in changes)])
 
 
 def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossReport) -> Stamps:
@@ -367,10 +364,8 @@ def _check_steps(late: Float64, where: str, loss: LossReport) -> None:
         if np.ptp(late) > CLOCK_MIXED:
             raise _mixed(where, float(np.ptp(late)), int(np.argmax(np.abs(np.diff(late)))) + 1)
         return
-    windows = np.empty(len(late) - n + 1)
-    for first, last in ranges(len(windows)):
-        near = late[first : last + n - 1]
-        windows[first:last] = np.median(np.lib.stride_tricks.sliding_window_view(near, n), axis=1)
+    near = np.lib.stride_tricks.sliding_window_view(late, n)
+    windows = np.concatenate([np.median(near[first:last], axis=1) for first, last in ranges(len(near))])
     change = np.abs(windows[n:] - windows[:-n])  # the n states before i + n against those from it on
     step = float(change.max(initial=0.0))
     if step <= CLOCK_STEP:

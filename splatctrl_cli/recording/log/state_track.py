@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, ranges
+from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, blocks_of, ranges
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.records import Bool, Float64, LossReport, Stamps
 
@@ -197,20 +197,14 @@ def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
 
 def _num_posed(raw: RawTrack) -> int:
     """States with an end-effector pose."""
-    num = 0
-    for first, last in ranges(len(raw.stamp_ns)):
-        there = np.zeros(last - first, dtype=np.bool_)
-        for poses in (raw.T_base_ee, raw.T_world_ee):
-            if poses is not None:
-                there |= np.isfinite(poses[first:last]).all(axis=(1, 2))
-        num += int(there.sum())
-    return num
+    poses = [table for table in (raw.T_base_ee, raw.T_world_ee) if table is not None]
+    blocks = [[np.isfinite(T[first:last]).all(axis=(1, 2)) for T in poses] for first, last in ranges(len(raw))]
+    return sum(int(np.any(block, axis=0).sum()) for block in blocks)
 
 
 def _finite(raw: RawTrack, loss: LossReport) -> RawTrack:
-    is_finite = np.zeros(len(raw.stamp_ns), dtype=np.bool_)
-    for first, last in ranges(len(is_finite)):
-        is_finite[first:last] = np.isfinite(raw.position[first:last]).all(axis=1)
+    blocks = (np.isfinite(block).all(axis=1) for block in blocks_of(raw.position))
+    is_finite = np.concatenate([np.zeros(0, np.bool_), *blocks])
     num_broken = int((~is_finite).sum())
     if not num_broken:
         return raw
@@ -229,11 +223,10 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
     num_again = int(is_again.sum())
     if not num_again:
         return raw
-    again, num_other = np.flatnonzero(is_again), 0
-    for first, last in ranges(num_again):
-        part = again[first:last]
-        differs = np.abs(raw.position[part] - raw.position[part - 1]).max(axis=1) > fixed.STATES_CONFLICT
-        num_other += int(differs.sum())
+    again = np.flatnonzero(is_again)
+    parts = [again[first:last] for first, last in ranges(num_again)]
+    apart = (np.abs(raw.position[part] - raw.position[part - 1]).max(axis=1) for part in parts)
+    num_other = sum(int((distances > fixed.STATES_CONFLICT).sum()) for distances in apart)
     loss.duplicate_states += num_again
     loss.conflicting_states += num_other
     more = f", {num_other} of them with other positions" if num_other else ""
