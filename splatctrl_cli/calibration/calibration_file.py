@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.formats.summary import Grid, Summary
+from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.geometry import quat_from_rotation, transform_from
 from splatctrl_cli.records import Float64
 

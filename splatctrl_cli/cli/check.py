@@ -8,7 +8,7 @@ from splatctrl_cli.checks.finding import CheckReport
 from splatctrl_cli.cli.common import Console, shown, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.errors import DAMAGED
-from splatctrl_cli.formats.summary import Summary
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.recording.source import describe
 

@@ -16,7 +16,7 @@ from splatctrl_cli.cli.recordings import show_ingested
 from splatctrl_cli.cli.replay import show_replayed
 from splatctrl_cli.cli.score import show_scored
 from splatctrl_cli.cli.sdf_bake import show_baked
-from splatctrl_cli.formats.summary import Summary
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.bake.bake import BakeResult
 from splatctrl_cli.jobs.demo import DemoRequest, StepResult, demo
 from splatctrl_cli.jobs.export.export import ExportResult

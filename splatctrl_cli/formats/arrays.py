@@ -174,8 +174,7 @@ class ArrayFile(ABC):
         self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
     ) -> tuple[Stamps, dict[str, Rows]]:
         """`stamps`, and of each group of names its `columns`."""
-        columns = {key: self.columns(names) for key, names in groups.items()}
-        return self.stamps(time, unit_ns, epoch_ns), columns
+        return self.stamps(time, unit_ns, epoch_ns), {key: self.columns(names) for key, names in groups.items()}
 
     def numbers(self, names: Sequence[str]) -> Float64:
         """`columns`, all rows at once."""
@@ -270,8 +269,7 @@ class NpzFile(ArrayFile):
     def _opened(self, stack: ExitStack, name: str) -> tuple[tuple[int, ...], np.dtype[Any], bool, IO[bytes]]:
         """Shape, type, whether by columns, and the stream behind the header."""
         try:
-            archive = stack.enter_context(zipfile.ZipFile(self.path))
-            stream = stack.enter_context(archive.open(f"{name}.npy"))
+            stream = stack.enter_context(stack.enter_context(zipfile.ZipFile(self.path)).open(f"{name}.npy"))
             shape, is_by_columns, dtype = npy_head(stream)
         except _DAMAGE as error:
             raise self._unreadable("NPZ", error) from None
@@ -369,8 +367,7 @@ class ParquetFile(ArrayFile):
         """A column (T, ...), of floats NaN where it has no value."""
         if not hasattr(column.type, "value_type") or self._arrow.types.is_dictionary(column.type):
             return np.asarray(column.to_numpy(zero_copy_only=False))
-        lengths = column.value_lengths().to_numpy(zero_copy_only=False)
-        if column.null_count or len(set(lengths.tolist())) > 1:
+        if column.null_count or len(set(column.value_lengths().to_numpy(zero_copy_only=False).tolist())) > 1:
             raise self._ragged(name)
         inner = self._values(column.flatten(), name)
         return inner.reshape(len(column), -1, *inner.shape[1:])

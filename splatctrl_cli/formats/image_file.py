@@ -46,9 +46,7 @@ def image_head(data: bytes) -> ImageHead | None:
     without transparency or interlace, every chunk of which has the checksum that it says (ITU-T T.81; W3C PNG).
     """
     head = (_jpeg_head if data.startswith(JPEG) else _png_head)(data)
-    if head is None or not 0 < head.width * head.height <= MOST_PIXELS:
-        return None
-    return head
+    return None if head is None or not 0 < head.width * head.height <= MOST_PIXELS else head
 
 
 def _jpeg_head(data: bytes) -> ImageHead | None:

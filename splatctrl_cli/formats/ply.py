@@ -122,11 +122,10 @@ def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) 
     """Raise InputError that names which of the `required` properties are not among `names`."""
     missing = [name for name in required if name not in names]
     if missing:
-        is_named_otherwise = {"opacity", "f_dc_0"} & {*names}
         raise InputError(
             f"{path}: no 3D-GS splat file: missing properties {' '.join(missing)} (it has {' '.join(names)})",
             remedy="write them by these names: scale_* is log(sigma [m]), rot_* a quaternion w x y z, opacity a logit"
-            if is_named_otherwise
+            if ({"opacity", "f_dc_0"} & {*names})
             else "a point cloud or mesh has to be reconstructed first",
         )
 

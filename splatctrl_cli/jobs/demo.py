@@ -15,9 +15,9 @@ from splatctrl_cli.errors import DAMAGED, InputError, UsageError
 from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
-from splatctrl_cli.formats.summary import Summary
 from splatctrl_cli.jobs.bake.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake.request import BakeRequest
 from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult, export
@@ -117,8 +117,12 @@ def demo(request: DemoRequest, progress: Progress = SILENT, told: Told = lambda 
     with output_path(out, force=request.force, is_folder=True) as folder:
         data = recorded or folder / "recording"
         with stopwatch.stage("commands"):
-            steps = [] if recorded else [_simulation(data, progress)]
-            steps += _steps(data, folder, request.threads, progress)
+            made = Step(  # the same scene, with the arm of primitive shapes
+                words=["simulate", "-o", str(data)],
+                run=lambda: simulate(SimulateRequest(out=data), progress),
+                expected="done",
+            )
+            steps = [*([] if recorded else [made]), *_steps(data, folder, request.threads, progress)]
             reasons = [_reason(step, request, folder, progress, told) for step in steps]
         with stopwatch.stage("pictures"):
             _draw(data, folder, request.threads)
@@ -145,12 +149,6 @@ def _refuse_unusable(data: Path, out: Path) -> None:
         )
     if out.resolve() == data.resolve():
         raise UsageError(f"{out}: is the input folder", remedy="give another --out")
-
-
-def _simulation(data: Path, progress: Progress) -> Step:
-    """The step that makes a recording of the same scene, with the arm of primitive shapes."""
-    asked = SimulateRequest(out=data)
-    return Step(words=["simulate", "-o", str(data)], run=lambda: simulate(asked, progress), expected="done")
 
 
 def _steps(data: Path, out: Path, threads: int, progress: Progress) -> list[Step]:
@@ -276,17 +274,15 @@ def _draw(data: Path, out: Path, threads: int) -> None:
         else:
             newest[record.camera] = record
     scene = open_scene(out / "scene")
-    rows = [_comparison(frame, scene, threads) for frame in newest.values()]
-    comparison_picture(out / "renders.png", rows)
+    comparison_picture(out / "renders.png", [_comparison(frame, scene, threads) for frame in newest.values()])
     model = RobotModel.from_urdf(data / "robot.urdf", data / "robot_spheres.yaml").moved_by(source.joint_names)
     assert joints is not None
     centers = model.sphere_centers(model.positions_of(source.joint_names, joints.position))
-    height = float(np.median(centers[model.moving_spheres][-4:, 2]))
     field_slice_picture(
         out / "field_slice.png",
         read_npz(out / "field" / "field.npz"),
         2,
-        height,
+        float(np.median(centers[model.moving_spheres][-4:, 2])),
         (centers, model.sphere_set.radii),
         "distance to the map, with the arm's spheres",
     )

@@ -13,12 +13,12 @@ import yaml
 from defusedxml import ElementTree
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.arrays import DAMAGE, npy_head, read_arrays
 from splatctrl_cli.formats.grid.grid_formats import FORMATS as GRID_FORMATS
 from splatctrl_cli.formats.image_file import decode_file
 from splatctrl_cli.formats.splat.splats import FORMATS as SPLAT_FORMATS
 from splatctrl_cli.formats.splat.splats import describe_splats
-from splatctrl_cli.formats.summary import Grid, Summary
 from splatctrl_cli.recording.container.log_formats import SUFFIXES
 
 _LIST_LIMIT = 12  # longer lists are counted, not shown

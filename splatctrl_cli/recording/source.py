@@ -9,10 +9,10 @@ from typing import Any
 from splatctrl_cli.calibration.calibration_file import describe_calibration, is_calibration
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.summary import Grid, Summary, files_below, names_in
 from splatctrl_cli.formats.grid.grid_format import FORMAT, covers, header_facts
 from splatctrl_cli.formats.scene.scene_folder import run_value
 from splatctrl_cli.formats.scene.voxel_file import known_space, read_occupancy
-from splatctrl_cli.formats.summary import Grid, Summary, files_below, names_in
 from splatctrl_cli.recording.calibrated import calibrated
 from splatctrl_cli.recording.capture.capture import CaptureSource, robot_description_of
 from splatctrl_cli.recording.capture.capture_header import is_capture, read_capture_header

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.formats.summary import Summary
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs import demo as module
 from splatctrl_cli.jobs.demo import SAMPLE, DemoRequest, Step, demo
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, SimulateResult, simulate

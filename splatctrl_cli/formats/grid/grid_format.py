@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import write_durably, write_json
-from splatctrl_cli.formats.summary import Grid, Summary
+from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.records import DistanceGrid
 
 FORMAT = "splatctrl distance grid"
@@ -259,10 +259,8 @@ class GridSlabs:
     def __init__(
         self, folder: Path, plan: SlabPlan, num_layers: int, counts: Mapping[str, int] | None = None
     ) -> None:
-        self.folder = folder
-        self.plan = plan
-        self.num_layers = num_layers
-        self.counts = counts or {}
+        self.folder, self.plan = folder, plan
+        self.num_layers, self.counts = num_layers, counts or {}
 
     def write(self, slab: Mapping[str, NDArray[np.generic]], counts: Mapping[str, int] | None = None) -> None:
         """Put the next layers of x, ``(L, Y, Z[, 3])`` of every channel, on disk, and count them when they are there.
@@ -299,19 +297,16 @@ class GridSlabs:
                 remedy="continue the bake",
             )
         channels: dict[str, NDArray[np.generic]] = {
-            name: np.lib.format.open_memmap(self._path(name), mode="r") for name in self.plan.channels
+            name: np.lib.format.open_memmap(self.folder / f"{name}.npy", mode="r") for name in self.plan.channels
         }
         origin = np.array(self.plan.origin, np.float64)
         return DistanceGrid(origin=origin, voxel=self.plan.voxel, channels=channels, header=dict(header))
-
-    def _path(self, name: str) -> Path:
-        return self.folder / f"{name}.npy"
 
     def _shape(self, name: str, num_layers: int) -> tuple[int, ...]:
         return CHANNELS[name].shape((num_layers, *self.plan.shape[1:]))
 
     def _write_channel(self, name: str, values: NDArray[np.generic]) -> None:
-        path = self._path(name)
+        path = self.folder / f"{name}.npy"
         layer = np.dtype(CHANNELS[name].dtype).itemsize * int(np.prod(self._shape(name, 1)))
         with path.open("r+b") as stream:
             stream.seek(path.stat().st_size - layer * (self.plan.shape[0] - self.num_layers))

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.grid.grid_format import CHUNK, GridFormat, check_grid
-from splatctrl_cli.formats.summary import Summary
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import DistanceGrid, Float32, Float64
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.arrays import DAMAGE, check_numbers, has_arrays, npy_head, savez
 from splatctrl_cli.formats.grid.grid_format import (
     GridFormat,
@@ -26,7 +27,6 @@ from splatctrl_cli.formats.grid.grid_format import (
     parse_header,
     summary_of,
 )
-from splatctrl_cli.formats.summary import Summary
 from splatctrl_cli.records import DistanceGrid
 
 PLACE: Mapping[str, tuple[str, tuple[int, ...]]] = {"origin": ("<f8", (3,)), "voxel": ("<f8", ())}
@@ -71,9 +71,8 @@ def read_npz_head(path: Path) -> GridHead:
 
 def describe_npz(path: Path, head: bytes) -> Summary | None:
     """A ``field.npz``. Raises InputError for one that is damaged or of another version."""
-    if not has_arrays(path, head, {*PLACE, "header", "sdf"}):
-        return None
-    return summary_of(path, "distance grid", read_npz_head(path))
+    is_ours = has_arrays(path, head, {*PLACE, "header", "sdf"})
+    return summary_of(path, "distance grid", read_npz_head(path)) if is_ours else None
 
 
 @contextmanager
@@ -114,8 +113,7 @@ def _members(archive: zipfile.ZipFile) -> _Members:
 
 
 def _head(path: Path, archive: zipfile.ZipFile, members: _Members) -> GridHead:
-    missing = {*PLACE, "header", "sdf"} - members.keys()
-    if missing:
+    if {*PLACE, "header", "sdf"} - members.keys():
         raise InputError(
             f"{path}: expected the arrays origin, voxel, header and sdf, got {', '.join(members) or 'none'}",
             remedy="give a field.npz that sdf-bake wrote",

@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
     GridFormat,
@@ -19,7 +20,6 @@ from splatctrl_cli.formats.grid.grid_format import (
     json_value,
     x_fastest,
 )
-from splatctrl_cli.formats.summary import Summary
 from splatctrl_cli.formats.unpacking import read_bytes
 from splatctrl_cli.records import DistanceGrid
 
@@ -29,9 +29,7 @@ _TYPES = {"<f4": "float", "|u1": "uint8"}
 
 def write_nrrd(path: Path, grid: DistanceGrid, channel: str) -> None:
     """Write one channel; NaN is kept. Raises InputError for channels that a file cannot hold."""
-    shape = check_grid(grid)
-    kind = CHANNELS[channel]
-    step = repr(float(grid.voxel))
+    shape, kind, step = check_grid(grid), CHANNELS[channel], repr(float(grid.voxel))
     directions = [f"({step},0,0)", f"(0,{step},0)", f"(0,0,{step})"]
     sizes, kinds = [str(n) for n in shape], ["domain"] * 3
     if kind.components > 1:

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.arrays import DAMAGE, Pieces, has_arrays, read_arrays, savez
 from splatctrl_cli.formats.grid.grid_format import (
     CHUNK,
@@ -36,7 +37,6 @@ from splatctrl_cli.formats.grid.grid_format import (
     header_text,
     slabs,
 )
-from splatctrl_cli.formats.summary import Summary
 from splatctrl_cli.records import Bool, DistanceGrid
 
 CUROBO = "0.7"  # the version that a file is for, as it says

@@ -16,6 +16,7 @@ import numpy as np
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
     FORMAT,
@@ -26,7 +27,6 @@ from splatctrl_cli.formats.grid.grid_format import (
     json_value,
     slabs,
 )
-from splatctrl_cli.formats.summary import Grid, Summary
 from splatctrl_cli.records import DistanceGrid
 
 MAGIC = b" BDV\0\0\0\0"
@@ -44,6 +44,8 @@ def write_vdb(path: Path, grid: DistanceGrid) -> None:
     check_grid(grid)
     vdb = openvdb()
     metadata = {key: _plain(value) for key, value in file_header(grid).items()}
+    v, (x, y, z) = float(grid.voxel), (float(value) for value in grid.origin)
+    to_world = [[v, 0.0, 0.0, 0.0], [0.0, v, 0.0, 0.0], [0.0, 0.0, v, 0.0], [x, y, z, 1.0]]  # for row vectors
     grids = []
     for name, values in grid.channels.items():
         is_vector = CHANNELS[name].components == 3
@@ -54,7 +56,7 @@ def write_vdb(path: Path, grid: DistanceGrid) -> None:
             known = np.where(np.isnan(layers), np.float32(background), layers.astype(np.float32, copy=False))
             made.copyFromArray(known, ijk=(start, 0, 0))
             start += len(layers)
-        made.transform = vdb.createLinearTransform(_matrix(grid))
+        made.transform = vdb.createLinearTransform(to_world)
         made.name, made.creator = name, f"splatctrl {__version__}"
         if name in {"sdf", "hard", "se", "gpdf"}:
             made.gridClass = vdb.GridClass.LEVEL_SET
@@ -85,12 +87,6 @@ def _above(values: Any) -> float:
     """The float next above the largest value: no cell is the background."""
     largest = max((float(np.nanmax(layers)) for layers in slabs(values) if not np.isnan(layers).all()), default=0.0)
     return float(np.nextafter(np.float32(largest), np.float32(np.inf)))
-
-
-def _matrix(grid: DistanceGrid) -> list[list[float]]:
-    """Index to world, for row vectors, as OpenVDB has it."""
-    v, (x, y, z) = float(grid.voxel), (float(value) for value in grid.origin)
-    return [[v, 0.0, 0.0, 0.0], [0.0, v, 0.0, 0.0], [0.0, 0.0, v, 0.0], [x, y, z, 1.0]]
 
 
 def _plain(value: object) -> object:

@@ -17,6 +17,7 @@ from defusedxml.common import DefusedXmlException
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.grid.grid_format import (
     CHANNELS,
     FORMAT,
@@ -31,7 +32,6 @@ from splatctrl_cli.formats.grid.grid_format import (
     summary_of,
     x_fastest,
 )
-from splatctrl_cli.formats.summary import Grid, Summary
 from splatctrl_cli.records import DistanceGrid
 
 _TYPES = {"<f4": "Float32", "|u1": "UInt8"}
@@ -195,7 +195,8 @@ def describe_vti(path: Path, head: bytes) -> Summary | None:
     image = re.search(r"<ImageData\b([^>]*)>", text)
     if image is None:
         raise InputError(f"{path}: a .vti without ImageData", remedy="the file is damaged")
-    if FORMAT in _field_text(text):
+    codes = re.search(r'<Array type="String"[^>]*>([\d\s]+)</Array>', text)  # the string, written as numbers
+    if codes and FORMAT in bytes(int(code) % 256 for code in codes[1].split()).decode("utf-8", "replace"):
         return summary_of(path, "ParaView image data", read_vti_head(path))
     facts: dict[str, object] = dict(_ATTRIBUTE.findall(image[1]))
     arrays = [dict(_ATTRIBUTE.findall(attributes)) for attributes in re.findall(r"<DataArray\b([^>]*)>", text)]
@@ -205,12 +206,6 @@ def describe_vti(path: Path, head: bytes) -> Summary | None:
 
 
 _ATTRIBUTE = re.compile(r'(\w+)="([^"]*)"')
-
-
-def _field_text(text: str) -> str:
-    """The string in FieldData, which is written as numbers."""
-    codes = re.search(r'<Array type="String"[^>]*>([\d\s]+)</Array>', text)
-    return "" if codes is None else bytes(int(code) % 256 for code in codes[1].split()).decode("utf-8", "replace")
 
 
 _DOCS = """

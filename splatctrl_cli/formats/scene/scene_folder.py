@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -147,6 +147,8 @@ class SceneFolder:
     """A scene that `reconstruct` wrote."""
 
     path: Path
+    names_its_views: ClassVar[bool] = True
+    """Whether it is recorded which views trained the scene."""
 
     @cached_property
     def run(self) -> dict[str, Any]:
@@ -185,11 +187,6 @@ class SceneFolder:
     def cameras(self) -> tuple[str, ...]:
         """The cameras that trained the scene."""
         return self._metric("cameras", lambda names: tuple(map(str, names)))
-
-    @property
-    def names_its_views(self) -> bool:
-        """Whether it is recorded which views trained the scene."""
-        return True
 
     @property
     def training_stamps_ns(self) -> frozenset[int]:
@@ -331,6 +328,8 @@ def open_scene(path: Path) -> SceneFolder:
 class SplatFile(SceneFolder):
     """Splats that are rendered as they are: of any shape, with what harmonics they have, before black."""
 
+    names_its_views: ClassVar[bool] = False
+
     @cached_property
     def run(self) -> dict[str, Any]:
         """What is known of how they were made: nothing."""
@@ -340,11 +339,6 @@ class SplatFile(SceneFolder):
     def parts(self) -> Parts:
         """Of the file alone."""
         return Parts(folder=self.path.parent)
-
-    @property
-    def names_its_views(self) -> bool:
-        """False: who trained them is not recorded."""
-        return False
 
     @property
     def is_anisotropic(self) -> bool:

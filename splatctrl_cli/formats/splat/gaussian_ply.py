@@ -210,10 +210,6 @@ def _harmonics(ply: PlyFile) -> Float32:
     return np.ascontiguousarray(np.array(values).transpose(2, 1, 0))
 
 
-def _write_reference_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    write_gaussian_ply(path, without_labels(gaussians), comments)
-
-
 _DOCS = """
 `.ply`, short | 3D-GS PLY with `label` and `density`, for isotropic splats | float32 | view-dependent colour
 
@@ -223,5 +219,10 @@ _DOCS = """
 _PLY = SplatFormat(
     name="3D-GS PLY", order=0, suffix=".ply", write=write_gaussian_ply, read=read_gaussian_ply, docs=_DOCS
 )
-REFERENCE_PLY = replace(_PLY, name="3D-GS PLY, 62 properties", write=_write_reference_ply, held=without_labels)
+REFERENCE_PLY = replace(
+    _PLY,
+    name="3D-GS PLY, 62 properties",
+    write=lambda path, gaussians, comments: write_gaussian_ply(path, without_labels(gaussians), comments),
+    held=without_labels,
+)
 ENTRIES = (_PLY,)

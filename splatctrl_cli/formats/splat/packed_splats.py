@@ -38,7 +38,7 @@ from splatctrl_cli.formats.splat.splat_format import (
     without_labels,
 )
 from splatctrl_cli.formats.unpacking import FREE_BYTES, BadBlockError, read_bytes, unpacked
-from splatctrl_cli.records import Float32, Float64, GaussianSet, UInt8
+from splatctrl_cli.records import Float32, GaussianSet, UInt8
 
 ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 
@@ -143,12 +143,16 @@ def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """
     content = read_bytes(path)
     bits, (centers, opacities, colors, sigmas, quats, rest) = _columns(path, content)
+    wide = np.zeros((len(centers), 3, 4), dtype=np.uint8)
+    wide[:, :, 1:] = centers.reshape(-1, 3, 3)  # in the upper bytes: the shift back keeps the sign
+    constant = ((colors / 255.0 - 0.5) / 0.15)[:, None]
+    further = (rest / 128.0 - 1.0).reshape(len(rest), rest.shape[1] // 3, 3)
     gaussians = GaussianSet(
-        centers=_centers(centers, bits),
+        centers=np.ldexp((wide.view("<i4")[:, :, 0] >> 8).astype(np.float64), -bits).astype(np.float32),
         scales=np.exp(sigmas / 16.0 - 10.0).astype(np.float32),
         quats_wxyz=_quaternions(quats),
         opacities=(opacities[:, 0] / 255.0).astype(np.float32),
-        harmonics=_harmonics(colors, rest),
+        harmonics=np.concatenate([constant, further], axis=1).astype(np.float32),
         labels=np.zeros(len(centers), dtype=np.uint8),
     )
     check_gaussians(str(path), gaussians)
@@ -169,9 +173,8 @@ def spz_bound(gaussians: GaussianSet) -> Differences:
     Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511, 1.2e-3 together; the fourth
     follows and is at least 1/2, which at most doubles it; a rotation turns by twice that angle: 0.28 degrees.
     """
-    step = 2.0 ** -_fraction_bits(gaussians.centers)
     return Differences(
-        center=0.5001 * step,
+        center=0.5001 * (2.0 ** -_fraction_bits(gaussians.centers)),
         sigma=float(np.expm1(1 / 32)) + 1e-5,
         rotation=0.28,
         color=0.5001 * SH_C0 / COLOR_SCALE,
@@ -188,8 +191,7 @@ def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
         parts = _streams(path, content, [num * width for width in widths])
     elif start[:2] == GZIP:
         num, bits, widths, body = _unzipped(path, content)
-        ends = np.cumsum([0, *widths]) * num
-        parts = [body[i:j] for i, j in pairwise(ends)]
+        parts = [body[i:j] for i, j in pairwise(np.cumsum([0, *widths]) * num)]
     else:
         raise InputError(f"{path}: no .spz file: expected it to start as gzip or with NGSP, got {start.hex()}")
     tables = [np.frombuffer(part, np.uint8).reshape(num, w) for part, w in zip(parts, widths, strict=True)]
@@ -265,18 +267,6 @@ def _fraction_bits(centers: Float32) -> int:
     return bits
 
 
-def _centers(table: UInt8, bits: int) -> Float32:
-    wide = np.zeros((len(table), 3, 4), dtype=np.uint8)
-    wide[:, :, 1:] = table.reshape(-1, 3, 3)  # in the upper bytes: the shift back keeps the sign
-    return np.ldexp((wide.view("<i4")[:, :, 0] >> 8).astype(np.float64), -bits).astype(np.float32)
-
-
-def _harmonics(colors: UInt8, rest: UInt8) -> Float32:
-    constant = ((colors / 255.0 - 0.5) / 0.15)[:, None]
-    further = (rest / 128.0 - 1.0).reshape(len(rest), rest.shape[1] // 3, 3)
-    return np.concatenate([constant, further], axis=1).astype(np.float32)
-
-
 def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
     """(N,) little-endian words: 2 bits say which of x y z w is largest, then 10 bits (sign, size) for each other."""
     quats = np.roll(quats_wxyz.astype(np.float64), -1, axis=1)
@@ -294,28 +284,20 @@ def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
 
 def _quaternions(table: UInt8) -> Float32:
     """(N, 4) unit quaternions w x y z of three bytes (version 2) or of four (version 3)."""
-    is_version_2 = table.shape[1] == 3
-    quats = _of_three_bytes(table) if is_version_2 else _of_words(np.ascontiguousarray(table).view("<u4")[:, 0])
+    if table.shape[1] == 3:
+        xyz = table / 127.5 - 1.0
+        quats = np.column_stack([xyz, np.sqrt(np.maximum(0.0, 1.0 - (xyz**2).sum(axis=1)))])
+    else:
+        words = np.ascontiguousarray(table).view("<u4")[:, 0]
+        largest = (words >> np.uint32(30)).astype(np.intp)[:, None]
+        fields = np.stack([(words >> np.uint32(shift)) & np.uint32(0x3FF) for shift in (20, 10, 0)], axis=1)
+        others = SQRT_HALF * (fields & np.uint32(0x1FF)) / 511.0 * np.where(fields >> np.uint32(9), -1.0, 1.0)
+        quats = np.zeros((len(words), 4))
+        quats[np.arange(4) != largest] = others.ravel()
+        rest = np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(axis=1)))
+        np.put_along_axis(quats, largest, rest[:, None], axis=1)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     return np.roll(quats, 1, axis=1).astype(np.float32)
-
-
-def _of_three_bytes(table: UInt8) -> Float64:
-    xyz = table / 127.5 - 1.0
-    w = np.sqrt(np.maximum(0.0, 1.0 - (xyz**2).sum(axis=1)))
-    return np.column_stack([xyz, w])
-
-
-def _of_words(words: NDArray[np.uint32]) -> Float64:
-    largest = (words >> np.uint32(30)).astype(np.intp)
-    fields = np.stack([(words >> np.uint32(shift)) & np.uint32(0x3FF) for shift in (20, 10, 0)], axis=1)
-    others = SQRT_HALF * (fields & np.uint32(0x1FF)) / 511.0 * np.where(fields >> np.uint32(9), -1.0, 1.0)
-    quats = np.zeros((len(words), 4))
-    quats[np.arange(4) != largest[:, None]] = others.ravel()
-    np.put_along_axis(
-        quats, largest[:, None], np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(axis=1)))[:, None], axis=1
-    )
-    return quats
 
 
 _SPZ_DOCS = """

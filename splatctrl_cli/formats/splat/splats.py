@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.ply import PlyFile, read_table, write_table
 from splatctrl_cli.formats.splat.gaussian_ply import (
     RoundedError,
@@ -33,7 +34,6 @@ from splatctrl_cli.formats.splat.splat_format import (
     sigma_of_log,
     sigmoid,
 )
-from splatctrl_cli.formats.summary import Summary
 from splatctrl_cli.libraries import entries_of
 from splatctrl_cli.records import Bool, Float32, Float64, GaussianSet, Label, SplatSet
 
@@ -66,11 +66,6 @@ def as_gaussians(splats: SplatSet) -> GaussianSet:
         harmonics=coefficients.astype(np.float32)[:, None, :],
         labels=splats.labels,
     )
-
-
-def is_isotropic(gaussians: GaussianSet) -> bool:
-    """True where every Gaussian is round and looks the same from every side."""
-    return not (_is_stretched(gaussians).any() or gaussians.harmonics[:, 1:].any())
 
 
 def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
@@ -237,7 +232,8 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
     kind = _known_format(path)
     if kind is not FORMATS[".ply"]:
         gaussians, comments = kind.read(path)
-        return (as_splats(gaussians, str(path)) if is_isotropic(gaussians) else gaussians), comments
+        is_round = not (_is_stretched(gaussians).any() or gaussians.harmonics[:, 1:].any())
+        return (as_splats(gaussians, str(path)) if is_round else gaussians), comments
     ply = read_table(path, "vertex", REQUIRED)
     return _splats_or_gaussians(ply), ply.pairs()
 

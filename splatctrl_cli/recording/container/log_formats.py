@@ -18,7 +18,7 @@ import yaml
 import zstandard
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.formats.summary import names_in
+from splatctrl_cli.files.summary import names_in
 from splatctrl_cli.formats.unpacking import (
     FREE_BYTES,
     MAX_BLOCK,

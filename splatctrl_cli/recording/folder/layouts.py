@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.formats.summary import names_in
+from splatctrl_cli.files.summary import names_in
 from splatctrl_cli.libraries import entries_of
 from splatctrl_cli.recording.capture.capture_writer import check_not_partial
 from splatctrl_cli.recording.container.log_formats import SUFFIXES, is_bag_folder
