@@ -1,7 +1,9 @@
 """What each mechanism is worth: a recording with it off, and the table of what that changes."""
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,9 +22,11 @@ from experiments.ablation import (
     sections,
 )
 from experiments.problems import ProblemRequest
+from splatctrl_cli.blocks import RecordingOptions, SimulateRequest
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import Stopwatch
+from tests.conftest import ROOT
 
 GOOD = Measured(
     environment=TABLE, number=0, method=ALL, psnr=25.0, depth=0.005, in_front=0.05, splats=4900, fit_s=6.0,
@@ -74,6 +78,12 @@ def test_the_problems_are_drawn_and_still() -> None:
 
 @pytest.mark.usefixtures("fast", "without_plots")
 def test_a_recording_goes_through_the_mechanisms_that_it_can_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    def copied(request: SimulateRequest) -> None:
+        """The scan that a simulation writes, whatever its size."""
+        assert request.dtu
+        shutil.copytree(ROOT / "sample_data" / "dtu", request.out / "dtu")
+
+    monkeypatch.setattr(ablation, "simulate", copied)
     rows = list(measured(asked("scan-0001", [ALL, "scale", "second-look"], 48), Config(), Stopwatch()))
     assert [row.method for row in rows] == [ALL, "scale"] and all(row.number == 1 for row in rows)
     assert all(row.psnr is not None and row.psnr > 8 and row.audit == "" for row in rows)
@@ -88,7 +98,10 @@ def test_a_recording_goes_through_the_mechanisms_that_it_can_show(monkeypatch: p
 
 
 @pytest.mark.usefixtures("fast", "without_plots", "coverage_once")
-def test_a_map_serves_all_that_changes_the_motion_alone() -> None:
+def test_a_map_serves_all_that_changes_the_motion_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        ablation, "RecordingOptions", partial(RecordingOptions, duration_s=2.0, fps=4.0, color_rays=0)
+    )
     methods = [ALL, "distance-rate"]
     whole, without = measured(asked("table-0003", methods, 64), Config(), Stopwatch())
     assert (whole.method, without.method) == (ALL, "distance-rate") and "distance-rate" in OF_MOTION
