@@ -128,7 +128,6 @@ def test_what_may_pass_is_tried_again_and_nothing_else(tmp_path: Path) -> None:
 PROGRAM = """
 import sys
 from pathlib import Path
-from tests.jobs.bake.baked import Said
 from tests.jobs.batch.desk import batch_of, node
 folder = Path(sys.argv[1])
 words = ("tell", "{0}/begun{1}", "sleep", "0.1", "tell", "{0}/told{1}")
