@@ -26,7 +26,7 @@ from splatctrl_cli.formats.grid.grid_formats import FORMATS as GRID_FORMATS
 from splatctrl_cli.formats.splat.splat_format import SplatFormat
 from splatctrl_cli.formats.splat.splats import FORMATS as SPLAT_FORMATS
 from splatctrl_cli.jobs.compare.judged_runs import scales
-from splatctrl_cli.jobs.replay.criteria_input import Judged
+from splatctrl_cli.jobs.replay.criteria import Judged
 from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS, PROOF, Limit
 from splatctrl_cli.jobs.replay.verdict import CRITERIA
 from splatctrl_cli.recording.folder.layout import Layout

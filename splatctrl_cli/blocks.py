@@ -40,13 +40,15 @@ from splatctrl_cli.geometry import (
     transform_points,
     turn_about_z,
 )
-from splatctrl_cli.jobs.replay.criteria_input import Judged
-from splatctrl_cli.jobs.replay.detours import ROUNDING, Certified, certified_distance
+from splatctrl_cli.jobs.replay.criteria import Judged
 from splatctrl_cli.jobs.replay.goal import checked_pose, goal_waypoints
 from splatctrl_cli.jobs.replay.inputs import LoggedStates, MeasuredRobot, measured_robot
 from splatctrl_cli.jobs.replay.known_scene import (
+    ROUNDING,
+    Certified,
     KnownFields,
     KnownScene,
+    certified_distance,
     fields_at,
     known_space,
     seen_of,

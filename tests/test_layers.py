@@ -20,7 +20,19 @@ ROOMS = [  # a room imports those of the rows above its own
     ["cli"],
 ]
 INSIDE = {  # of a room, its folders and the modules beside them, likewise
-    "formats": [["summary", "unpacking", "mesh"], ["arrays", "image_file", "ply"], ["splat", "grid"], ["scene"]],
+    "jobs": [
+        ["running"],
+        ["robot", "batch", "simulate", "ingest", "settings"],
+        ["check", "runs"],
+        ["calibrate", "recordings", "bake", "sweep"],
+        ["reconstruct", "query"],
+        ["score", "replay"],
+        ["compare"],
+        ["report"],
+        ["export"],
+        ["demo"],
+    ],
+    "formats": [["unpacking", "mesh"], ["arrays", "image_file", "ply"], ["splat", "grid"], ["scene"]],
     "recording": [
         ["source_options"],
         ["container"],

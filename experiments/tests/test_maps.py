@@ -14,7 +14,7 @@ from experiments.trial import Rig
 from experiments.ways import Way, Ways
 from splatctrl_cli.config import Config
 from splatctrl_cli.files.output import Stopwatch
-from splatctrl_cli.jobs.replay.detours import Certified
+from splatctrl_cli.jobs.replay.known_scene import Certified
 from splatctrl_cli.records import SplatSet
 from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.scene.self_mask import self_mask

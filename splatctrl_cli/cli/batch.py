@@ -17,13 +17,11 @@ from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import publish
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.jobs.batch.batch import (
     BatchRequest,
     BatchResult,
     batch,
     dry_run,
-    node_document,
     planned,
     suites_of,
 )
@@ -32,15 +30,9 @@ from splatctrl_cli.jobs.batch.ledger import NAME, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batch.run import DONE, FAILED, told
 from splatctrl_cli.jobs.batch.suite import Table
 
-PRELOADED = (
-    "check",
-    "ingest",
-    "reconstructions.reconstruct",
-    "export",
-    "bakes.bake",
-    "scores.score",
-    "replay",
-)  # of a runner
+PRELOADED = (  # of a runner
+    *("check", "ingest", "reconstruct.reconstruct", "export.export", "bake.bake", "score.score", "replay.replay"),
+)
 MOST_ROWS = 40  # recordings that are all printed
 OWN = ("out", "force", "resume", "threads")  # options that a batch gives itself, where a command has them
 NOT_OF_A_NODE = (*OWN, "help", "help-all", "json", "verbose", "quiet", "junit", "preset")  # the last is in --set
@@ -67,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         "out": str(result.out),
         "suite": result.suite,
         "kept": result.num_kept,
-        "nodes": [node_document(run) for run in result.runs],
+        "nodes": [run.document() for run in result.runs],
     }
     code = console.concluded(result.verdict, printed, _lines(result, is_long=args.verbose > 0))
     publish(suites_of(result), junit=args.junit, is_fatal=code != 0)
@@ -180,7 +172,7 @@ def _text(value: Any) -> str:
 
 def _lines(result: BatchResult, *, is_long: bool) -> Iterator[str]:
     """A row for each recording, a column for each job and variant; of many recordings those not as expected."""
-    runs = {(run.recording, run.node.removeprefix(f"{run.recording}/")): run for run in result.runs}
+    runs = {(run.recording, run.column): run for run in result.runs}
     columns = columns_of(((run.job, column) for (_, column), run in runs.items()), result.jobs)
     recordings = list(dict.fromkeys(recording for recording, _ in runs))
     odd = {run.recording for run in result.runs if run.state != DONE}
@@ -196,7 +188,7 @@ def _lines(result: BatchResult, *, is_long: bool) -> Iterator[str]:
 def _cell(run: Run | None) -> str:
     if run is None:
         return "-"
-    word = (run.label or run.state) + damage_mark(run.sentence, run.exit_code)
+    word = (run.label or run.state) + run.damage
     return word if run.state == DONE else f"{word.upper()} !" if run.state == FAILED else run.state.upper()
 
 
@@ -218,4 +210,4 @@ def _listed(console: Console, args: argparse.Namespace, request: BatchRequest, c
         console.log(f"wrote {len(runs)} runs to {args.csv}")
     rows = [(run.node, run.state, told(run), f"{run.peak_mb:.0f}", run.log) for run in runs]
     lines = table(("node", "state", "outcome", "MB", "log"), rows) if rows else ["no such runs"]
-    return console.result({"nodes": [node_document(run) for run in runs]}, lines)
+    return console.result({"nodes": [run.document() for run in runs]}, lines)

@@ -10,8 +10,7 @@ from splatctrl_cli.config import load_config
 from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.jobs.replay.files import chunks_of, when_and_why
 from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
-from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.replay.result import Replay
+from splatctrl_cli.jobs.replay.request import Replay, ReplayRequest
 
 HEADLINE = (
     *("min_clearance", "min_clearance_certified", "min_clearance_true", "min_self_clearance", "min_limit_margin"),

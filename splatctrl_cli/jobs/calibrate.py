@@ -16,7 +16,7 @@ from splatctrl_cli.calibration.solution import Solution, solved
 from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.files.output import output_path
+from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.jobs.check import posed_robot
 from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
@@ -98,17 +98,13 @@ class CalibrateResult:
                     "sigma_deg": round(change.sigma_rotation, 4),
                     "depth_scale": change.scale,
                     "depth_bias_mm": round(1e3 * change.bias, 3),
-                    "depth_bias_noticed_mm": _finite_mm(change.bias_noticed),
+                    "depth_bias_noticed_mm": finite(round(1e3 * change.bias_noticed, 3)),
                     "held": change.is_held,
                     "unobserved": list(change.unobserved),
                 }
                 for change in self.changes
             },
         }
-
-
-def _finite_mm(metres: float) -> float | None:
-    return round(1e3 * metres, 3) if np.isfinite(metres) else None
 
 
 def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> CalibrateResult:
@@ -133,7 +129,14 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
     with output_path(out, force=request.force, is_folder=False) as partial:
         frames, sightings = _frames(source, request.board, progress)
         if arm is not None:
-            _check_travel(arm, frames)
+            travel = arm.travel(sorted({frame.stamp_ns for frame in frames}))
+            if travel < fixed.CALIBRATION_TRAVEL:  # whose one posture any wrong model explains
+                raise NotEvaluableError(
+                    f"calibrate: the robot hardly moves: {1e3 * travel:.0f} mm at most (expected"
+                    f" {1e3 * fixed.CALIBRATION_TRAVEL:.0f})",
+                    remedy="record it moving through the space that the cameras see, or leave --urdf out to place the"
+                    " cameras against each other",
+                )
         cameras, moving = sorted({frame.camera for frame in frames}), moving_cameras(frames)
         held = _held(request, cameras, has_anchor=arm is not None or bool(moving))
         begin = {camera: np.eye(4) for camera in cameras}
@@ -251,18 +254,6 @@ def depth_frame(stored: StoredFrame) -> RgbdFrame:
         intrinsics=stored.intrinsics,
         T_world_camera=stored.T_world_camera,
     )
-
-
-def _check_travel(arm: Arm, frames: Sequence[RgbdFrame]) -> None:
-    """Raise NotEvaluableError for a robot that hardly moves, whose one posture any wrong model explains."""
-    travel = arm.travel(sorted({frame.stamp_ns for frame in frames}))
-    if travel < fixed.CALIBRATION_TRAVEL:
-        raise NotEvaluableError(
-            f"calibrate: the robot hardly moves: {1e3 * travel:.0f} mm at most (expected"
-            f" {1e3 * fixed.CALIBRATION_TRAVEL:.0f})",
-            remedy="record it moving through the space that the cameras see, or leave --urdf out to place the cameras"
-            " against each other",
-        )
 
 
 def _held(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.formats.splat.splats import write_ply
-from splatctrl_cli.jobs.query.point_answers import TITLES
+from splatctrl_cli.jobs.query.query import TITLES
 from tests.cli import here
 from tests.cli.replay_desk import BALL, splats_of
 from tests.cli.test_command_line import splatctrl

@@ -18,7 +18,7 @@ from splatctrl_cli.formats.grid import grid_formats
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.formats.splat.splats import FORMATS, write_ply
-from splatctrl_cli.jobs.bake.bake import SUMMARY_METRICS
+from splatctrl_cli.jobs.bake.accuracy import SUMMARY_METRICS
 from splatctrl_cli.simulate.truth import load_truth
 from tests.cli import here
 from tests.cli.test_command_line import splatctrl

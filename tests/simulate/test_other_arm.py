@@ -11,7 +11,7 @@ from experiments.shared_workspace import scene_of
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.jobs.simulate.simulated_arm import adapted_motion
+from splatctrl_cli.jobs.simulate.simulate import adapted_motion
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel

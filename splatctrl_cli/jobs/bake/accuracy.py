@@ -1,6 +1,6 @@
-"""A baked field beside a truth, a mesh, and the depth of cameras that did not train the scene."""
+"""What a baked field comes to: its report and verdict, beside a truth, a mesh, and depth that trained nothing."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config.fixed import COMPARED_CELLS
+from splatctrl_cli.config.fixed import COMPARED_CELLS, FAR_GRID
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.field_accuracy import (
     MeshComparison,
@@ -18,16 +18,29 @@ from splatctrl_cli.evaluate.field_accuracy import (
     compare_with_truth,
     median_radius,
 )
+from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.held_out_depth import HeldOutComparison, compare_with_held_out_depth, counted_pixels
+from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS, LENGTH
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
 from splatctrl_cli.field.clustered_splats import Spheres
+from splatctrl_cli.field.distance import KERNEL_OF
+from splatctrl_cli.field.grid_cells import LOSS
 from splatctrl_cli.field.grid_field import exact_channel
+from splatctrl_cli.field.incremental import Changes
 from splatctrl_cli.field.probability import probabilities
+from splatctrl_cli.field.report import GridStatistics
 from splatctrl_cli.jobs.bake.request import BakeRequest, BakeSource
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import DistanceGrid, Float64, JointState, RecordSource, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
 
+SUMMARY_METRICS = {
+    **dict.fromkeys(("num_splats", "num_splats_left_out", "num_cells"), DESCRIBES),
+    **dict.fromkeys(("voxel", "length_scale", "median_radius", "median_spacing"), LENGTH),
+    **dict.fromkeys(("never_seen_share", "over_estimating_share"), BAD_SHARE),
+    "num_warnings": FAULTS,
+}  # and how two runs are compared by them
 POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 
 
@@ -162,3 +175,115 @@ def _held_out_cameras(
     if not chosen:
         raise UsageError(f"--held-out: every camera of {log} trained the scene", remedy="give another log")
     return chosen
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldReport:
+    """A baked grid with its statistics, and what an update changed."""
+
+    grid: DistanceGrid
+    statistics: GridStatistics
+    changes: Changes | None = None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Those on the splats' health, and on a box that no splat is near."""
+        health, lowest = self.grid.header["health"], self.statistics.lowest
+        assert isinstance(health, dict)
+        if lowest is None or lowest <= FAR_GRID:
+            return tuple(health["warnings"])
+        far = f"the box holds no splat: the nearest is {lowest:.3g} m from every cell; check --box"
+        return (*health["warnings"], far)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as written to ``field.json``: the grid's header and place first."""
+        grid, changes, update = self.grid, self.changes, {}
+        if changes is not None:
+            why = {"why_all": changes.reason} if changes.reason else {}
+            update = {"update": {"blocks_baked": changes.num_baked, "blocks": changes.num_blocks, **why}}
+        return {
+            **grid.header,
+            "shape": grid.channels["sdf"].shape,
+            "first_cell": grid.origin,
+            "voxel": grid.voxel,
+            "channels": list(grid.channels),
+            "statistics": self.statistics.as_dict(),
+            "warnings": self.warnings,
+            **update,
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """What is printed, and what --json has beside the accuracy."""
+        header: Mapping[str, Any] = self.grid.header
+        num_used, health = sum(header["splats_used"].values()), header["health"]
+        # cells where the kernel field of sdf, alone, exceeds the exact distance
+        over = header["kernel_counts"].get(f"{KERNEL_OF[header['distance']]}_over_estimates")
+        summary = {
+            "num_splats": num_used,
+            "num_splats_left_out": sum(header["splats_given"].values()) - num_used,
+            "shape": list(self.grid.channels["sdf"].shape),
+            "num_cells": self.statistics.num_cells,
+            "voxel": self.grid.voxel,
+            "distance": header["distance"],
+            "length_scale": header["length_scale"],
+            "median_radius": health["radius"],
+            "median_spacing": health["spacing"],
+            "never_seen_share": self.statistics.never_seen_share,
+            "over_estimating_share": None if over is None else over / self.statistics.num_cells,
+            "num_warnings": len(self.warnings),
+        }
+        if self.changes is not None:
+            summary["blocks_baked"] = f"{self.changes.num_baked} of {self.changes.num_blocks}"
+        return summary
+
+
+def metrics_of(summary: Mapping[str, Any], accuracy: Accuracy) -> dict[str, float | None]:
+    """Numbers a gate can name: those of the summary, ``seen.hard.0_2cm.rmse`` and so on, ``over_estimate.*``."""
+    of_truth = {} if accuracy.truth is None else accuracy.truth.accuracy.figures()
+    return {name: summary[name] for name in SUMMARY_METRICS} | of_truth
+
+
+def counts_of(metrics: Mapping[str, float | None]) -> dict[str, int]:
+    """The cells that each of the metrics rests on: those of its band or of the over-estimate, else all."""
+    of_bands = {name: f"{name.rpartition('.')[0]}.count" for name in metrics if not name.endswith(".count")}
+    counted = {name: of_bands[name] if of_bands.get(name) in metrics else "num_cells" for name in metrics}
+    return {name: int(metrics[count] or 0) for name, count in counted.items()}
+
+
+def bake_verdict(
+    request: BakeRequest, report: FieldReport, metrics: Mapping[str, float | None], *, has_occupancy: bool
+) -> Verdict:
+    """What cells may lose [m], that a camera saw some of them where that is known, and each ``--require``."""
+    statistics, voxel = report.statistics, report.grid.voxel
+    num_cells, loss = statistics.num_cells, LOSS * voxel
+    reasons = [
+        Reason(
+            criterion="loss",
+            outcome=Outcome.PASSED,
+            sentence=f"cells read at most {1e3 * loss:.1f} mm too little of the distance to the splats",
+            value=loss,
+            threshold=request.config.field.max_loss,
+            unit="m",
+            count=num_cells,
+        )
+    ]
+    if has_occupancy and statistics.never_seen_share == 1:
+        reasons.append(
+            Reason(
+                criterion="known space",
+                outcome=Outcome.NOT_EVALUABLE,
+                sentence="no cell of the grid was ever seen by a camera",
+                value=1.0,
+                threshold=1.0,
+                remedy="give a --box that the cameras saw",
+                count=num_cells,
+            )
+        )
+    reasons += [noted("field", text) for text in report.warnings]
+    shape, counts = report.grid.channels["sdf"].shape, counts_of(metrics)
+    return verdict_of(
+        "sdf-bake",
+        [*reasons, *gate_reasons(request.require, metrics, counts)],
+        scope=f"{' x '.join(map(str, shape))} cells of {voxel:g} m, {metrics['num_splats']} splats",
+        counts=counts,
+    )

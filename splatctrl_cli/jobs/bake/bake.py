@@ -1,31 +1,38 @@
-"""A bake from its request to its result: a scene's splats as a distance grid, compared with what is known of it."""
+"""A bake from its request to its result: a scene's splats as a distance grid, slab by slab onto the disk."""
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
-from splatctrl_cli.config.fixed import FAR_GRID
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
-from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
-from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS, LENGTH
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, brief, noted, verdict_of
+from splatctrl_cli.evaluate.gates import check_gate_names
+from splatctrl_cli.evaluate.verdict import Verdict, brief
 from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker
-from splatctrl_cli.field.distance import KERNEL_OF
-from splatctrl_cli.field.grid_cells import LOSS, GridLayout, check_loss
+from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
 from splatctrl_cli.field.header import field_header
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
 from splatctrl_cli.field.obstacles import ObstacleSpheres, obstacle_spheres
-from splatctrl_cli.field.report import GridStatistics, grid_statistics
-from splatctrl_cli.field.slabs import Kept, UnknownSpace, slabs
+from splatctrl_cli.field.report import grid_statistics
+from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_json, write_run
-from splatctrl_cli.formats.grid.grid_formats import check_formats, write_grid
-from splatctrl_cli.jobs.bake.accuracy import Accuracy, accuracy_of, check_references
+from splatctrl_cli.formats.grid.grid_format import GridSlabs, SlabPlan, resume_slabs, start_slabs
+from splatctrl_cli.formats.grid.grid_formats import FORMATS, check_formats, write_grid
+from splatctrl_cli.jobs.bake.accuracy import (
+    SUMMARY_METRICS,
+    Accuracy,
+    FieldReport,
+    accuracy_of,
+    bake_verdict,
+    check_references,
+    metrics_of,
+)
 from splatctrl_cli.jobs.bake.request import (
     BakeRequest,
     BakeSource,
@@ -36,21 +43,99 @@ from splatctrl_cli.jobs.bake.request import (
     read_bake_source,
     read_previous,
 )
-from splatctrl_cli.jobs.bake.slabs import CHECKPOINT, FOLDER, BakeTask, bake_to_disk, clear_leftovers
 from splatctrl_cli.jobs.running.device import Device, named
-from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
 from splatctrl_cli.jobs.running.resume import deciding_versions, told_how_to_go_on
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
 from splatctrl_cli.report.reliability import reliability_picture
 
-SUMMARY_METRICS = {
-    **dict.fromkeys(("num_splats", "num_splats_left_out", "num_cells"), DESCRIBES),
-    **dict.fromkeys(("voxel", "length_scale", "median_radius", "median_spacing"), LENGTH),
-    **dict.fromkeys(("never_seen_share", "over_estimating_share"), BAD_SHARE),
-    "num_warnings": FAULTS,
-}  # and how two runs are compared by them
+FOLDER = "channels"
+CHECKPOINT = f"{FOLDER}/progress.json"
+VDB_COPIES = 7  # of the channels, in memory: 454 MiB were measured for one of 64 MiB
+
+
+def bake_to_disk(
+    job: "_Job", kept: Kept | None, unknown: UnknownSpace | None, partial: Path, progress: Progress
+) -> GridSlabs:
+    """The channels in ``partial/channels``; the baker's counts are then those of all that was baked.
+
+    kept: what an update keeps; unknown: what is done with unknown space. With --resume it goes on after the last slab
+    that an interrupted bake of the same settings left. Raises UsageError for one of other settings, and where the
+    disk or the memory has no room.
+    """
+    baker, request, folder = job.baker, job.request, partial / FOLDER
+    layout, config = baker.layout, request.config
+    check_slab_memory(layout, baker.channels)
+    plan = SlabPlan(
+        origin=(float(layout.origin[0]), float(layout.origin[1]), float(layout.origin[2])),
+        voxel=layout.voxel,
+        shape=layout.shape,
+        channels=baker.channels,
+        settings={  # everything that decides the bytes beside the grid and its channels
+            **deciding_versions(),
+            **{f"field.{name}": value for name, value in asdict(config.field).items()},
+            **{f"occupancy.{name}": value for name, value in asdict(config.occupancy).items()},
+            **{f"sha256 of {name}": value for name, value in job.digests.items()},
+            "labels": ",".join(request.label_names),
+            **({} if job.device.card is None else {"card": job.device.card.name}),
+        },
+    )
+    if not (folder / "progress.json").is_file():
+        check_disk(partial, layout, baker.channels, request.formats)
+        check_vdb(layout, baker.channels, request.formats)
+    store = resume_slabs(folder, plan) if request.resume else start_slabs(folder, plan)
+    if store.num_layers:
+        progress.log(f"{partial}: continues after {store.num_layers} of {layout.shape[0]} planes")
+        baker.counts = {name: store.counts[name] for name in baker.counts}
+        if unknown is not None:
+            unknown.num_never_seen, unknown.num_changed = store.counts["never_seen"], store.counts["changed"]
+    wait = Wait(progress, "bakes", "planes", layout.shape[0])
+    hidden = True if progress.is_quiet else None
+    with tqdm(total=layout.shape[0], initial=store.num_layers, unit=" planes", disable=hidden) as bar:
+        for first, last in slabs(layout, baker.channels, store.num_layers):
+            planes = baked_planes(baker, first, last, kept)
+            counts = baker.counts
+            if unknown is not None:
+                planes = unknown.apply(planes, first, last, baker.bound_margin)
+                counts = {**counts, "never_seen": unknown.num_never_seen, "changed": unknown.num_changed}
+            store.write(planes, counts)
+            bar.update(last - first)
+            if bar.disable:
+                wait.at(last)
+    return store
+
+
+def clear_leftovers(partial: Path) -> None:
+    """Remove what an interrupted run had written beside the channels: all of it is written again."""
+    for path in partial.iterdir():
+        if path.name != FOLDER:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
+    """Raise UsageError where the channels and the files made of them do not fit the disk."""
+    per_cell = bytes_per_cell(channels)
+    copies = sum(FORMATS[name].size_per_cell(per_cell) for name in formats)
+    needed = (per_cell + copies) * layout.num_cells + (1 << 26)  # bytes for what is small
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        size = " x ".join(str(n) for n in layout.shape)
+        raise UsageError(
+            f"grid of {size} cells: needs {needed / 2**30:.1f} GiB of disk ({needed} bytes), "
+            f"{free / 2**30:.1f} GiB ({free} bytes) is free at {folder.parent}",
+            remedy="give a larger --voxel, a smaller --box, fewer --channels or --formats, or another --out",
+        )
+
+
+def check_vdb(layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
+    """Raise UsageError where OpenVDB is asked for and cannot hold the grid in memory, as its library does."""
+    if "vdb" in formats:
+        remedy = "leave it out of --formats (nrrd needs no memory), or give a larger --voxel or fewer --channels"
+        check_room("format vdb:", VDB_COPIES * bytes_per_cell(channels) * layout.num_cells, remedy)
+
+
 EXACT = frozenset({"bound", "hard"})
 
 
@@ -107,7 +192,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
                 _draw(partial / "report", report, accuracy, _middle(job))
         summary = report.summary()
         metrics = metrics_of(summary, accuracy)
-        verdict = _verdict(request, report, metrics, has_occupancy=job.source.occupancy is not None)
+        verdict = bake_verdict(request, report, metrics, has_occupancy=job.source.occupancy is not None)
         shutil.rmtree(partial / FOLDER)
         write_run(
             partial,
@@ -228,8 +313,7 @@ def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, 
     unknown = None
     if config.field.unknown != "free":
         unknown = UnknownSpace(baker.layout, config.field, source.occupancy, config.occupancy)
-    task = BakeTask(baker=baker, settings=_settings(job), kept=kept, unknown=unknown, formats=job.request.formats)
-    store = bake_to_disk(task, partial, progress, resume=job.request.resume)
+    store = bake_to_disk(job, kept, unknown, partial, progress)
     if kept is not None and old is not None and previous is not None:
         counts: Any = previous.grid.header["kernel_counts"]
         baker.counts = counts_after(counts, old, baker, kept.mask, list(slabs(baker.layout, baker.channels)))
@@ -244,131 +328,6 @@ def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, 
     treated = {} if unknown is None else unknown.header()
     made = {"digests": source.digests, "stamp_ns": source.stamp_ns, "made_from": source.made_from}
     return store.grid({**header, **treated, **made}), changes
-
-
-def _settings(job: _Job) -> dict[str, Any]:
-    """Everything that decides the bytes beside the grid and its channels."""
-    config = job.request.config
-    return {
-        **deciding_versions(),
-        **{f"field.{name}": value for name, value in asdict(config.field).items()},
-        **{f"occupancy.{name}": value for name, value in asdict(config.occupancy).items()},
-        **{f"sha256 of {name}": value for name, value in job.digests.items()},
-        "labels": ",".join(job.request.label_names),
-        **({} if job.device.card is None else {"card": job.device.card.name}),
-    }
-
-
-@dataclass(frozen=True, kw_only=True)
-class FieldReport:
-    """A baked grid with its statistics, and what an update changed."""
-
-    grid: DistanceGrid
-    statistics: GridStatistics
-    changes: Changes | None = None
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Those on the splats' health, and on a box that no splat is near."""
-        health, lowest = self.grid.header["health"], self.statistics.lowest
-        assert isinstance(health, dict)
-        if lowest is None or lowest <= FAR_GRID:
-            return tuple(health["warnings"])
-        far = f"the box holds no splat: the nearest is {lowest:.3g} m from every cell; check --box"
-        return (*health["warnings"], far)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, as written to ``field.json``: the grid's header and place first."""
-        grid, changes, update = self.grid, self.changes, {}
-        if changes is not None:
-            why = {"why_all": changes.reason} if changes.reason else {}
-            update = {"update": {"blocks_baked": changes.num_baked, "blocks": changes.num_blocks, **why}}
-        return {
-            **grid.header,
-            "shape": grid.channels["sdf"].shape,
-            "first_cell": grid.origin,
-            "voxel": grid.voxel,
-            "channels": list(grid.channels),
-            "statistics": self.statistics.as_dict(),
-            "warnings": self.warnings,
-            **update,
-        }
-
-    def summary(self) -> dict[str, Any]:
-        """What is printed, and what --json has beside the accuracy."""
-        header: Mapping[str, Any] = self.grid.header
-        num_used, health = sum(header["splats_used"].values()), header["health"]
-        # cells where the kernel field of sdf, alone, exceeds the exact distance
-        over = header["kernel_counts"].get(f"{KERNEL_OF[header['distance']]}_over_estimates")
-        summary = {
-            "num_splats": num_used,
-            "num_splats_left_out": sum(header["splats_given"].values()) - num_used,
-            "shape": list(self.grid.channels["sdf"].shape),
-            "num_cells": self.statistics.num_cells,
-            "voxel": self.grid.voxel,
-            "distance": header["distance"],
-            "length_scale": header["length_scale"],
-            "median_radius": health["radius"],
-            "median_spacing": health["spacing"],
-            "never_seen_share": self.statistics.never_seen_share,
-            "over_estimating_share": None if over is None else over / self.statistics.num_cells,
-            "num_warnings": len(self.warnings),
-        }
-        if self.changes is not None:
-            summary["blocks_baked"] = f"{self.changes.num_baked} of {self.changes.num_blocks}"
-        return summary
-
-
-def metrics_of(summary: Mapping[str, Any], accuracy: Accuracy) -> dict[str, float | None]:
-    """Numbers a gate can name: those of the summary, ``seen.hard.0_2cm.rmse`` and so on, ``over_estimate.*``."""
-    of_truth = {} if accuracy.truth is None else accuracy.truth.accuracy.figures()
-    return {name: summary[name] for name in SUMMARY_METRICS} | of_truth
-
-
-def counts_of(metrics: Mapping[str, float | None]) -> dict[str, int]:
-    """The cells that each of the metrics rests on: those of its band or of the over-estimate, else all."""
-    of_bands = {name: f"{name.rpartition('.')[0]}.count" for name in metrics if not name.endswith(".count")}
-    counted = {name: of_bands[name] if of_bands.get(name) in metrics else "num_cells" for name in metrics}
-    return {name: int(metrics[count] or 0) for name, count in counted.items()}
-
-
-def _verdict(
-    request: BakeRequest, report: FieldReport, metrics: Mapping[str, float | None], *, has_occupancy: bool
-) -> Verdict:
-    """What cells may lose [m], that a camera saw some of them where that is known, and each ``--require``."""
-    statistics, voxel = report.statistics, report.grid.voxel
-    num_cells, loss = statistics.num_cells, LOSS * voxel
-    reasons = [
-        Reason(
-            criterion="loss",
-            outcome=Outcome.PASSED,
-            sentence=f"cells read at most {1e3 * loss:.1f} mm too little of the distance to the splats",
-            value=loss,
-            threshold=request.config.field.max_loss,
-            unit="m",
-            count=num_cells,
-        )
-    ]
-    if has_occupancy and statistics.never_seen_share == 1:
-        reasons.append(
-            Reason(
-                criterion="known space",
-                outcome=Outcome.NOT_EVALUABLE,
-                sentence="no cell of the grid was ever seen by a camera",
-                value=1.0,
-                threshold=1.0,
-                remedy="give a --box that the cameras saw",
-                count=num_cells,
-            )
-        )
-    reasons += [noted("field", text) for text in report.warnings]
-    shape, counts = report.grid.channels["sdf"].shape, counts_of(metrics)
-    return verdict_of(
-        "sdf-bake",
-        [*reasons, *gate_reasons(request.require, metrics, counts)],
-        scope=f"{' x '.join(map(str, shape))} cells of {voxel:g} m, {metrics['num_splats']} splats",
-        counts=counts,
-    )
 
 
 def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence[float]) -> None:

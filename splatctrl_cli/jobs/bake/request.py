@@ -1,6 +1,5 @@
 """What a bake is asked for, and what it reads: the scene, and for an update the field baked before."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +20,7 @@ from splatctrl_cli.formats.scene.scene_folder import SceneFolder, Snapshot, open
 from splatctrl_cli.formats.splat.splats import read_spheres
 from splatctrl_cli.jobs.running.device import CUDA, TO_CPU, Device, RunOptions, chosen
 from splatctrl_cli.jobs.running.progress import Progress
+from splatctrl_cli.jobs.runs.run_folder import read_object
 from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import Balls, OccupancyGrid
@@ -115,12 +115,16 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
         then = scene.snapshot_at(wanted_ns)
         files = [then.path, then.occupancy_path]
     occupancy = final if wanted_ns is None else then.occupancy()
+    lower = (
+        final.origin + 0.5 * final.voxel
+    )  # less a voxel at every border: a surface there may have splats beyond it
+    upper = lower + final.voxel * (np.array(final.log_odds.shape) - 2)
     return BakeSource(
         splats=then.splats(),
         occupancy=occupancy,
         unrepresented=scene.unrepresented_at(wanted_ns),
         stamp_ns=then.stamp_ns,
-        workspace=_workspace(final),
+        workspace=Box(lower=lower, upper=upper),
         cameras=scene.cameras,
         made_from=scene.made_from,
         digests={file.name: sha256(file) for file in (files if occupancy is not None else files[:1])},
@@ -155,7 +159,12 @@ def read_previous(path: Path, scene: Path) -> Previous:
     file = path / "field.npz"
     if file.is_file():
         check_room(f"--update: {file}", file.stat().st_size, "bake without --update, which needs less")
-    run = _run_of(path)
+    try:
+        run = read_object(path / "run.json")
+    except InputError:
+        raise InputError(
+            f"--update {path}: has no readable run.json", remedy="bake it once without --update"
+        ) from None
     grid = read_npz(Parts.of_run(path, run).checked(file))
     is_ours = run.get("command") == "sdf-bake" and run.get("splatctrl") == __version__
     if not is_ours or "unrepresented_voxels" not in grid.header:
@@ -192,16 +201,6 @@ def check_same(
         )
 
 
-def _run_of(folder: Path) -> dict[str, Any]:
-    try:
-        run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        run = None
-    if not isinstance(run, dict):
-        raise InputError(f"--update {folder}: has no readable run.json", remedy="bake it once without --update")
-    return run
-
-
 def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
     """The splats of `scene` at the grid's time. Raises UsageError, beginning with `where`, where they are not those
     that it was baked from.
@@ -220,13 +219,6 @@ def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
             remedy=f"give the scene that it was baked from as {option}",
         )
     return source
-
-
-def _workspace(occupancy: OccupancyGrid) -> Box:
-    """The box of the occupancy grid, less a voxel at every border (a surface there may have splats beyond it)."""
-    num_voxels = np.array(occupancy.log_odds.shape)
-    lower = occupancy.origin + 0.5 * occupancy.voxel
-    return Box(lower=lower, upper=lower + occupancy.voxel * (num_voxels - 2))
 
 
 def covered(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:

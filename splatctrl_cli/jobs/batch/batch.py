@@ -1,20 +1,20 @@
 """A batch from its request to its verdict: read the suite, run its graph, write batch.json."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import DAMAGED, InputError, UsageError
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, damage_mark, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, verdict_of
 from splatctrl_cli.files.output import MARKERS, write_durably, write_json
 from splatctrl_cli.jobs.batch.graph import COMMANDS, CommandLine, Node, nodes_of, of_shard
-from splatctrl_cli.jobs.batch.ledger import Ledger, Run, keys_of
+from splatctrl_cli.jobs.batch.ledger import FILE, FILE_VERSION, FORMAT, Ledger, Run, keys_of
 from splatctrl_cli.jobs.batch.run import (
     DONE,
     ERROR,
@@ -36,7 +36,6 @@ from splatctrl_cli.libraries import distributed
 from splatctrl_cli.report.suites import Case, Kind, Suite, cases_of, damage_case, error_case, skipped_case
 
 CONNECT_S = 10.0  # to a scheduler
-FORMAT, VERSION = "splatctrl-batch", 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +140,7 @@ def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
 
 def _is_damaged(run: Run) -> bool:
     """Whether damage is to be said of a run: it ended as expected, and damage was not what was expected."""
-    return run.state == DONE and run.expect != f"exit {DAMAGED}" and bool(damage_mark(run.sentence, run.exit_code))
+    return run.state == DONE and run.expect != f"exit {DAMAGED}" and bool(run.damage)
 
 
 def _reason(run: Run) -> Reason:
@@ -205,20 +204,12 @@ def write_batch(
         found += [] if run is None else [run]
     document = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": FILE_VERSION,
         "suite": suite.name,
         "jobs": [job.name for job in suite.jobs],
-        "nodes": [node_document(run) for run in found],
+        "nodes": [run.document() for run in found],
     }
-    write_durably(out / "batch.json", lambda path: write_json(path, document))
-
-
-def node_document(run: Run) -> dict[str, Any]:
-    """A run as JSON has it."""
-    plain: dict[str, Any] = asdict(run)
-    for name in ("variant", "words", "needs"):
-        plain[name] = json.loads(plain[name])
-    return {"id": plain.pop("node"), **plain, "outcome": run.outcome or None}
+    write_durably(out / FILE, lambda path: write_json(path, document))
 
 
 def check_same_asked(out: Path, name: str, asked: Mapping[str, Any], *, what: str) -> None:
@@ -227,7 +218,7 @@ def check_same_asked(out: Path, name: str, asked: Mapping[str, Any], *, what: st
     """
     file = out / name
     if not file.is_file():
-        if any((out / other).exists() for other in (*MARKERS, "batch.json")):
+        if any((out / other).exists() for other in (*MARKERS, FILE)):
             raise UsageError(f"{out}: is no {what}, but something else", remedy="give another --out")
         return
     try:
@@ -246,18 +237,10 @@ def scheduling(
     ledger: Ledger, entry: str, progress: Progress, *, workers: int, dask: str | None, again: bool = False
 ) -> Iterator[Scheduler]:
     """What runs nodes: processes of this machine, or a Dask cluster. Raises UsageError where none answers."""
-    with _executor(workers, dask) as (executor, slots, hint):
-        yield Scheduler(
-            ledger=ledger, entry=entry, executor=executor, slots=slots, progress=progress, again=again, hint=hint
-        )
-
-
-@contextmanager
-def _executor(workers: int, dask: str | None) -> Iterator[tuple[Executor, int, Callable[[], str]]]:
-    """What runs nodes, how many at once, and why a wait may be in vain."""
+    scheduler = partial(Scheduler, ledger=ledger, entry=entry, progress=progress, again=again)
     if dask is None:
         with local_executor(workers) as executor:
-            yield executor, workers, lambda: ""
+            yield scheduler(executor=executor, slots=workers)
         return
     try:
         client = distributed.Client(dask, timeout=CONNECT_S)
@@ -266,9 +249,8 @@ def _executor(workers: int, dask: str | None) -> Iterator[tuple[Executor, int, C
     except (OSError, ValueError) as error:
         raise UsageError(f"--dask {dask}: no scheduler answers: {error}", remedy="check the address") from None
     with client:
-        slots = max(sum(client.nthreads().values()), 1)
-        yield (
-            client.get_executor(pure=False, retries=2),
-            2 * slots,
-            lambda: "" if client.nthreads() else ": the cluster has no worker",
+        yield scheduler(
+            executor=client.get_executor(pure=False, retries=2),
+            slots=2 * max(sum(client.nthreads().values()), 1),
+            hint=lambda: "" if client.nthreads() else ": the cluster has no worker",
         )

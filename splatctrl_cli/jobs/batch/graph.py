@@ -115,8 +115,12 @@ def _with_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
     return replace(job, options={**filled, **job.options})
 
 
+def _where(job: Job, recording: Recording) -> str:
+    return f"[jobs.{job.name}] of {recording.name}"
+
+
 def _filled(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> str:
-    where = f"[jobs.{job.name}] of {recording.name}"
+    where = _where(job, recording)
     makers = [other.name for other in jobs if other.command == role and other.name != job.name]
     if len(makers) > 1:
         example = " or ".join(f"'{{{name}}}'" for name in makers)
@@ -150,8 +154,7 @@ def _needs(job: Job, jobs: Mapping[str, Job], recording: Recording) -> tuple[str
     for place in found:
         if place not in {RECORDING, NAME, *jobs}:
             known = ", ".join((RECORDING, NAME, *jobs))
-            where = f"[jobs.{job.name}] of {recording.name}"
-            raise UsageError(f"{where}: {{{place}}} is no job", remedy=f"known here: {known}")
+            raise UsageError(f"{_where(job, recording)}: {{{place}}} is no job", remedy=f"known here: {known}")
     return tuple(place for place in found if place in jobs)
 
 
@@ -191,13 +194,15 @@ def _nodes_of(
                 try:
                     parsed = command_line.parsed(job.command, options, folder)
                 except UsageError as error:
-                    where = f"[jobs.{job.name}] of {recording.name}"
-                    raise UsageError(f"{where}: {error.message}", remedy=error.remedy) from None
+                    raise UsageError(f"{_where(job, recording)}: {error.message}", remedy=error.remedy) from None
                 outs = [each.out for each in before if each.out is not None]
                 inputs = (path for path in parsed.inputs if not any(out in (path, *path.parents) for out in outs))
                 made[job.name].append(replace(node, words=parsed.words, inputs=tuple(inputs)))
     nodes = [node for each in made.values() for node in each]
-    _check_names(nodes)
+    by_name: dict[str, Node] = {}
+    for node in nodes:
+        if by_name.setdefault(node.name.lower(), node) is not node:
+            raise UsageError(f"two outputs are called {node.name}", remedy="rename a job, or a value of its matrix")
     return nodes
 
 
@@ -240,7 +245,6 @@ def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
 
 def _node(recording: Recording, job: Job, variant: Variant, suffix: str, before: Sequence[Node], out: Path) -> Node:
     place = re.sub(r"[^\w.+=-]", "_", job.name + suffix)[:_LONGEST]
-    ending = ENDINGS.get(job.command, "")
     return Node(
         name=f"{recording.name}/{place}",
         recording=recording.name,
@@ -249,7 +253,7 @@ def _node(recording: Recording, job: Job, variant: Variant, suffix: str, before:
         words=(),
         variant=variant,
         needs=tuple(node.name for node in before),
-        out=None if job.command in WITHOUT_OUTPUT else out / recording.name / f"{place}{ending}",
+        out=None if job.command in WITHOUT_OUTPUT else out / recording.name / (place + ENDINGS.get(job.command, "")),
         expect=job.expect,
         limits=job.limits,
     )
@@ -281,9 +285,7 @@ def _placed(value: Any, filled: Callable[[str], Any]) -> Any:
     """With each {place} filled; a text that is one place alone becomes what stands for it, a list too."""
     if isinstance(value, str):
         alone = _PLACE.fullmatch(value)
-        if alone:
-            return filled(alone[1])
-        return _PLACE.sub(lambda match: _one(filled(match[1])), value)
+        return filled(alone[1]) if alone else _PLACE.sub(lambda match: _one(filled(match[1])), value)
     if isinstance(value, Mapping):
         return {key: _placed(each, filled) for key, each in value.items()}
     return [_placed(each, filled) for each in value] if isinstance(value, list) else value
@@ -291,11 +293,3 @@ def _placed(value: Any, filled: Callable[[str], Any]) -> Any:
 
 def _one(value: Any) -> str:
     return value[0] if isinstance(value, list) else str(value)
-
-
-def _check_names(nodes: Sequence[Node]) -> None:
-    by_name: dict[str, Node] = {}
-    for node in nodes:
-        other = by_name.setdefault(node.name.lower(), node)
-        if other is not node:
-            raise UsageError(f"two outputs are called {node.name}", remedy="rename a job, or a value of its matrix")

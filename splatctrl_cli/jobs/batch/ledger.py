@@ -22,10 +22,12 @@ from uuid import uuid4
 
 import splatctrl_cli
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PACKAGES, sha256, write_durably
 from splatctrl_cli.jobs.batch.graph import Node
 
 NAME, OWNERS = "ledger.sqlite", ".owners"
+FILE, FORMAT, FILE_VERSION = "batch.json", "splatctrl-batch", 1  # what a batch says of itself
 VERSION = 1  # of the tables
 BUSY_S, WAIT_S = 30.0, 0.02  # to wait for another process that writes, and before it is asked again
 _COMPARISON = re.compile(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)")
@@ -41,12 +43,12 @@ class Run:
     """One run of a node, as it ended; `state` is done (as expected), failed (not so), error or skipped."""
 
     node: str
-    recording: str
-    job: str
-    command: str
-    key: str
-    state: str
-    expect: str
+    recording: str = ""
+    job: str = ""
+    command: str = ""
+    key: str = ""
+    state: str = ""
+    expect: str = ""
     outcome: str = ""
     label: str = ""
     sentence: str = ""
@@ -65,8 +67,24 @@ class Run:
     version: str = ""
     host: str = ""
 
+    @property
+    def damage(self) -> str:
+        """The word of a damaged recording, or nothing."""
+        return damage_mark(self.sentence, self.exit_code)
+
+    @property
+    def column(self) -> str:
+        """The job and its variant."""
+        return self.node.removeprefix(f"{self.recording}/")
+
+    def document(self) -> dict[str, Any]:
+        """As JSON has it."""
+        plain = asdict(self) | {name: json.loads(getattr(self, name)) for name in _OF_JSON}
+        return {"id": plain.pop("node"), **plain, "outcome": self.outcome or None}
+
 
 COLUMNS = tuple(column.name for column in fields(Run))
+_OF_JSON = ("variant", "words", "needs")  # columns of JSON text
 _NUMBERS = ("exit_code", "started", "seconds", "peak_mb")
 _TABLES = f"""
 CREATE TABLE IF NOT EXISTS runs (id INTEGER PRIMARY KEY, {
@@ -147,15 +165,11 @@ class Ledger(AbstractContextManager["Ledger"]):
 
     def last(self, node: str) -> Run | None:
         """The last run of a node."""
-        row = self._base.execute("SELECT * FROM runs WHERE node = ? ORDER BY id DESC LIMIT 1", (node,)).fetchone()
-        return None if row is None else _run_of(row)
+        return next(self.runs([f"node={node}"]), None)
 
     def latest(self) -> dict[str, Run]:
         """The last run of each node."""
-        rows = self._base.execute(
-            "SELECT * FROM runs WHERE id IN (SELECT max(id) FROM runs GROUP BY node) ORDER BY node"
-        )
-        return {row["node"]: _run_of(row) for row in rows}
+        return {run.node: run for run in self.runs()}
 
     def mean_seconds(self) -> dict[str, float]:
         """Of runs that ended by themselves, by job."""
@@ -170,14 +184,15 @@ class Ledger(AbstractContextManager["Ledger"]):
         for condition in conditions:
             match = _COMPARISON.fullmatch(condition.strip())
             if match is None or match[1] not in COLUMNS:
-                known = ", ".join(COLUMNS)
-                raise UsageError(f"--where {condition}: expected COLUMN=VALUE", remedy=f"columns: {known}")
-            means = _PATTERN.get(match[2], match[2]) if "*" in match[3] else match[2]
-            clauses.append(f"{match[1]} {means} ?")
+                raise UsageError(
+                    f"--where {condition}: expected COLUMN=VALUE", remedy=f"columns: {', '.join(COLUMNS)}"
+                )
+            clauses.append(f"{match[1]} {_PATTERN.get(match[2], match[2]) if '*' in match[3] else match[2]} ?")
             values.append(_value_of(match[1], match[3], condition))
         where = f" WHERE {' AND '.join(clauses)}" if clauses else ""
         for row in self._base.execute(f"SELECT * FROM runs{where} ORDER BY id", values):
-            yield _run_of(row)
+            plain = {name: row[name] for name in COLUMNS}
+            yield Run(**plain | {"exit_code": None if plain["exit_code"] is None else int(plain["exit_code"])})
 
     def digest(self, path: Path) -> str:
         """sha256 of a file, or of a folder's names and files; read again only where sizes or times changed."""
@@ -234,10 +249,10 @@ def write_csv(path: Path, runs: Iterable[Run]) -> None:
     write_durably(path, write)
 
 
-def _run_of(row: sqlite3.Row) -> Run:
-    plain = {name: row[name] for name in COLUMNS}
-    code = plain["exit_code"]
-    return Run(**plain | {"exit_code": None if code is None else int(code)})
+def run_of_document(plain: Mapping[str, Any]) -> Run:
+    """What `Run.document` gave, of another version, too. Raises TypeError, KeyError or AttributeError for others."""
+    known = {name: value for name, value in plain.items() if name in COLUMNS and value is not None}
+    return Run(node=plain["id"], **known | {name: json.dumps(known[name]) for name in _OF_JSON if name in known})
 
 
 def _value_of(column: str, text: str, condition: str) -> Any:

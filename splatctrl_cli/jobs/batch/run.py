@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.jobs.batch.graph import Node
 from splatctrl_cli.jobs.batch.ledger import Ledger, Run, keys_of
 from splatctrl_cli.jobs.batch.task import End, Task, last_lines, read_end, run_task, stamp_of, stop_runners
@@ -78,7 +77,9 @@ class Scheduler:
             ended, _ = wait(futures, timeout=AGAIN_S if is_busy else STILL_S, return_when=FIRST_COMPLETED)
             now = time.monotonic()
             if not ended and now - last >= STILL_S:
-                self._tell_of([*futures.values()])
+                names = [node.name for node in futures.values()] or ["what another batch runs"]
+                more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+                self.progress.log(f"batch: still waits for {names[0]}{more}{self.hint()}")
             last = now if ended or now - last >= STILL_S else last
             if is_busy and not futures:
                 time.sleep(AGAIN_S)
@@ -129,12 +130,6 @@ class Scheduler:
         line = clock.passed(run)
         if run.started >= clock.started or run.state == SKIPPED:
             self.progress.log(f"{line} {node.name}: {told(run)}{clock.left()}")
-
-    def _tell_of(self, nodes: Sequence[Node]) -> None:
-        """What is waited for."""
-        names = [node.name for node in nodes] or ["what another batch runs"]
-        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-        self.progress.log(f"batch: still waits for {names[0]}{more}{self.hint()}")
 
     def _task(self, node: Node, key: str) -> Task:
         return Task(
@@ -201,12 +196,11 @@ def _judged_again(run: Run, node: Node) -> Run:
 
 def told(run: Run) -> str:
     """A run in a few words."""
-    what = run.cause or (run.label.upper() if run.outcome else run.label)
-    what += damage_mark(run.sentence, run.exit_code)
     if run.state == SKIPPED:
         return f"skipped: {run.cause}"
+    what = run.cause or (run.label.upper() if run.outcome else run.label)
     odd = "" if run.state == DONE else f", expected {run.expect}" if run.state == FAILED else ", an error"
-    return f"{what}{odd} ({run.seconds:.1f} s)"
+    return f"{what}{run.damage}{odd} ({run.seconds:.1f} s)"
 
 
 @contextmanager

@@ -23,6 +23,7 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
     *("controller failed", "goal not reached", "gate failed"),
 )
 _NAME = re.compile(r"[\w][\w.+-]*")
+_COMMON = ("log", "capture", "recording", "data")  # names of thousands, to which that of the folder is added
 _ENDINGS = (".mcap", ".bag", ".db3", ".toml", ".capture")
 
 
@@ -102,12 +103,12 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
 
 def jobs_for(recording: Recording, jobs: Sequence[Job], commands: Sequence[str]) -> list[Job]:
     """The jobs of a recording, as it has them. Raises UsageError for what an override says."""
-    return [_job_for(job, recording, commands) for job in jobs if job.name in recording.only or not recording.only]
-
-
-def _job_for(job: Job, recording: Recording, commands: Sequence[str]) -> Job:
-    own = _job(job.name, recording.overrides.get(job.name, {}), commands, job)
-    return replace(own, options={**job.options, **own.options}, matrix={**job.matrix, **own.matrix})
+    chosen = [job for job in jobs if job.name in recording.only or not recording.only]
+    own = [_job(job.name, recording.overrides.get(job.name, {}), commands, job) for job in chosen]
+    return [
+        replace(its, options={**job.options, **its.options}, matrix={**job.matrix, **its.matrix})
+        for job, its in zip(chosen, own, strict=True)
+    ]
 
 
 def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = None) -> Job:
@@ -117,8 +118,7 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     _checked_name(where, name)
     command = _text(where, table, "command", base.command if base else name)
     if command not in commands:
-        near = difflib.get_close_matches(command, commands, n=1)
-        remedy = f"did you mean {near[0]}?" if near else f"give command = one of: {', '.join(commands)}"
+        remedy = _near(command, commands, "give command = one of")
         raise UsageError(f"{where}: no job is called {command!r}", remedy=remedy)
     own = next((option for option in _OWN if option in table), None)
     if own is not None:
@@ -128,8 +128,9 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
         raise UsageError(f"{where} matrix: expected OPTION = [VALUE, ...] each, got {shown(matrix)}")
     expect = _text(where, table, "expect", base.expect if base else "passed")
     if expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect):
-        remedy = _near(expect, (*EXPECTED, "exit N"))
-        raise UsageError(f"{where} expect: no verdict is called {expect!r}", remedy=remedy)
+        raise UsageError(
+            f"{where} expect: no verdict is called {expect!r}", remedy=_near(expect, (*EXPECTED, "exit N"))
+        )
     limits = base.limits if base else Limits()
     return Job(
         name=name,
@@ -183,7 +184,8 @@ def _named(recordings: Sequence[Recording]) -> list[Recording]:
     files = [Path(os.path.normpath(each.paths[0])) for each in recordings]
     beside = Counter(map(_without_ending, set(files)))
     places = [path if beside[_without_ending(path)] > 1 else _without_ending(path) for path in files]
-    names = [each.name or _name_of(place) for each, place in zip(recordings, places, strict=True)]
+    own = [f"{p.parent.name}-{p.name}" if p.name in _COMMON else p.name for p in places]
+    names = [each.name or _plain(name) for each, name in zip(recordings, own, strict=True)]
     for above in range(max((len(place.parts) - 1 for place in places), default=0)):
         alike: dict[str, list[int]] = {}
         for k, name in enumerate(names):
@@ -197,12 +199,6 @@ def _named(recordings: Sequence[Recording]) -> list[Recording]:
 
 def _without_ending(path: Path) -> Path:
     return path.with_suffix("") if path.suffix in _ENDINGS else path
-
-
-def _name_of(place: Path) -> str:
-    """Of a file; of one called like thousands of others with its folder's."""
-    is_common = place.name in {"log", "capture", "recording", "data"}
-    return _plain(f"{place.parent.name}-{place.name}" if is_common else place.name)
 
 
 def _plain(name: str) -> str:
@@ -234,9 +230,9 @@ def _check_keys(where: str, table: Table, known: Sequence[str]) -> None:
             raise UsageError(f"{where}: unknown key {key!r}", remedy=_near(key, known))
 
 
-def _near(word: str, known: Sequence[str]) -> str:
+def _near(word: str, known: Sequence[str], otherwise: str = "known here") -> str:
     near = difflib.get_close_matches(word, known, n=1)
-    return f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+    return f"did you mean {near[0]}?" if near else f"{otherwise}: {', '.join(known)}"
 
 
 def _checked_name(where: str, name: str) -> None:

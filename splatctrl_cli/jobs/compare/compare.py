@@ -151,8 +151,7 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
     Raises UsageError for a request of another form, InputError for what cannot be read or was not run alike.
     """
     num_needed = 1 if request.against is not None else 2
-    is_alone = len(request.runs) == 1 and request.update_baseline is not None
-    if len(request.runs) != num_needed and not is_alone:
+    if len(request.runs) != num_needed and not (len(request.runs) == 1 and request.update_baseline is not None):
         raise UsageError(f"compare: expected two runs, or one and --against, got {len(request.runs)}")
     after = read_judged(request.runs[-1])
     before = read_baseline(request.against) if request.against is not None else read_judged(request.runs[0])
@@ -200,10 +199,9 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
     worse = [one for one in found if one.change is Change.WORSE]
     alone = [one for one in worse if (one.job, one.metric) not in by_jobs or one.after is None]
     only_after = tuple(sorted(after.runs.keys() - before.runs.keys()))
-    num_verdicts = sum(bool(old.outcome and new.outcome) for old, new in pairs)
     metrics = {
         "num_runs": len(pairs),
-        "num_verdicts": num_verdicts,
+        "num_verdicts": sum(bool(old.outcome and new.outcome) for old, new in pairs),
         "num_figures": sum(one.better is not Better.NEITHER for one in found),
         "num_verdicts_worse": sum(one.change is Change.WORSE for one in verdicts),
         "num_verdicts_better": sum(one.change is Change.BETTER for one in verdicts),
@@ -226,7 +224,12 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
             counts=metrics,
         ),
         verdicts=tuple(verdicts),
-        figures=tuple(sorted((one for one in found if one.change is not Change.SAME), key=_worst_first)),
+        figures=tuple(
+            sorted(
+                (one for one in found if one.change is not Change.SAME),
+                key=lambda one: (one.change is not Change.WORSE, -one.share, one.metric, one.run),
+            )
+        ),
         jobs=tuple(jobs),
         differences=_differences(pairs),
         only_after=only_after,
@@ -240,8 +243,9 @@ def _overall(metrics: Mapping[str, int]) -> Reason:
     num_figures, num_verdicts = metrics["num_figures"], metrics["num_verdicts"]
     if not num_figures and not num_verdicts:
         return lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides")
-    words = f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}"
-    return noted("comparison", words)
+    return noted(
+        "comparison", f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}"
+    )
 
 
 def _verdict_change(old: JudgedRun, new: JudgedRun) -> VerdictChange | None:
@@ -382,10 +386,6 @@ def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tupl
             if values[0] != values[1]:
                 found.setdefault(name, values)
     return found
-
-
-def _worst_first(one: FigureChange) -> tuple[bool, float, str, str]:
-    return one.change is not Change.WORSE, -one.share, one.metric, one.run
 
 
 def _named(names: Sequence[str]) -> str:

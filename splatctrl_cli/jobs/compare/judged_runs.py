@@ -2,7 +2,6 @@
 that each command declares, and the state of a replay that is worst by one.
 """
 
-import csv
 import json
 import math
 import re
@@ -21,11 +20,13 @@ from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.metrics import Better, Scale, Shown
 from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PARTIAL, output_path
-from splatctrl_cli.jobs.bake import bake
+from splatctrl_cli.jobs.bake.accuracy import SUMMARY_METRICS
+from splatctrl_cli.jobs.batch.run import DONE
 from splatctrl_cli.jobs.reconstruct import verdict as reconstruct_verdict
 from splatctrl_cli.jobs.replay.metrics import metric_scales, shown_metrics
 from splatctrl_cli.jobs.replay.request import MODES
 from splatctrl_cli.jobs.robot import robot
+from splatctrl_cli.jobs.runs.run_folder import BatchFolder, is_batch, open_batch, open_run, read_columns, read_object
 
 REPLAY_FIELDS = ("exact", "barrier", "certified")
 
@@ -39,7 +40,7 @@ def scales() -> Mapping[str, Mapping[str, Scale]]:
     bands = [field_accuracy.band_name(lower, upper) for lower, upper in BANDS]
     return {
         "reconstruct": reconstruct_verdict.GATED,
-        "sdf-bake": bake.SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS, bands),
+        "sdf-bake": SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS, bands),
         "score": score_report.SCALES,
         "replay": replay,
         "robot": robot.SCALES,
@@ -52,7 +53,7 @@ def shown() -> Mapping[str, Shown]:
     return {name: where for mode in MODES for name, where in shown_metrics(mode, REPLAY_FIELDS).items()}
 
 
-BATCH, BASELINE, VERSION = "splatctrl-batch", "splatctrl-baseline", 1
+BASELINE, VERSION = "splatctrl-baseline", 1
 HEAD = "# Made by splatctrl compare --update-baseline: review what changed, then commit it.\n"
 ANEW = "write it anew with --update-baseline"
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
@@ -92,41 +93,31 @@ class Judged:
 
 def read_judged(path: Path) -> Judged:
     """A folder that a command that judges or a batch wrote. Raises InputError for anything else."""
-    if path.name.endswith(PARTIAL):
+    has_batch, has_run = is_batch(path), (path / "run.json").is_file()
+    is_begun = not has_batch and not has_run and path.with_name(path.name + PARTIAL).exists()
+    if path.name.endswith(PARTIAL) or is_begun:
         raise InputError(f"{path}: is still being written, or was interrupted", remedy="wait for it, or run it again")
-    batch, run = path / "batch.json", path / "run.json"
-    if batch.is_file():
-        return Judged(path=path, kind="batch", runs={run.name: run for run in _nodes(path, _json(batch))})
-    if run.is_file():
-        one = _run_in(path, path.absolute().name)
-        return Judged(path=path, kind="run", runs={one.command: one})
-    if path.with_name(path.name + PARTIAL).exists():
-        raise InputError(f"{path}: is still being written, or was interrupted", remedy="wait for it, or run it again")
-    what = "no run.json and no batch.json in it" if path.is_dir() else "no such folder"
-    raise InputError(f"{path}: expected the output folder of a command or a batch, got {what}")
-
-
-def _run_in(folder: Path, recording: str) -> JudgedRun:
-    document = _json(folder / "run.json")
-    verdict, command = document.get("verdict"), str(document.get("command"))
-    if not isinstance(verdict, dict) or command not in (*scales(), "demo"):
+    if has_batch:
+        return Judged(path=path, kind="batch", runs={run.name: run for run in _of_batch(open_batch(path))})
+    if not has_run:
+        what = "no run.json and no batch.json in it" if path.is_dir() else "no such folder"
+        raise InputError(f"{path}: expected the output folder of a command or a batch, got {what}")
+    run = open_run(path)
+    command = run.command
+    if not run.verdict or command not in (*scales(), "demo"):
         raise InputError(
-            f"{folder}: a run of {command}, which judges nothing", remedy=f"give one of {', '.join(scales())}"
+            f"{path}: a run of {command}, which judges nothing", remedy=f"give one of {', '.join(scales())}"
         )
-    return _judged_run(command, recording, command, command, verdict, document.get("metrics"), document, folder)
+    one = _judged_run(command, path.absolute().name, command, command, run.run, path)
+    return Judged(path=path, kind="run", runs={command: one})
 
 
 def _judged_run(
-    name: str,
-    recording: str,
-    job: str,
-    command: str,
-    verdict: Mapping[str, Any],
-    metrics: Any,
-    document: Mapping[str, Any],
-    folder: Path | None,
+    name: str, recording: str, job: str, command: str, document: Mapping[str, Any], folder: Path | None
 ) -> JudgedRun:
-    """From what a command wrote into ``run.json``, or printed with --json."""
+    """From what a command wrote into ``run.json``, or printed with --json, and then without a folder."""
+    verdict, known = document["verdict"], scales().get(command, {})
+    metrics = document["metrics"] if isinstance(document.get("metrics"), dict) else {}
     return JudgedRun(
         name=name,
         recording=recording,
@@ -135,64 +126,40 @@ def _judged_run(
         outcome=verdict["outcome"],
         label=verdict["label"] + damage_mark(verdict.get("sentence"), verdict.get("exit_code")),
         is_green=verdict["outcome"] == "passed",
-        metrics=_declared(command, metrics if isinstance(metrics, dict) else {}),
-        settings=dict(_settings(document)),
+        metrics={
+            name: float(value) if isinstance(value, int | float) and math.isfinite(value) else None
+            for name, value in metrics.items()
+            if name in known
+        },
+        settings={} if folder is None else dict(_settings(document)),
         reasons=tuple(verdict["reasons"]),
         folder=folder,
     )
 
 
-def _nodes(path: Path, document: Mapping[str, Any]) -> Iterator[JudgedRun]:
-    if document.get("format") != BATCH or not isinstance(document.get("nodes"), list):
-        raise InputError(f"{path / 'batch.json'}: expected a batch, got another file")
-    _check_version(path / "batch.json", document, "a batch")
-    for node in document["nodes"]:
-        variant = ", ".join(f"{key}={value}" for key, value in sorted((node.get("variant") or {}).items()))
-        job = f"{node['job']} ({variant})" if variant else str(node["job"])
-        found = _node_output(path, node)
-        command = str(node["command"]).partition(" ")[0]
-        name, recording, is_green = str(node["id"]), str(node["recording"]), node["state"] == "done"
-        if found is None or node.get("outcome") is None:
-            label = str(node.get("cause") or node["state"])
+def _of_batch(batch: BatchFolder) -> Iterator[JudgedRun]:
+    """The run of each node: by its folder, without one by what it printed."""
+    for ran in batch.runs:
+        variant = ", ".join(f"{key}={value}" for key, value in sorted(json.loads(ran.variant).items()))
+        job = f"{ran.job} ({variant})" if variant else ran.job
+        command, is_green = ran.command.partition(" ")[0], ran.state == DONE
+        folder, printed = batch.path / ran.out, batch.path / ran.result
+        has_run = (folder / "run.json").is_file()
+        document = open_run(folder).run if has_run else read_object(printed) if printed.is_file() else {}
+        if ran.outcome and isinstance(document.get("verdict"), dict):
+            judged = _judged_run(ran.node, ran.recording, job, command, document, folder if has_run else None)
+            yield replace(judged, is_green=is_green)
+        else:
             yield JudgedRun(
-                name=name,
-                recording=recording,
+                name=ran.node,
+                recording=ran.recording,
                 job=job,
                 command=command,
                 outcome="",
-                label=label,
+                label=ran.cause or ran.state,
                 is_green=is_green,
                 metrics={},
             )
-            continue
-        verdict, metrics, run, folder = found
-        judged = _judged_run(name, recording, job, command, verdict, metrics, run, folder)
-        yield replace(judged, is_green=is_green)
-
-
-def _node_output(
-    path: Path, node: Mapping[str, Any]
-) -> tuple[Mapping[str, Any], Any, Mapping[str, Any], Path | None] | None:
-    """Verdict, metrics, ``run.json`` and folder of a node; of one without that file, what it printed."""
-    folder = path / str(node["out"])
-    if (folder / "run.json").is_file():
-        run = _json(folder / "run.json")
-        return (run["verdict"], run.get("metrics"), run, folder) if isinstance(run.get("verdict"), dict) else None
-    printed = path / str(node["result"])
-    if not printed.is_file():
-        return None
-    document = _json(printed)
-    return (document["verdict"], document.get("metrics"), {}, None) if "verdict" in document else None
-
-
-def _declared(command: str, metrics: Mapping[str, Any]) -> dict[str, float | None]:
-    """The figures that are declared for the command: numbers that are finite, None for others."""
-    known = scales().get(command, {})
-    return {name: _number(value) for name, value in metrics.items() if name in known}
-
-
-def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
 
 
 def _settings(document: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
@@ -210,23 +177,6 @@ def _settings(document: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
         yield f"input {name}", str(digest)[:12]
 
 
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: expected an object, got {type(document).__name__}")
-    return document
-
-
-def _check_version(path: Path, document: Mapping[str, Any], what: str) -> None:
-    if document.get("version") != VERSION:
-        remedy = "update splatctrl" if document.get("version", 0) > VERSION else ANEW
-        found = document.get("version")
-        raise InputError(f"{path}: {what} of version {found}, this splatctrl reads {VERSION}", remedy=remedy)
-
-
 def read_baseline(path: Path) -> Judged:
     """A stored baseline. Raises InputError for another file, a newer one, and figures that no command has now."""
     try:
@@ -241,7 +191,9 @@ def read_baseline(path: Path) -> Judged:
         raise InputError(
             f"{path}: expected a baseline, got another TOML file", remedy="give one of --update-baseline"
         )
-    _check_version(path, document, "a baseline")
+    if (found := document.get("version")) != VERSION:
+        remedy = "update splatctrl" if (found or 0) > VERSION else ANEW
+        raise InputError(f"{path}: a baseline of version {found}, this splatctrl reads {VERSION}", remedy=remedy)
     version, runs = str(document.get("splatctrl", "")), {}
     try:
         kind = str(document["kind"])
@@ -311,22 +263,19 @@ def worst_state(folder: Path | None, metric: str) -> WorstState | None:
     where = shown().get(metric)
     if where is None or folder is None or not (folder / "steps.csv").is_file():
         return None
-    with (folder / "steps.csv").open(encoding="utf-8", newline="") as stream:
-        rows = csv.DictReader(stream)
-        if where.column not in (rows.fieldnames or ()):
-            return None
-        found, least = None, math.inf
-        for index, row in enumerate(rows):
-            badness = _badness(where, row[where.column])
-            if badness < least:
-                found, least = (index, row), badness
-    if found is None:
+    columns = read_columns(folder / "steps.csv")
+    badness = [_badness(where, text) for text in columns.get(where.column, ())]
+    if min(badness, default=math.inf) == math.inf:
         return None
-    index, row = found
-    sphere = row.get(f"nearest_{where.column.removeprefix('clearance_')}") or ""
-    is_exact = where.column == "clearance_exact"
-    obstacle = (row.get("obstacle") or "") if is_exact else ""
-    return WorstState(state=index, time_s=float(row["time_s"]), sphere=sphere, obstacle=obstacle)
+    index = badness.index(min(badness))
+    nearest = columns.get(f"nearest_{where.column.removeprefix('clearance_')}")
+    obstacles = columns.get("obstacle") if where.column == "clearance_exact" else None
+    return WorstState(
+        state=index,
+        time_s=float(columns["time_s"][index]),
+        sphere=nearest[index] if nearest else "",
+        obstacle=obstacles[index] if obstacles else "",
+    )
 
 
 def _badness(where: Shown, text: str) -> float:

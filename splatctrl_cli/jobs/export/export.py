@@ -88,15 +88,6 @@ class ExportResult:
         return {name: value for name, value in asdict(self).items() if name != "was_rounded"}
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Look:
-    """How differently two sets look, as in `ExportResult`."""
-
-    largest: float
-    psnr: float | None
-    covered: float
-
-
 def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     """Write the splats, read them back and compare.
 
@@ -130,7 +121,7 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
         held, bound = kind.held(before), kind.bound(before)
         bound = replace(bound, center=bound.center + float(np.abs(exact - before.centers).max()))
         found = _checked_differences(out, held, after, bound, exact)
-        look = _checked_look(out, kind, chosen, back)
+        largest, psnr, covered = _checked_look(out, kind, chosen, back)
         return ExportResult(
             file=out,
             format=kind.name,
@@ -143,10 +134,10 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
             num_outside=_num_outside(before, held),
             differences=found,
             allowed=bound,
-            largest_pixel_difference=look.largest,
-            psnr=look.psnr,
-            covered_share=look.covered,
-            isotropic_psnr=None if chosen is selected else _look(selected, chosen).psnr,
+            largest_pixel_difference=largest,
+            psnr=psnr,
+            covered_share=covered,
+            isotropic_psnr=None if chosen is selected else _look(selected, chosen)[1],
             was_rounded=chosen is not selected,
         )
 
@@ -207,15 +198,15 @@ def _checked_differences(
     return found
 
 
-def _checked_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) -> _Look:
-    look = _look(source, back)
-    looks_the_same = look.psnr is None or look.psnr >= EXPORT_MIN_PSNR
-    if not kind.is_rounded and not (looks_the_same and look.largest <= EXPORT_DIFFERENCE):
+def _checked_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) -> tuple[float, float | None, float]:
+    largest, psnr, covered = _look(source, back)
+    looks_the_same = psnr is None or psnr >= EXPORT_MIN_PSNR
+    if not kind.is_rounded and not (looks_the_same and largest <= EXPORT_DIFFERENCE):
         raise WriteError(
-            f"{out}: does not render as its source: PSNR {look.psnr} dB, largest pixel difference "
-            f"{look.largest:.3g}, expected at least {EXPORT_MIN_PSNR:g} dB and at most {EXPORT_DIFFERENCE:.3g}"
+            f"{out}: does not render as its source: PSNR {psnr} dB, largest pixel difference "
+            f"{largest:.3g}, expected at least {EXPORT_MIN_PSNR:g} dB and at most {EXPORT_DIFFERENCE:.3g}"
         )
-    return look
+    return largest, psnr, covered
 
 
 def _not_kept(source: Splats, back: Splats, held: GaussianSet) -> list[str]:
@@ -236,8 +227,10 @@ def _num_outside(source: GaussianSet, held: GaussianSet) -> int:
     return int(np.count_nonzero(is_outside))
 
 
-def _look(a: Splats, b: Splats) -> _Look:
-    """Renders of both sets, seen from around `a`."""
+def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
+    """How differently two sets look, seen from around `a`: largest difference, PSNR and share that is covered, as
+    `ExportResult` has them.
+    """
     intrinsics, poses, size = _views(a.centers)
     largest, covered, squared = 0.0, 0.0, 0.0
     for T_world_camera in poses:
@@ -246,7 +239,7 @@ def _look(a: Splats, b: Splats) -> _Look:
         largest = max(largest, *(float(np.abs(x.astype(np.float64) - y).max()) for x, y in pairs))
         covered += float(np.mean(one.opacity > 0)) / len(poses)
         squared += float(np.mean(np.square(one.color.astype(np.float64) - two.color))) / len(poses)
-    return _Look(largest=largest, psnr=-10.0 * math.log10(squared) if squared else None, covered=covered)
+    return largest, -10.0 * math.log10(squared) if squared else None, covered
 
 
 def _render(splats: Splats, intrinsics: Intrinsics, T_world_camera: Float64) -> Rendering:

@@ -4,14 +4,14 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import methodcaller
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from splatctrl_cli.control.events import INTERVENTIONS, SHOWN
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.output import output_path
+from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import Snapshot, open_scene
 from splatctrl_cli.jobs.report.spaces import position_of, robot_bodies, robot_of, scene_of, sets_known, spread
@@ -38,8 +38,7 @@ class ExportRunResult(WrittenFile):
 
 def export_run(request: ExportRunRequest) -> ExportRunResult:
     """Write the MCAP. Raises InputError for a folder of another kind, and UsageError where a library is missing."""
-    run = open_run(request.path)
-    parts = sorted(_parts(run, request.roots), key=lambda part: part[:2])
+    parts = sorted(_parts(open_run(request.path), request.roots), key=lambda part: part[:2])
     name = request.path.absolute()
     out = request.out or name.with_name(f"{name.name}.mcap")
     with output_path(out, force=request.force, is_folder=False) as written:
@@ -57,8 +56,7 @@ def _parts(run: RunFolder, roots: tuple[Path, ...]) -> Iterator[Later]:
     elif (run.path / "field.npz").is_file():
         yield 0, 0, partial(_field, 0, run.parts.checked(run.path / "field.npz"))
     elif (run.path / "splats.ply").is_file():
-        snapshots = open_scene(run.path).snapshots
-        yield from _known_parts([(snapshot.stamp_ns, snapshot) for snapshot in snapshots])
+        yield from _known_parts([(snapshot.stamp_ns, snapshot) for snapshot in open_scene(run.path).snapshots])
     else:
         raise InputError(f"{run.path}: {run.command} leaves nothing to log", remedy="give a replay, scene or field")
 
@@ -73,18 +71,20 @@ def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> It
         yield start, 0, partial(_field, start, place / "field.npz" if place.is_dir() else place)
     robot = robot_of(run, states, roots)
     for link, body in robot_bodies(robot).items():
-        yield start, 1, _mesh(start, link, body.vertices, body.faces)
+        yield start, 1, methodcaller("add_mesh", f"{MESHES}/{link}", start, link, body.vertices, body.faces)
     for state, stamp in enumerate(states.stamps_ns.tolist()):
         q = position_of(states, robot, state)
-        yield stamp, 2, _transforms(stamp, {link: robot.frame_pose(q, link) for link in robot.frame_names})
-        yield stamp, 3, _numbers(stamp, {name: float(values[state]) for name, values in states.clearance.items()})
-    yield start, 4, _line(start, "INFO", str(run.verdict.get("sentence", "")))
+        poses = {link: robot.frame_pose(q, link) for link in robot.frame_names}
+        clearance = {name: finite(float(values[state])) for name, values in states.clearance.items()}
+        yield stamp, 2, methodcaller("add_transforms", TRANSFORMS, stamp, poses)
+        yield stamp, 3, methodcaller("add_numbers", CLEARANCE, stamp, clearance)
+    yield start, 4, methodcaller("add_line", EVENTS, start, "INFO", str(run.verdict.get("sentence", "")))
     for event in (run.json_of("events.json") or {}).get("events", []):
         if event["source"] in SHOWN:
             level = "INFO" if event["kind"] in INTERVENTIONS else "WARNING"
             words = f"{event['kind']}{SHOWN[event['source']]}: {event['worst_name']}, worst {event['worst']:.4g}"
             told = f"{words} {event['unit']} at {event['worst_s']:.2f} s, until {event['end_s']:.2f} s"
-            yield int(event["first_ns"]), 4, _line(int(event["first_ns"]), level, told)
+            yield int(event["first_ns"]), 4, methodcaller("add_line", EVENTS, int(event["first_ns"]), level, told)
 
 
 def _known_parts(known: Sequence[tuple[int, Snapshot]]) -> Iterator[Later]:
@@ -113,20 +113,3 @@ def _space(stamp: int, snapshot: Snapshot, log: FoxgloveLog) -> None:
 def _field(stamp: int, path: Path, log: FoxgloveLog) -> None:
     grid = read_npz(path)
     log.add_voxels(DISTANCE, stamp, "distance", np.asarray(grid.channels["sdf"]), grid.origin, grid.voxel)
-
-
-def _mesh(stamp: int, link: str, vertices: Any, faces: Any) -> Callable[[FoxgloveLog], None]:
-    return lambda log: log.add_mesh(f"{MESHES}/{link}", stamp, link, vertices, faces)
-
-
-def _transforms(stamp: int, poses: dict[str, Any]) -> Callable[[FoxgloveLog], None]:
-    return lambda log: log.add_transforms(TRANSFORMS, stamp, poses)
-
-
-def _numbers(stamp: int, values: dict[str, float]) -> Callable[[FoxgloveLog], None]:
-    known = {name: value if math.isfinite(value) else None for name, value in values.items()}
-    return lambda log: log.add_numbers(CLEARANCE, stamp, known)
-
-
-def _line(stamp: int, level: str, text: str) -> Callable[[FoxgloveLog], None]:
-    return lambda log: log.add_line(EVENTS, stamp, level, text)

@@ -149,7 +149,11 @@ def _gains(frames: list[RgbdFrame], scale: float, console: Progress) -> Float64:
 def corrected(frame: RgbdFrame, corrections: Mapping[tuple[str, int], ViewCorrection]) -> RgbdFrame:
     """The frame as a scene's training corrected it, where it did."""
     row = corrections.get((frame.camera, frame.stamp_ns))
-    return frame if row is None else _applied(frame, row)
+    if row is None:
+        return frame
+    frame = frame if row.bend is None else unbent(frame, row.bend)
+    frame = frame if row.T_world_camera is None else replace(frame, T_world_camera=row.T_world_camera)
+    return frame if row.gain is None else exposed(frame, row.gain)
 
 
 def corrected_among(
@@ -168,8 +172,7 @@ def corrected_among(
     bend = _bend_of(frame, others, corrections)
     frame = frame if bend is None else unbent(frame, bend)
     if respects.T_world_camera is not None:
-        T = refined_poses([frame, *others], scale, free).T_world_camera[0]
-        frame = replace(frame, T_world_camera=T)
+        frame = replace(frame, T_world_camera=refined_poses([frame, *others], scale, free).T_world_camera[0])
     if respects.gain is not None:
         frame = exposed(frame, exposure_gains([frame, *others], scale, free)[0])
     return frame
@@ -182,9 +185,3 @@ def _bend_of(
     cameras = {other.camera for other in others if other.intrinsics == frame.intrinsics}
     camera = frame.camera if frame.camera != HOLDOUT or len(cameras) != 1 else cameras.pop()
     return next((row.bend for (name, _), row in corrections.items() if name == camera), None)
-
-
-def _applied(frame: RgbdFrame, row: ViewCorrection) -> RgbdFrame:
-    frame = frame if row.bend is None else unbent(frame, row.bend)
-    frame = frame if row.T_world_camera is None else replace(frame, T_world_camera=row.T_world_camera)
-    return frame if row.gain is None else exposed(frame, row.gain)

@@ -19,7 +19,7 @@ from splatctrl_cli.formats.scene.scene_writer import Checkpoint, SceneWriter
 from splatctrl_cli.jobs.reconstruct.correct_views import Corrections
 from splatctrl_cli.jobs.reconstruct.kept_maps import KeptMaps
 from splatctrl_cli.jobs.recordings.open_recording import CameraAgreement, guessed_unit
-from splatctrl_cli.jobs.recordings.same_recording import first_frame
+from splatctrl_cli.jobs.recordings.provenance import first_frame
 from splatctrl_cli.jobs.running.device import CPU, Device, FitDevice, RunOptions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
@@ -169,13 +169,14 @@ class Reconstruction:
         the workspace is.
         """
         index, self.num_read = self.num_read, self.num_read + 1
-        if self.fitter is None and not step.has_depth and self._needs_depth():
+        needs_depth = self.request.box is None and self.robot is None and self.cloud is None  # for the workspace
+        if self.fitter is None and not step.has_depth and needs_depth:
             console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
             self._early = self._early or step
             return None
         for frame in step.frames:
             if frame.camera not in self.first_frames:
-                self.first_frames[frame.camera] = first_frame(frame).as_dict()
+                self.first_frames[frame.camera] = asdict(first_frame(frame))
         if self.fitter is None:
             self._fit_to(RecordedDepth.of(step.frames), console)
             frames, self.corrected = self.request.corrections.of(
@@ -203,8 +204,12 @@ class Reconstruction:
         self._count_carried(step, posture)
         self.stamps.extend(frame.stamp_ns for frame in step.frames)
         self._record(row)
-        if self.fitter.num_steps == 1:
-            self._warn_of_small_budget(row, console)
+        if self.fitter.num_steps == 1 and row.unmet:
+            budget = self.config.scene.max_splats
+            console.log(
+                f"warning: a budget of {budget} splats is too small for the first frames: {row.unmet} seeds found no"
+                f" slot; --max-splats {budget + row.unmet} would hold them"
+            )
         if self.source.has_clock and (self._kept.is_due(index, step.stamp_ns) or self._kept.shows_news(self.fitter)):
             self.snapshot(step.stamp_ns)
         return row
@@ -222,24 +227,14 @@ class Reconstruction:
         least = SceneConfig().max_splats
         if self.robot is None or not row.unmet or self.config.scene.max_splats != least:
             return False
-        wanted = 1.25 * (least + row.unmet + row.evicted)
-        budget = min(1000 * math.ceil(wanted / 1000), MOST_GROWTH * least)
+        budget = min(1000 * math.ceil((1.25 * (least + row.unmet + row.evicted)) / 1000), MOST_GROWTH * least)
         self.config = self.config.derived(scene=self.config.scene.derived(max_splats=budget))
         console.log(f"the first frames show more than {least} splats can stand for: takes {budget}")
         return True
 
-    def _warn_of_small_budget(self, row: AuditRow, console: Progress) -> None:
-        if row.unmet:
-            budget = self.config.scene.max_splats
-            console.log(
-                f"warning: a budget of {budget} splats is too small for the first frames: {row.unmet} seeds found no"
-                f" slot; --max-splats {budget + row.unmet} would hold them"
-            )
-
     def _refine(self, fitter: SceneFitter, console: Progress) -> None:
         total = self.config.scene.refine_iterations
-        wait = Wait(console, "refines", "iterations", total).announce()
-        fitter.descent.heard = wait.step
+        fitter.descent.heard = Wait(console, "refines", "iterations", total).announce().step
         self._record(fitter.refine(total, lambda _: self._save_if_due()))
         self.snapshot(self.rows[-1].stamp_ns)
         self.is_refined = True
@@ -371,10 +366,6 @@ class Reconstruction:
         return SceneFitter(
             scene, self.config.occupancy, workspace, human=human, seed=seed, threads=threads, has_shell=has_shell
         )
-
-    def _needs_depth(self) -> bool:
-        """Whether only depth can say where the workspace is."""
-        return self.request.box is None and self.robot is None and self.cloud is None
 
     def _workspace(self, first: TimeStep) -> Box:
         if self.request.box is not None:

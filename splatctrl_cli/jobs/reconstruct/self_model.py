@@ -42,10 +42,9 @@ class LearnRequest(RobotOptions):
 
 def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel:
     """Learn and write the self-model. Raises InputError for a recording that shows no link moving."""
-    none = SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
     model = RobotModel.from_urdf(
         request.urdf,
-        request.spheres or none,
+        request.spheres or SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0)),
         T_world_base=None if request.base is None else transform_from(request.base[:3], request.base[3:]),
         locked=request.locked,
         packages=request.packages,

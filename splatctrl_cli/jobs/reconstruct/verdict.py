@@ -9,7 +9,6 @@ from splatctrl_cli.config.fixed import MASK_PIXELS
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, FAULTS, Better, Scale
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, note, noted, verdict_of
-from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.records import LossReport
 from splatctrl_cli.robot.declared_contact import carried_words
 from splatctrl_cli.scene.time_steps import AuditRow
@@ -29,7 +28,7 @@ GATED = {
     "loss": Scale(better=Better.LOWER, absolute=1e-3, relative=0.02),
     "psnr": DECIBELS,
 }  # what --require can name, and how two runs are compared by it
-LONGEST_BLIND = ReplayRequest.max_map_age  # [s] as long as a replay takes what it knows for evidence
+LONGEST_BLIND = 1.0  # [s] as long as a replay takes what it knows for evidence
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +57,7 @@ def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
         "reconstruct",
         [
             *reasons,
-            *_held(metrics),
-            *_unbent(metrics),
-            *_loss_notes(made.loss),
+            *_notes(metrics, made.loss),
             *gate_reasons(require, {name: metrics[name] for name in GATED}, counts),
         ],
         scope=f"{metrics['time_steps']} time steps of {', '.join(metrics['cameras'])}, {metrics['splats']} splats",
@@ -82,32 +79,24 @@ def counts_of(made: Reconstructed) -> dict[str, int]:
     }
 
 
-def _held(metrics: Mapping[str, Any]) -> Iterator[Reason]:
-    """The views whose poses could not be put right, where that was asked for."""
+def _notes(metrics: Mapping[str, Any], loss: LossReport) -> Iterator[Reason]:
+    """The views whose poses could not be put right, the cameras whose depth is not what they measured, and what the
+    input lost.
+    """
     held = metrics.get("poses", {}).get("held", [])
     if held:
         shown = ", ".join(held[:3]) + (f" and {len(held) - 3} more" if len(held) > 3 else "")
         yield noted("poses", f"not put right, too far off or seen by no other view: {shown}")
-
-
-def _unbent(metrics: Mapping[str, Any]) -> Iterator[Reason]:
-    """The cameras whose depth is not what they measured, and by how much."""
     for camera, bend in metrics.get("depth_bends", {}).items():
         yield noted("depth", f"{camera}: freed of a bend of at most {100 * bend['largest']:.1f} % of the depth")
-
-
-def _loss_notes(loss: LossReport) -> Iterator[Reason]:
-    """What the input lost."""
     if loss.invalid_depth:
         yield noted("input", f"{loss.invalid_depth} pixels of depth NaN, infinite, negative or 65535: taken as none")
-    for text in loss.notes:
-        yield noted("input", text)
+    yield from (noted("input", text) for text in loss.notes)
 
 
 def _map(made: Reconstructed) -> Iterator[Reason]:
     """Whether there is anything that a distance could be taken to: splats, and occupied voxels without one."""
-    metrics, scene = made.metrics, made.config.scene
-    num = metrics["unrepresented_voxels"]
+    metrics, num = made.metrics, made.metrics["unrepresented_voxels"]
     num_splats = metrics["splats"] - metrics["robot_splats"]
     is_empty = num_splats + num == 0
     yield Reason(
@@ -127,7 +116,7 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
             sentence=f"{num} voxels ({1e3 * metrics['unrepresented_volume']:.2f} l) are occupied and have no splat; "
             "they are obstacles as they are",
             value=float(num),
-            remedy=f"raise --max-splats above {scene.max_splats}",
+            remedy=f"raise --max-splats above {made.config.scene.max_splats}",
             count=metrics["splats"] + num,
         )
 

@@ -163,7 +163,8 @@ class CameraAgreement:
 
         Raises InputError where cameras place surfaces too far apart, or views fit at another scale of depth only.
         """
-        if not self._has_new_pairs(step):
+        names = sorted(frame.camera for frame in step.frames)
+        if {" and ".join(dict.fromkeys(pair)) for pair in combinations(names, 2)} <= self.disagreement.keys():
             return
         if self._is_still and not self.disagreement:
             self._check_scale(step, console)
@@ -210,9 +211,3 @@ class CameraAgreement:
             if len(units) == len(self._source.cameras):
                 break
         return {*units.values()} or {None}
-
-    def _has_new_pairs(self, step: TimeStep) -> bool:
-        """Whether two views of this time step are from cameras that have not been compared yet."""
-        names = sorted(frame.camera for frame in step.frames)
-        pairs = {" and ".join(dict.fromkeys(pair)) for pair in combinations(names, 2)}
-        return not pairs <= self.disagreement.keys()

@@ -1,4 +1,4 @@
-"""``--evidence``: depth that did not train the map, and how far the map misses the surface that it shows.
+"""What a replay is held against: depth that did not train the map (``--evidence``), and the truth of a simulated log.
 
 The field's value at a surface point is how far the map misses it. Where a sphere's true clearance is d and p the
 true surface point nearest to it, the map's clearance is at most d plus the miss at p, because the exact distance is
@@ -13,45 +13,33 @@ from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
 from splatctrl_cli.config.motion import VerdictConfig
+from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import DistanceFunction
+from splatctrl_cli.control.events import Event, EventFold, EventKind, Obstacle
+from splatctrl_cli.control.signals import clearance_signals
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.conformal import ConformalBound, conformal_bound
+from splatctrl_cli.evaluate.clearance_agreement import clearance_agreement, mark_seen
+from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.files.spilled_rows import ranges
+from splatctrl_cli.files.spilled_rows import RowFile, Rows, ranges
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.reconstruct.reconstruction import training_cameras
-from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.state_store import StoredAudit
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame, Stamps
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep, time_steps
+from splatctrl_cli.simulate.truth import distance_to
 
 EVERY = "held_out_every"  # the metric of a scene in lockstep that says which frame sets did not train it
-
-
-@dataclass(frozen=True, kw_only=True)
-class MapError:
-    """What held-out frame sets say of the map: `bound` is None where they are too few.
-
-    source: which frames, in words; num_sets: those within the judged time, num_seen of them with points near the
-    motion, num_points in all; time_s, place (3,) [m]: when (since the first judged state) and where the map misses as
-    much as the bound says. A bound below 0, of a map that is fatter than what it shows everywhere, is given as 0.
-    """
-
-    source: str
-    num_sets: int
-    num_seen: int
-    num_points: int
-    bound: ConformalBound | None
-    time_s: float | None = None
-    place: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,3 +267,91 @@ class Swept:
         """Those of points (Q, 3) [m] that are."""
         inside = points[self._box.contains(points)]
         return inside[self._field.query(inside)[0] <= self._reach] if len(inside) else inside
+
+
+class TrueSurfaces:
+    """The true surface points (T, 3) [m] nearest to each state's spheres, and which of them a camera saw by then."""
+
+    def __init__(self, points: Rows, stamp_ns: Stamps, inputs: ReplayInputs) -> None:
+        self._points, self._stamp_ns = points, stamp_ns
+        self._cameras, self._has_clock = inputs.scene.cameras, inputs.source.has_clock
+        self.seen = np.zeros(len(stamp_ns), dtype=np.bool_)
+
+    def watching(self, frames: Iterable[RgbdFrame]) -> Iterator[RgbdFrame]:
+        """The same frames; those of a camera that made the scene are taken in on their way."""
+        for frame in frames:
+            if self._cameras is None or frame.camera in self._cameras:
+                mark_seen(self.seen, self._points, self._stamp_ns, frame, has_clock=self._has_clock)
+            yield frame
+
+
+def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfaces | None]:
+    """With the true clearance of every state and its events, and the surfaces that it is to; None without a truth."""
+    if inputs.truth is None:
+        return replay, None
+    model, trace = inputs.model, replay.audit
+    moving = np.flatnonzero(model.moving_spheres)
+    radii = model.sphere_set.radii[moving]
+    clearances, surfaces, nearest_spheres = RowFile(), RowFile((3,)), RowFile()
+    for first, last in ranges(len(trace.stamp_ns)):
+        clearance, surface = np.zeros(last - first), np.zeros((last - first, 3))
+        spheres = np.zeros(last - first)
+        stamps, positions = trace.stamp_ns[first:last].tolist(), trace.position[first:last]
+        for index, (stamp, q) in enumerate(zip(stamps, positions, strict=True)):
+            distance, points = inputs.truth.closest(model.sphere_centers(q)[moving], stamp)
+            gap = _unexpected(inputs, moving, distance - radii, points, stamp, replay.margin)
+            nearest = int(np.argmin(gap))
+            clearance[index], surface[index] = gap[nearest], points[nearest]
+            spheres[index] = moving[nearest]
+        clearances.append(clearance)
+        nearest_spheres.append(spheres)
+        surfaces.append(surface)
+    truth = Rows(clearances)
+    events = _true_events(inputs, replay, np.asarray(truth), Rows(nearest_spheres))
+    merged = tuple(sorted((*replay.events, *events), key=lambda event: (event.first_ns, -event.last_ns)))
+    found = replace(replay, true_clearance=truth, events=merged)
+    return found, TrueSurfaces(Rows(surfaces), trace.stamp_ns, inputs)
+
+
+def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
+    """With how an audit agrees with the truth near surfaces that a camera saw, once all frames have been seen."""
+    truth = np.asarray(replay.true_clearance)
+    agreement = {
+        name: clearance_agreement(of.distance, truth, surfaces.seen, replay.median_radius)
+        for name, of in replay.audit.clearance.items()
+    }
+    return replace(replay, agreement=agreement)
+
+
+def _unexpected(
+    inputs: ReplayInputs, moving: NDArray[np.intp], gap: Float64, points: Float64, stamp_ns: int, margin: float
+) -> Float64:
+    """True clearances (M,) of the moving spheres to points (M, 3), infinite where the contact is declared."""
+    if not inputs.declared.expected_contact:
+        return gap
+    links, seconds = inputs.model.sphere_set.links, (stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
+    is_meant = [
+        bool(gap[k] < margin and inputs.declared.expects(links[sphere], points[k], seconds))
+        for k, sphere in enumerate(moving)
+    ]
+    return np.where(is_meant, np.inf, gap)
+
+
+def _true_events(inputs: ReplayInputs, replay: Replay, clearance: Float64, spheres: Rows) -> tuple[Event, ...]:
+    """Intervals (of T states) below the margin, and in contact, by the truth."""
+    model, truth, audit = inputs.model, inputs.truth, replay.audit
+    assert truth is not None
+    names = sphere_names(model.sphere_set)
+    nearest = np.asarray(spheres[: len(clearance)], np.int64)
+    fold = EventFold()
+
+    def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
+        stamp, center = int(audit.stamp_ns[at]), model.sphere_centers(audit.position[at])[[names.index(name)]]
+        distance, surface = truth.closest(center, stamp)
+        there = [p for p in truth.primitives if p.is_present(stamp)]
+        least = min(there, key=lambda p: float(distance_to([p], center, stamp)[0]))
+        x, y, z = (float(v) for v in surface[0])
+        return Obstacle(distance=float(distance[0]), position=(x, y, z), name=least.name)
+
+    fold.add(audit.stamp_ns, clearance_signals("true", clearance, nearest, replay.margin, names), near)
+    return fold.events()

@@ -15,18 +15,21 @@ from splatctrl_cli.config.fixed import (
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
-from splatctrl_cli.jobs.replay.criteria_input import (
+from splatctrl_cli.jobs.replay.criteria import (
     MARGIN,
     UNKNOWN,
     Judged,
+    clocks,
+    evidence_age,
+    judged_time,
     least_of,
+    map_age,
     mm,
     nearby,
     seconds_at,
 )
 from splatctrl_cli.jobs.replay.request import OCCUPIED
 from splatctrl_cli.jobs.replay.state_store import Figures
-from splatctrl_cli.jobs.replay.time_criteria import clocks, evidence_age, judged_time, map_age
 from splatctrl_cli.records import Float64
 from splatctrl_cli.voxels import EvidenceClass
 
@@ -209,7 +212,7 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
     if share <= allowed:
         yield held(f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.num_states)
         return
-    first = int(np.argmax(judged.replay.audit.unknown_share > allowed))
+    first = int(np.argmax(judged.replay.audit.figures["unknown_share"] > allowed))
     yield lacking(
         sentence=f"{100 * share:.1f} % of the sphere centres lie in space no camera ever saw, allowed "
         f"{100 * allowed:g} %, first",

@@ -1,9 +1,11 @@
-"""What a replay leaves in its folder: steps, events, a summary, pictures."""
+"""What a replay leaves in its folder: steps, events, a summary, plots, and pictures of the moments at which it was
+nearest to the scene.
+"""
 
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +13,22 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.arm import sphere_names
-from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event, first_intervention
+from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event, EventKind, first_intervention
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.evaluate.worst_frames import Moment, Sight, draw_sight, sights_of, worst_moments
 from splatctrl_cli.files.output import Stopwatch, finite, write_json, write_run
 from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.jobs.replay.metrics import Metrics
-from splatctrl_cli.jobs.replay.pictures import draw_replay
-from splatctrl_cli.jobs.replay.result import Replay
-from splatctrl_cli.records import Float64
+from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs
+from splatctrl_cli.records import Float64, FloatRows, RgbdFrame
+from splatctrl_cli.report.replay_pictures import (
+    clearance_picture,
+    commands_picture,
+    divergence_picture,
+    evidence_picture,
+    open_loop_picture,
+)
 
 UNITS = {
     **dict.fromkeys(("below-margin", "in-collision", "between-states", "self-collision", "hold", "cannot-act"), "m"),
@@ -29,16 +38,13 @@ _SPECIAL = re.compile('[,"\r\n]')
 
 Columns = dict[str, list[object]]
 
-ALL = slice(None)
-
 
 def chunks_of(replay: Replay) -> Iterator[Columns]:
     """`columns_of` all states, BLOCK at a time, so that a long log is never a table in memory."""
-    for first in range(0, len(replay.audit.stamp_ns), BLOCK):
-        yield columns_of(replay, slice(first, first + BLOCK))
+    return (columns_of(replay, slice(k, k + BLOCK)) for k in range(0, len(replay.audit.stamp_ns), BLOCK))
 
 
-def columns_of(replay: Replay, rows: slice = ALL) -> Columns:
+def columns_of(replay: Replay, rows: slice = slice(None)) -> Columns:
     """Every column of a range of states, by name."""
     first, last, _ = rows.indices(len(replay.audit.stamp_ns))
     audit, names = replay.audit.block(first, last), sphere_names(replay.model.sphere_set)
@@ -80,11 +86,11 @@ def _step_columns(replay: Replay, rows: slice) -> Columns:
     def each(value: Callable[[ControlStep], object]) -> list[object]:
         return ["" if step is None else value(step) for step in steps]
 
-    def velocity_of(joint: int) -> list[object]:
-        return each(lambda step: float(step.velocity[joint]))
-
     return {
-        **{f"v_{joint}": velocity_of(j) for j, joint in enumerate(replay.model.joint_names)},
+        **{
+            f"v_{joint}": ["" if step is None else float(step.velocity[j]) for step in steps]
+            for j, joint in enumerate(replay.model.joint_names)
+        },
         "barrier_clearance": each(lambda step: step.clearance),
         "barrier_nearest": each(lambda step: step.nearest),
         "rung": each(lambda step: str(step.rung)),
@@ -130,7 +136,7 @@ def write_replay(
     write_json(folder / "events.json", events_document(replay))
     write_json(folder / "summary.json", summary_of(replay, metrics, verdict, robot))
     with stopwatch.stage("picture"):
-        draw_replay(folder, replay, seconds_of(replay))
+        draw_replay(folder, replay, np.asarray((replay.audit.stamp_ns - replay.audit.stamp_ns[0]) * 1e-9))
     write_run(
         folder,
         command="replay",
@@ -160,8 +166,12 @@ def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, robot: Mappin
 def events_document(replay: Replay) -> dict[str, Any]:
     """events.json: what happened as intervals, what never moves, and where the scene changed under the arm."""
     changes = () if replay.closed_loop is None else replay.closed_loop.scene_changes
+    numbers = ("worst", "worst_s", "start_s", "end_s")
     return {
-        "events": [_event_document(event) for event in replay.events],
+        "events": [
+            asdict(event) | {"unit": UNITS.get(event.kind, "")} | {n: finite(getattr(event, n)) for n in numbers}
+            for event in replay.events
+        ],
         "static_violations": [asdict(violation) for violation in replay.static_violations],
         "scene_changes": [
             asdict(change) | {"is_hit": change.is_hit}
@@ -204,16 +214,6 @@ def told(event: Event, *, with_kind: bool = True) -> str:
     return ", ".join(filter(None, (span, f"{who}{more}", f"worst {worst} at {event.worst_s:.2f} s{near}")))
 
 
-def seconds_of(replay: Replay) -> Float64:
-    """Seconds (T,) since the replay's first state."""
-    return np.asarray((replay.audit.stamp_ns - replay.audit.stamp_ns[0]) * 1e-9)
-
-
-def _event_document(event: Event) -> dict[str, Any]:
-    numbers = {name: finite(getattr(event, name)) for name in ("worst", "worst_s", "start_s", "end_s")}
-    return asdict(event) | {"unit": UNITS.get(event.kind, "")} | numbers
-
-
 def write_steps(path: Path, chunks: Iterable[Mapping[str, Sequence[object]]]) -> None:
     """Write chunks of rows, each as equally long columns of the same names, as one CSV.
 
@@ -238,15 +238,136 @@ def _formatted(values: Sequence[object]) -> tuple[str, Sequence[object]]:
     if kinds == {str}:
         known = {value: _quoted(str(value)) for value in set(values)}
         return "%s", [known[value] for value in values]
-    return "%s", [_cell(value) for value in values]
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.9g}" if math.isfinite(value) else ""
-    return _quoted(str(value))
+    return "%s", [
+        _quoted(str(v)) if not isinstance(v, float) else f"{v:.9g}" if math.isfinite(v) else "" for v in values
+    ]
 
 
 def _quoted(text: str) -> str:
     """A cell as CSV has it: between quotes where it holds a comma, a quote or the end of a line."""
     return '"' + text.replace('"', '""') + '"' if _SPECIAL.search(text) else text
+
+
+NAMES = {"exact": "exact", "barrier": "barrier", "certified": "certified bound"}  # of the fields, in a caption
+TITLES = {
+    "audit": "Clearance of the logged motion",
+    "open-loop": "Clearance of the logged motion",
+    "closed-loop": "Clearance in closed loop",
+}
+ROWS = ("scene", "self", "limit")  # kinds of rows that shape a command
+
+
+def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
+    """Write clearance.png, and evidence.png where that is known; of a controller commands.png, in open loop
+    open_loop.png, in closed loop divergence.png.
+
+    seconds: (T,) since the first state.
+    """
+    curves: dict[str, FloatRows] = {name: of.rows for name, of in replay.audit.clearance.items()}
+    if replay.true_clearance is not None:
+        curves["truth"] = replay.true_clearance
+    happened = _intervals(replay, lambda event: event.kind not in INTERVENTIONS and event.source in SHOWN)
+    title = TITLES[replay.mode]
+    if replay.closed_loop is not None and replay.start_time_s > 0:
+        title += f", from {replay.start_time_s:.2f} s of the log"
+    clearance_picture(folder / "clearance.png", seconds, curves, replay.margin, title, happened)
+    if np.isfinite(shares := replay.near["shares"]).any():
+        evidence_picture(folder / "evidence.png", seconds, shares)
+    if replay.kept_steps is not None:
+        broken = frozenset({EventKind.ROW_BROKEN})
+        kinds, rows = (INTERVENTIONS, ROWS) if replay.outside is None else (broken, tuple(broken))
+        commands_picture(
+            folder / "commands.png",
+            seconds,
+            replay.kept_steps.figures.rows("velocity"),
+            replay.model.joint_names,
+            replay.model.velocity_limit,
+            _intervals(replay, lambda event: event.kind in kinds, at_least=rows),
+            None if replay.open_loop is None else replay.open_loop.figures.rows("logged"),
+        )
+    if replay.open_loop is not None:
+        shaped = [(event.start_s, event.end_s) for event in replay.events if event.kind in ROWS]
+        open_loop_picture(
+            folder / "open_loop.png",
+            seconds,
+            replay.open_loop.figures.rows("difference"),
+            replay.model.joint_names,
+            replay.open_loop.figures.rows("barrier"),
+            shaped,
+        )
+    if replay.divergence is not None and np.isfinite(replay.divergence["joints"]).any():
+        of = [replay.divergence[name] for name in ("joints", "position", "rotation")]
+        divergence_picture(folder / "divergence.png", seconds, *of)
+
+
+def _intervals(
+    replay: Replay, is_shown: Callable[[Event], bool], *, at_least: Sequence[str] = ()
+) -> dict[str, list[tuple[float, float]]]:
+    """First and last time [s] of the events that are shown, by kind and measure; `at_least` these kinds, if empty."""
+    found: dict[str, list[tuple[float, float]]] = {kind: [] for kind in at_least}
+    for event in replay.events:
+        if is_shown(event):
+            found.setdefault(f"{event.kind}{SHOWN.get(event.source, '')}", []).append((event.start_s, event.end_s))
+    return found
+
+
+def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterable[RgbdFrame]) -> list[Sight | None]:
+    """The images of the moments of least clearance, by the truth where that is known, the least first; None where no
+    camera has one. Frames behind the last moment are not read.
+    """
+    audit = replay.audit
+    least = audit.clearance["exact"].distance
+    if replay.true_clearance is not None:
+        least = np.fmin(least, np.asarray(replay.true_clearance))
+    states = worst_moments(audit.stamp_ns, least, num)
+    if not states or not inputs.source.has_clock:
+        return []
+    return sights_of([_moment(inputs, replay, state) for state in states], frames)
+
+
+def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | None]) -> list[str]:
+    """Write worst_1.png, worst_2.png ...; what there is to say of it."""
+    seen = [sight for sight in sights if sight is not None]
+    for number, sight in enumerate(seen, start=1):
+        first, *rest = sight.moment.caption
+        whose = "driven arm; the image shows the logged one" if replay.mode == "closed-loop" else "logged posture"
+        caption = (
+            f"worst {number}   {first}",
+            *rest,
+            f"{sight.frame.camera}, taken {sight.age_s:.2f} s before; spheres of the {whose}",
+        )
+        explained = replace(sight, moment=replace(sight.moment, caption=caption))
+        draw_sight(folder / f"worst_{number}.png", explained)
+    if len(seen) < len(sights):
+        return [f"worst frames: no camera image at or before {len(sights) - len(seen)} of {len(sights)} moments"]
+    return []
+
+
+def _moment(inputs: ReplayInputs, replay: Replay, state: int) -> Moment:
+    """A state with the obstacle that is nearest to its nearest sphere."""
+    audit, model = replay.audit, replay.model
+    stamp, worst = int(audit.stamp_ns[state]), int(audit.clearance["exact"].sphere[state])
+    centers = model.sphere_centers(np.asarray(audit.position[state]))
+    (obstacle,) = inputs.scene.at(stamp).obstacles(np.ascontiguousarray(centers[[worst]]))
+    figures = [f"{NAMES.get(name, name)} {_cm(float(of.distance[state]))}" for name, of in audit.clearance.items()]
+    if replay.true_clearance is not None:
+        figures.append(f"truth {_cm(float(replay.true_clearance[state]))}")
+    step = replay.steps[state] if replay.steps else None
+    rung = "" if step is None else f"   step: {step.rung}" + (f", scaled by {step.scale:g}" if step.scale < 1 else "")
+    seconds = (stamp - int(audit.stamp_ns[0])) * 1e-9
+    return Moment(
+        stamp_ns=stamp,
+        centers=centers,
+        radii=np.asarray(model.sphere_set.radii),
+        is_moving=np.asarray(model.moving_spheres),
+        worst=worst,
+        obstacle=np.array(obstacle.position),
+        caption=(
+            f"{seconds:.2f} s   {sphere_names(model.sphere_set)[worst]}   clearance: {', '.join(figures)}{rung}",
+            f"nearest: {obstacle}",
+        ),
+    )
+
+
+def _cm(metres: float) -> str:
+    return f"{100 * metres:.2f} cm"

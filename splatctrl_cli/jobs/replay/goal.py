@@ -24,8 +24,7 @@ from splatctrl_cli.control.step import OURS, Commander, ControlStep
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.replay.result import OutsideRun
+from splatctrl_cli.jobs.replay.request import OutsideRun, ReplayRequest
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.state.twists import read_twists
 from splatctrl_cli.records import Float64, FloatRows, Stamps
@@ -221,8 +220,7 @@ def twist_figures(
         reference = track.reference(model, config, q, int(stamp))
         if known:
             num_known += 1
-            asked = track.asked(model, q, int(stamp), config.twist_timeout)
-            num_capped += not np.array_equal(reference, asked)
+            num_capped += not np.array_equal(reference, track.asked(model, q, int(stamp), config.twist_timeout))
         if step is not None:
             missed = model.frame_jacobian(q, frame) @ step.velocity - reference
             linear[i], angular[i] = np.linalg.norm(missed[:3]), np.linalg.norm(missed[3:])

@@ -135,8 +135,7 @@ class Hindsight:
         """Stamps at which a newer scene is known."""
         shown = self._scene.age_s(stamp_ns)
         for later_ns in range(stamp_ns + STEP_NS, stamp_ns + UNWATCHED_AFTER_NS, STEP_NS):
-            age = self._scene.age_s(later_ns)
-            if age < shown + (later_ns - stamp_ns) * 1e-9 - 1e-6:
+            if self._scene.age_s(later_ns) < shown + (later_ns - stamp_ns) * 1e-9 - 1e-6:
                 yield later_ns
 
     def _hold_against(self, since_ns: int, until_ns: int, num: int) -> None:

@@ -30,6 +30,7 @@ from splatctrl_cli.voxels import SWEPT, Balls, EvidenceClass, OccupancyGrid, See
 
 Key = TypeVar("Key", bound=Hashable)
 BY_CAMERA = (VoxelState.FREE, VoxelState.UNCERTAIN, VoxelState.OCCUPIED)  # voxels that a camera saw
+ROUNDING = 1e-5  # [m] taken off distances to splats, far above what float32 rounds within 8 m
 HELD = 2  # scenes whose fields are kept: a rate of change needs two
 
 
@@ -297,8 +298,7 @@ def _nearest_spheres(obstacles: ObstacleSpheres, index: Index, points: Float64) 
 def _nearest_cells(grid: DistanceGrid, field: GridField, points: Float64) -> tuple[Obstacle, ...]:
     """The cells that hold the nearest surface to points (Q, 3), as the gradient points to it."""
     distance, gradient = field.query(points)
-    length = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
-    surface = points - gradient * (distance / length)[:, None]
+    surface = points - gradient * (distance / np.maximum(np.linalg.norm(gradient, axis=1), 1e-12))[:, None]
     cells = np.nan_to_num(np.floor((surface - grid.origin) / grid.voxel + 0.5)).astype(np.int64)
     return tuple(
         Obstacle(
@@ -321,3 +321,23 @@ def _median_radius(file: Path, header: Mapping[str, object]) -> float:
     if not isinstance(radius, Mapping) or not isinstance(radius.get("median"), float):
         raise InputError(f"{file}: header: expected the splats' median radius, got none", remedy="bake it again")
     return float(radius["median"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Certified:
+    """A scene to plan in: a lower bound of the exact distance to the splats."""
+
+    distance: DistanceFunction
+
+
+def certified_distance(fields: KnownFields) -> DistanceFunction:
+    """A lower bound of a 1-Lipschitz distance: of a grid its certified one, of splats the exact one less rounding.
+
+    Both bound the exact distance to the splats, so what is proved of an edge is proved of that. Of the kernel fields
+    nothing can be proved from samples: their slope has no useful bound.
+    """
+    certified = fields.distances.get("certified")
+    if certified is not None:
+        return certified
+    exact = fields.distances["exact"]
+    return lambda points: exact(points) - ROUNDING

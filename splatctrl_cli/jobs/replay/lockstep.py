@@ -168,7 +168,12 @@ class Lockstep:
         while self._next is not None and not self._stamps_ns:
             self._take()
         self._fitted.check_found()
-        known_at = fields_at(self._stamps_ns, self._latency_ns, self._files.__getitem__, self._fields)
+
+        def fields(file: Path) -> KnownFields:
+            balls = read_unrepresented(file.with_suffix(".npz"))
+            return splat_fields(read_ply(file)[0], self._config, self._fitted.request.threads, balls)
+
+        known_at = fields_at(self._stamps_ns, self._latency_ns, self._files.__getitem__, fields)
         voxels = lru_cache(maxsize=1)(lambda file: read_seen(file.with_suffix(".npz")))
 
         def at(stamp_ns: int) -> KnownFields:
@@ -216,10 +221,6 @@ class Lockstep:
         for snapshot in taken[len(self._files) :]:
             self._stamps_ns.append(snapshot.stamp_ns)
             self._files.append(snapshot.path)
-
-    def _fields(self, file: Path) -> KnownFields:
-        balls = read_unrepresented(file.with_suffix(".npz"))
-        return splat_fields(read_ply(file)[0], self._config, self._fitted.request.threads, balls)
 
     def _observed(self, points: Float64) -> UInt8:
         """The known space of the log, or of as much of it as the replay has passed."""

@@ -44,7 +44,7 @@ from splatctrl_cli.evaluate.metrics import (
 )
 from splatctrl_cli.jobs.replay.goal import TWIST_FIGURES
 from splatctrl_cli.jobs.replay.inputs import LOG_FIGURES, LoggedStates
-from splatctrl_cli.jobs.replay.result import Replay
+from splatctrl_cli.jobs.replay.request import Replay
 from splatctrl_cli.jobs.replay.state_store import RUNGS
 from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.voxels import EvidenceClass
@@ -79,12 +79,7 @@ def _single(
 
 def _clearance(field: str) -> Metric[Replay]:
     name = "min_clearance" if field == "exact" else f"min_clearance_{field}"
-    shown = least_of(f"clearance_{field}")
-    return folded(name, LEAST, lambda replay: replay.audit.clearance[field].distance, scale=GAP, shown=shown)
-
-
-def _exact(replay: Replay) -> Float64:
-    return replay.audit.clearance["exact"].distance
+    return folded(name, LEAST, AUDIT(f"distance {field}"), scale=GAP, shown=least_of(f"clearance_{field}"))
 
 
 def _of(columns: str, name: str, part: int | None = None) -> Callable[[Replay], Float64]:
@@ -95,10 +90,6 @@ def _of(columns: str, name: str, part: int | None = None) -> Callable[[Replay], 
     return lambda replay: figures(replay)[name] if part is None else figures(replay)[name][:, part]
 
 
-def _intervals(replay: Replay) -> int:
-    return num_states(replay) - 1
-
-
 def _num_sudden(replay: Replay) -> int:
     """States that have an acceleration, where that has a limit."""
     since = replay.audit.stamp_ns - replay.audit.stamp_ns[0]
@@ -107,13 +98,16 @@ def _num_sudden(replay: Replay) -> int:
 
 def _map_error(name: str, figure: str, scale: Scale) -> Metric[Replay]:
     """By held-out depth; None without, or where that is too little."""
+    return _single(
+        name,
+        lambda r: getattr(r.map_error.bound, figure) if r.map_error and r.map_error.bound else None,
+        lambda r: r.map_error.num_seen if r.map_error else 0,
+        scale,
+    )
 
-    def value(replay: Replay) -> float | None:
-        bound = None if replay.map_error is None else replay.map_error.bound
-        found: float | None = None if bound is None else getattr(bound, figure)
-        return found
 
-    return _single(name, value, lambda replay: 0 if replay.map_error is None else replay.map_error.num_seen, scale)
+def _intervals(replay: Replay) -> int:
+    return num_states(replay) - 1
 
 
 LIMIT = Scale(unit="rad", better=Better.HIGHER, absolute=1e-3)  # or m, of a prismatic joint
@@ -124,6 +118,7 @@ TURNED = Scale(unit="rad", better=Better.LOWER, absolute=ControlConfig().goal_ro
 RESIDUAL = Scale(better=Better.LOWER, absolute=1e-6)
 FULFILLED = Scale(better=Better.HIGHER)  # of 0 or 1, and of counts
 NEAREST = least_of("clearance_exact")
+AUDIT = partial(_of, "audit.figures")
 OF_AUDIT: Declared = (
     _single("num_spheres", lambda replay: len(replay.model.sphere_set.radii)),
     _single("num_bare_links", lambda r: len(r.model.bare_links), lambda r: len(r.model.urdf.links), FAULTS),
@@ -148,20 +143,22 @@ OF_STATES: Declared = (
         scale=GAP,
         shown=least_of("clearance_true"),
     ),
-    counted("num_below_margin", _exact, lambda replay, values: values < replay.margin, shown=NEAREST),
-    counted("num_in_collision", _exact, lambda _, values: values < 0, shown=NEAREST),
+    counted(
+        "num_below_margin", AUDIT("distance exact"), lambda replay, values: values < replay.margin, shown=NEAREST
+    ),
+    counted("num_in_collision", AUDIT("distance exact"), lambda _, values: values < 0, shown=NEAREST),
     folded(
         "min_self_clearance",
         LEAST,
-        lambda replay: replay.audit.self_clearance,
-        lambda replay: int(np.isfinite(replay.audit.self_clearance).sum()),
+        AUDIT("self_clearance"),
+        lambda replay: int(np.isfinite(replay.audit.figures["self_clearance"]).sum()),
         scale=GAP,
         shown=least_of("self_clearance"),
     ),
     folded(
         "min_limit_margin",
         LEAST,
-        lambda replay: replay.audit.limit_margin,
+        AUDIT("limit_margin"),
         num_states,
         scale=LIMIT,
         shown=least_of("limit_margin"),
@@ -188,7 +185,7 @@ OF_STATES: Declared = (
     folded(
         "unknown_share",
         MEAN,
-        lambda replay: replay.audit.unknown_share,
+        AUDIT("unknown_share"),
         scale=BAD_SHARE,
         shown=largest_of("unknown_share"),
     ),
@@ -223,15 +220,10 @@ def _rung(rung: Rung) -> Metric[Replay]:
     return counted(name, STEPS("rung"), lambda _, values: values == RUNGS.index(rung), scale=scale, shown=shown)
 
 
-def _first_intervention(replay: Replay) -> float | None:
-    first = first_intervention(replay.events)
-    return None if first is None else first.start_s
-
-
 OF_STEPS: Declared = (
     folded("intervention_share", MEAN, STEPS("shaped")),
     *(folded(f"intervention_share_{kind}", MEAN, STEPS(f"shaped {kind}")) for kind in RowKind),
-    _single("first_intervention_s", _first_intervention, scale=TIME),
+    _single("first_intervention_s", lambda r: getattr(first_intervention(r.events), "start_s", None), scale=TIME),
     folded("min_barrier_clearance", LOWEST, STEPS("clearance"), scale=GAP, shown=least_of("barrier_clearance")),
     *(_rung(rung) for rung in (Rung.SOLVED, Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD)),
     folded("num_refused", TOTAL, STEPS("refused"), scale=FAULTS),
@@ -252,12 +244,7 @@ OF_OPEN_LOOP: Declared = (
 
 def _trace(name: str, value: Callable[[ReplayTrace], float], scale: Scale = DESCRIBES) -> Metric[Replay]:
     """A figure of the closed loop."""
-
-    def of_trace(replay: Replay) -> float:
-        assert replay.closed_loop is not None
-        return value(replay.closed_loop)
-
-    return _single(name, of_trace, scale=scale)
+    return _single(name, lambda replay: value(replay.closed_loop) if replay.closed_loop else None, scale=scale)
 
 
 OF_CLOSED_LOOP: Declared = (
@@ -321,8 +308,7 @@ def metric_scales(
     mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
 ) -> dict[str, Scale]:
     """How two runs are compared by each of `metric_names`."""
-    scales = {metric.name: metric.scale for metric in _declared(mode, of_fields)}
-    scales |= LOG_FIGURES
+    scales = {metric.name: metric.scale for metric in _declared(mode, of_fields)} | LOG_FIGURES
     scales |= TWIST_FIGURES if has_twists else {}
     if has_truth:
         scales |= {f"truth_{figure}_{name}": scale for name in of_fields for figure, scale in AGREEMENT.items()}
@@ -364,11 +350,9 @@ def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> f
     figure of single states.
     """
     running = next((of.running for of in _declared_of(replay) if of.name == metric), None)
-    if running is None:
-        return None
-    start, values = running(replay)
-    if not holds(start):
+    start, values = (np.nan, ()) if running is None else running(replay)
+    if running is None or not holds(start):
         return None
     stamps = replay.audit.stamp_ns
-    first = next((index for index, value in enumerate(values) if not holds(float(value))), None)
-    return None if first is None else float(stamps[first] - stamps[0]) * 1e-9
+    times = (float(stamps[index] - stamps[0]) * 1e-9 for index, value in enumerate(values) if not holds(float(value)))
+    return next(times, None)

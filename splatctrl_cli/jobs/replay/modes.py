@@ -7,22 +7,20 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.barriers import scene_margin
-from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
+from splatctrl_cli.control.goals import LoggedMotion, PlanDetour, TwistTrack
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.preconditions import StaticViolation, check_within_limits, static_violations
-from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, StepRecord, closed_loop, divergence, scene_change
-from splatctrl_cli.control.step import Commander
+from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence, scene_change
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.jobs.replay.detours import planned_ways_out
+from splatctrl_cli.jobs.recordings.provenance import times_apart
 from splatctrl_cli.jobs.replay.goal import commander_of, goal_waypoints, outside_run, twist_figures, twist_track
 from splatctrl_cli.jobs.replay.inputs import check_inside
-from splatctrl_cli.jobs.replay.known_scene import KnownScene
-from splatctrl_cli.jobs.replay.provenance import times_apart
-from splatctrl_cli.jobs.replay.request import FIRST_MAP, ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.result import Replay
+from splatctrl_cli.jobs.replay.known_scene import Certified, KnownScene, certified_distance
+from splatctrl_cli.jobs.replay.request import FIRST_MAP, Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.state_pass import ReplayRecord
 from splatctrl_cli.jobs.replay.state_store import Figures, StoredLoop, StoredOpenLoop
 from splatctrl_cli.jobs.running.progress import Progress
+from splatctrl_cli.planner.planned import planned_detours
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.model import RobotModel
@@ -104,7 +102,18 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, consol
     console.log(f"replay: from {start_s:.2f} s of the log, {limit}")
     loop = StoredLoop(model.num_joints)
     with commander_of(request, model, config.control, console, frame=task.frame, home=task.home) as commander:
-        trace = _trace(inputs, task, config, loop, commander)
+        trace = closed_loop(
+            model,
+            config.control,
+            task,
+            lambda stamp: scene.at(stamp).barrier,
+            scene_step_at=scene.step_at,
+            plan_detour=planned_ways_out(inputs, task, config),
+            record=loop,
+            commander=commander,
+            distance_to=scene.at(task.stamp_ns).distances["exact"],
+            balls_at=lambda stamp: scene.at(stamp).balls,
+        )
     trace = _with_next_scene(trace, scene, model)
     apart = Figures()
     for first, last in record.blocks(trace.stamp_ns):
@@ -123,29 +132,6 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, consol
             model, config.control, task.frame, task.twists, trace.stamp_ns, trace.position, trace.steps
         ),
         outside=outside_run(commander),
-    )
-
-
-def _trace(
-    inputs: ReplayInputs,
-    task: ReplayTask,
-    config: Config,
-    record: StepRecord,
-    commander: Commander,
-) -> ReplayTrace:
-    """The closed loop of a commander."""
-    scene = inputs.scene
-    return closed_loop(
-        inputs.model,
-        config.control,
-        task,
-        lambda stamp: scene.at(stamp).barrier,
-        scene_step_at=scene.step_at,
-        plan_detour=planned_ways_out(inputs, task, config),
-        record=record,
-        commander=commander,
-        distance_to=scene.at(task.stamp_ns).distances["exact"],
-        balls_at=lambda stamp: scene.at(stamp).balls,
     )
 
 
@@ -275,4 +261,18 @@ def _task(
         end_ns=motion.last_ns,
         anchors=motion if request.re_anchor else None,
         anchor_period=request.re_anchor or 0.0,
+    )
+
+
+def planned_ways_out(inputs: ReplayInputs, task: ReplayTask, config: Config) -> PlanDetour | None:
+    """What plans the closed loop's ways out of local minima; None where it may take none."""
+    if config.control.max_detours == 0:
+        return None
+    return planned_detours(
+        inputs.model,
+        lambda stamp_ns: Certified(distance=certified_distance(inputs.scene.at(stamp_ns))),
+        task.frame,
+        config.planner,
+        config.control,
+        home=task.home,
     )

@@ -8,8 +8,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
 from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.evaluate.verdict import Criterion, Reason, counted, failed, held, lacking
-from splatctrl_cli.jobs.replay.control_criteria import commanded, controller, goal, scene_hits
-from splatctrl_cli.jobs.replay.criteria_input import (
+from splatctrl_cli.jobs.replay.criteria import (
     BROKEN,
     CONTACT,
     LIMITS,
@@ -17,9 +16,13 @@ from splatctrl_cli.jobs.replay.criteria_input import (
     SLOW,
     UNKNOWN,
     Judged,
+    commanded,
+    controller,
     events_of,
+    goal,
     least_of,
     mm,
+    scene_hits,
     time_of_least,
 )
 from splatctrl_cli.jobs.replay.inputs import bare_moving_links, recorded_postures
@@ -77,8 +80,7 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
     if least >= judged.threshold:
         yield held(f"at least {mm(least)}", least, replay.margin, "m", judged.num_states)
         return
-    kind = EventKind.IN_COLLISION if least < 0 else EventKind.BELOW_MARGIN
-    events = events_of(replay, kind, source)
+    events = events_of(replay, EventKind.IN_COLLISION if least < 0 else EventKind.BELOW_MARGIN, source)
     worst = min(events, key=lambda event: event.worst)
     states = sum(event.num_states for event in events)
     yield _at_worst(
@@ -136,7 +138,7 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     `control.self_margin` (or half of the largest gap that they ever have) and than in the recording. By their
     collision surfaces; by their spheres where these cannot be read.
     """
-    least = least_of(judged.replay.audit.self_clearance)
+    least = least_of(judged.replay.audit.figures["self_clearance"])
     events = events_of(judged.replay, EventKind.SELF_COLLISION)
     if least is None or not np.isfinite(least):
         return
@@ -233,7 +235,10 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
 
 def position_limits(judged: Judged) -> Iterator[Reason]:
     """Those of the URDF, with `control.limit_tolerance` for encoder noise."""
-    least, tolerance = least_of(judged.replay.audit.limit_margin), judged.request.config.control.limit_tolerance
+    least, tolerance = (
+        least_of(judged.replay.audit.figures["limit_margin"]),
+        judged.request.config.control.limit_tolerance,
+    )
     if least is None:
         return
     if least < -tolerance:
@@ -257,10 +262,7 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
     """At most one percent above those of the URDF, in the motion and in the commands of a controller of one's own."""
     too_fast = commanded(judged)
-    if too_fast is None:
-        yield from _share_of_limit(judged, "velocity", EventKind.TOO_FAST)
-    else:
-        yield too_fast
+    yield from _share_of_limit(judged, "velocity", EventKind.TOO_FAST) if too_fast is None else (too_fast,)
 
 
 def acceleration_limits(judged: Judged) -> Iterator[Reason]:
@@ -332,10 +334,9 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
         return
     if between < judged.threshold <= surface:
-        is_met = bool(columns["met"][int(np.nanargmin(columns["lower"]))])
         yield lacking(
             sentence=f"on the straight way between two states the arm comes to at most {mm(between)}"
-            if is_met
+            if bool(columns["met"][int(np.nanargmin(columns["lower"]))])
             else f"the arm may have come within {mm(between)} between two states",
             value=between,
             threshold=judged.replay.margin,

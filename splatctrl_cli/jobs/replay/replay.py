@@ -13,9 +13,17 @@ from splatctrl_cli.evaluate.worst_frames import Sight
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.jobs.reconstruct.reconstruct import declarations_of
-from splatctrl_cli.jobs.replay.criteria_input import Judged
-from splatctrl_cli.jobs.replay.evidence import Evidence, check_evidence, map_error, open_evidence
-from splatctrl_cli.jobs.replay.files import write_replay
+from splatctrl_cli.jobs.recordings.provenance import Mismatch, made_from_mismatches, scene_mismatches, truth_mismatch
+from splatctrl_cli.jobs.replay.criteria import Judged
+from splatctrl_cli.jobs.replay.evidence import (
+    Evidence,
+    check_evidence,
+    map_error,
+    open_evidence,
+    with_agreement,
+    with_truth,
+)
+from splatctrl_cli.jobs.replay.files import draw_worst_frames, worst_sights, write_replay
 from splatctrl_cli.jobs.replay.goal import check_controller, check_goal, check_twists
 from splatctrl_cli.jobs.replay.inputs import (
     LoggedStates,
@@ -33,11 +41,7 @@ from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.jobs.replay.lockstep import check_lockstep, opened_scene, reads_whole_log
 from splatctrl_cli.jobs.replay.metrics import Metrics, metric_names, metrics_of
 from splatctrl_cli.jobs.replay.modes import replayed
-from splatctrl_cli.jobs.replay.pictures import draw_worst_frames, worst_sights
-from splatctrl_cli.jobs.replay.provenance import Mismatch, made_from_mismatches, scene_mismatches, truth_mismatch
-from splatctrl_cli.jobs.replay.request import MODES, ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.result import Replay
-from splatctrl_cli.jobs.replay.truth import with_agreement, with_truth
+from splatctrl_cli.jobs.replay.request import MODES, Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.verdict import ASKED, replay_verdict
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL
 from splatctrl_cli.jobs.running.progress import SILENT, Progress

@@ -22,6 +22,7 @@ STEP_FIGURES = (
     *("clearance", "residual", "scale", "rung", "refused", "shaped"),
     *(f"shaped {kind}" for kind in RowKind),
 )
+AUDITED = ("position", "limit_margin", "limit_joint", "self_clearance", "self_pair", "unknown_share")
 STEP_BLANK = (np.nan,) * len(STEP_FIGURES)
 T = TypeVar("T")
 
@@ -109,10 +110,6 @@ class Figures:
         """A column (T,) that is read as it is asked for."""
         return Rows(self._files[name])
 
-    def block(self, name: str, first: int, last: int) -> Float64:
-        """Part of a column."""
-        return self._files[name].read(first, last)
-
 
 class StoredClearance:
     """As `Clearance`, a column read each time it is asked for."""
@@ -137,10 +134,12 @@ class StoredClearance:
 
 
 class StoredAudit:
-    """As `AuditTrace`, in files: position is read by rows, the other columns each time they are asked for."""
+    """As `AuditTrace`, in files: position is read by rows, clearances each time they are asked for; figures (T,): the
+    other columns, as `AuditTrace` has them.
+    """
 
     def __init__(self) -> None:
-        self._stamps, self._figures = StampColumn(), Figures()
+        self._stamps, self.figures = StampColumn(), Figures()
         self._names: tuple[str, ...] = ()
 
     def add(self, part: AuditTrace) -> None:
@@ -148,15 +147,8 @@ class StoredAudit:
         self._stamps.append(part.stamp_ns)
         for name, clearance in part.clearance.items():
             columns = {f"distance {name}": clearance.distance, f"sphere {name}": clearance.sphere.astype(np.float64)}
-            self._figures.append(**columns)
-        self._figures.append(
-            position=part.position,
-            limit_margin=part.limit_margin,
-            limit_joint=part.limit_joint.astype(np.float64),
-            self_clearance=part.self_clearance,
-            self_pair=part.self_pair.astype(np.float64),
-            unknown_share=part.unknown_share,
-        )
+            self.figures.append(**columns)
+        self.figures.append(**{name: np.asarray(getattr(part, name), np.float64) for name in AUDITED})
 
     @property
     def stamp_ns(self) -> Stamps:
@@ -166,60 +158,41 @@ class StoredAudit:
     @property
     def position(self) -> Rows:
         """(T, J)."""
-        return self._figures.rows("position")
+        return self.figures.rows("position")
 
     @property
     def clearance(self) -> Mapping[str, StoredClearance]:
         """By field name."""
-        return {name: StoredClearance(self._figures, name) for name in self._names}
-
-    @property
-    def limit_margin(self) -> Float64:
-        """(T,) [rad]."""
-        return self._figures["limit_margin"]
-
-    @property
-    def self_clearance(self) -> Float64:
-        """(T,) [m]."""
-        return self._figures["self_clearance"]
-
-    @property
-    def unknown_share(self) -> Float64:
-        """(T,)."""
-        return self._figures["unknown_share"]
+        return {name: StoredClearance(self.figures, name) for name in self._names}
 
     def block(self, first: int, last: int) -> AuditTrace:
         def part(name: str) -> Float64:
-            return self._figures.block(name, first, last)
+            return self.figures.rows(name)[first:last]
 
         return AuditTrace(
             stamp_ns=self.stamp_ns[first:last],
-            position=part("position"),
             clearance={
                 name: Clearance(distance=part(f"distance {name}"), sphere=part(f"sphere {name}").astype(np.int64))
                 for name in self._names
             },
-            limit_margin=part("limit_margin"),
             limit_joint=part("limit_joint").astype(np.int64),
-            self_clearance=part("self_clearance"),
             self_pair=part("self_pair").astype(np.int64),
+            position=part("position"),
+            limit_margin=part("limit_margin"),
+            self_clearance=part("self_clearance"),
             unknown_share=part("unknown_share"),
         )
 
 
 class StoredSteps:
     """Steps of a controller, None where it was not asked, with the figures (T,) that are asked for over all of them:
-    clearance, residual, scale, rung (its number), refused, shaped, and shaped by each kind of row.
+    clearance, residual, scale, rung (its number), refused, shaped, and shaped by each kind of row; and the velocity
+    (T, J) [rad/s], NaN without a step.
     """
 
     def __init__(self) -> None:
         self.stored: StoredObjects[ControlStep | None] = StoredObjects()
         self.figures = Figures()
-
-    @property
-    def velocity(self) -> Rows:
-        """(T, J) [rad/s], NaN without a step."""
-        return self.figures.rows("velocity")
 
     def extend(self, steps: Sequence[ControlStep | None], num_joints: int) -> None:
         blank = np.full(num_joints, np.nan)
@@ -282,7 +255,7 @@ class StoredLoop:
 
 class StoredOpenLoop:
     """As `OpenLoopTrace`, in files; figures (T,): size and largest of the difference, and by how much the logged
-    velocity keeps the tightest barrier row and limit.
+    velocity keeps the tightest barrier row and limit; (T, J) [rad/s]: logged, and difference: commanded less logged.
     """
 
     def __init__(self) -> None:
@@ -294,21 +267,10 @@ class StoredOpenLoop:
         """None where the controller was not asked."""
         return self.kept.stored
 
-    @property
-    def logged(self) -> Rows:
-        """(T, J) [rad/s]."""
-        return self.figures.rows("logged")
-
-    @property
-    def difference(self) -> Rows:
-        """(T, J) [rad/s] commanded less logged."""
-        return self.figures.rows("difference")
-
     def add(self, part: OpenLoopTrace) -> None:
         self.kept.extend(part.steps, part.logged.shape[1])
         self.margins.extend(part.margins)
-        nothing = (np.nan, np.nan)
-        room = np.array([nothing if m is None else (m.barrier, m.limit) for m in part.margins])
+        room = np.array([(np.nan, np.nan) if m is None else (m.barrier, m.limit) for m in part.margins])
         self.figures.append(
             logged=part.logged,
             difference=part.difference,
@@ -320,8 +282,8 @@ class StoredOpenLoop:
 
     def block(self, first: int, last: int) -> OpenLoopTrace:
         return OpenLoopTrace(
-            logged=self.logged[first:last],
-            commanded=self.kept.velocity[first:last],
+            logged=self.figures.rows("logged")[first:last],
+            commanded=self.kept.figures.rows("velocity")[first:last],
             steps=tuple(self.steps[first:last]),
             margins=tuple(self.margins[first:last]),
         )

@@ -6,7 +6,7 @@ from operator import attrgetter
 from splatctrl_cli.control.line_process import shown
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
-from splatctrl_cli.jobs.replay.criteria_input import CONTACT, SAFE, Judged, nearby
+from splatctrl_cli.jobs.replay.criteria import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words
 from splatctrl_cli.jobs.replay.metrics import counts_of, first_time
 from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION

@@ -2,6 +2,7 @@
 page that only shows a scene, a field, splats or a replay in 3-D.
 """
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,15 +11,15 @@ from pathlib import Path
 from splatctrl_cli.errors import DAMAGE, InputError, SplatCtrlError
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.jobs.batch.graph import columns_of
+from splatctrl_cli.jobs.batch.ledger import Run
+from splatctrl_cli.jobs.batch.run import DONE
 from splatctrl_cli.jobs.report.sections import PASSED, changes_since, section_of
 from splatctrl_cli.jobs.report.spaces import space_of, space_of_run
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.runs.run_folder import (
-    AS_EXPECTED,
     REPLAY,
     BatchFolder,
     FolderRequest,
-    Node,
     RunFolder,
     WrittenFile,
     is_batch,
@@ -121,7 +122,7 @@ def _of_run(request: WriteReportRequest, run: RunFolder) -> Page:
 class _Job:
     """A job of a batch with its folder, if that can be read, and else why not."""
 
-    node: Node
+    ran: Run
     run: RunFolder | None
     why: str
     is_changed: bool
@@ -136,24 +137,24 @@ class _Job:
     @property
     def order(self) -> tuple[bool, bool, bool, float]:
         """Not as expected first, then changed, then not passed, then by clearance."""
-        node = self.node
-        return (node.state == AS_EXPECTED, not self.is_changed, node.outcome in ("passed", None), self.least)
+        ran = self.ran
+        return (ran.state == DONE, not self.is_changed, ran.outcome in ("passed", ""), self.least)
 
 
 def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progress) -> Page:
     changes, changed = changes_since(request.against, request.path, has_links=True)
-    jobs = sorted((_job(batch, node, node.id in changed) for node in batch.nodes), key=lambda job: job.order)
-    replayed = {job.node.recording for job in jobs if job.node.command == REPLAY}
-    told = [job for job in jobs if _is_told(job, is_seen=request.all_scenes and job.node.recording not in replayed)]
+    jobs = sorted((_job(batch, ran, ran.node in changed) for ran in batch.runs), key=lambda job: job.order)
+    replayed = {job.ran.recording for job in jobs if job.ran.command == REPLAY}
+    told = [job for job in jobs if _is_told(job, is_seen=request.all_scenes and job.ran.recording not in replayed)]
     wanted = [job for job in told if job.run is not None and job.run.command in WITH_SPACE]
-    chosen = {job.node.id for job in (wanted if request.all_scenes else wanted[:MOST_SCENES])}
+    chosen = {job.ran.node for job in (wanted if request.all_scenes else wanted[:MOST_SCENES])}
     scenes: dict[str, str] = {}
     sections = []
     for number, job in enumerate(told, start=1):
-        progress.log(f"{number} of {len(told)}: {job.node.id}")
-        sections.append(_section(request, batch, job, scenes, has_space=job.node.id in chosen))
-    unexpected = [job for job in jobs if job.node.state != AS_EXPECTED]
-    linked = {job.node.id for job in told}
+        progress.log(f"{number} of {len(told)}: {job.ran.node}")
+        sections.append(_section(request, batch, job, scenes, has_space=job.ran.node in chosen))
+    unexpected = [job for job in jobs if job.ran.state != DONE]
+    linked = {job.ran.node for job in told}
     return Page(
         title=f"batch {batch.suite}",
         state="failed" if unexpected else "passed",
@@ -173,16 +174,16 @@ def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progres
 
 def _gallery(jobs: Sequence[_Job], linked: set[str]) -> list[Picture]:
     """A picture of each recording without one in a section: of its score, else of its field."""
-    shown = {job.node.recording for job in jobs if job.node.id in linked and job.run is not None}
+    shown = {job.ran.recording for job in jobs if job.ran.node in linked and job.run is not None}
     found = list[Picture]()
     for command, (name, words) in WITH_PICTURES.items():
         for job in jobs:
-            run, recording = job.run, job.node.recording
+            run, recording = job.run, job.ran.recording
             if run is None or run.command != command or recording in shown or len(found) == MOST_PICTURES:
                 continue
             files = [path for path in run.pictures() if name in path.stem]
             shown |= {recording} if files else set()
-            found += [picture(path, f"{job.node.id}: {words}", PICTURE_WIDTH) for path in files[:1]]
+            found += [picture(path, f"{job.ran.node}: {words}", PICTURE_WIDTH) for path in files[:1]]
     return found
 
 
@@ -190,54 +191,54 @@ def _sentence(jobs: Sequence[_Job], unexpected: Sequence[_Job]) -> str:
     """How many jobs are as expected, and the first that is not."""
     count = len(jobs) - len(unexpected)
     if not unexpected:
-        damaged = dict.fromkeys(job.node.recording for job in jobs if job.node.damage)
+        damaged = dict.fromkeys(job.ran.recording for job in jobs if job.ran.damage)
         return f"all {count} jobs as expected" + (f"; {DAMAGE}: {', '.join(damaged)}" if damaged else "")
-    node = unexpected[0].node
-    said = node.sentence or node.cause or node.state
-    return f"{len(unexpected)} of {len(jobs)} jobs not as expected; first {node.id}: {said}"
+    ran = unexpected[0].ran
+    said = ran.sentence or ran.cause or ran.state
+    return f"{len(unexpected)} of {len(jobs)} jobs not as expected; first {ran.node}: {said}"
 
 
-def _job(batch: BatchFolder, node: Node, is_changed: bool) -> _Job:
-    if not node.out or node.outcome is None:  # it only prints, or left nothing
-        return _Job(node=node, run=None, why="", is_changed=is_changed)
+def _job(batch: BatchFolder, ran: Run, is_changed: bool) -> _Job:
+    if not ran.out or not ran.outcome:  # it only prints, or left nothing
+        return _Job(ran=ran, run=None, why="", is_changed=is_changed)
     try:
-        place = batch.inside(node.out)
-        run = open_run(place) if (place / "run.json").is_file() or node.command == REPLAY else None
-        run = None if run is None else replace(run, words=tuple(map(str, node.words)))
-        return _Job(node=node, run=run, why="", is_changed=is_changed)
+        place = batch.inside(ran.out)
+        run = open_run(place) if (place / "run.json").is_file() or ran.command == REPLAY else None
+        run = None if run is None else replace(run, words=tuple(map(str, json.loads(ran.words))))
+        return _Job(ran=ran, run=run, why="", is_changed=is_changed)
     except InputError as error:
-        return _Job(node=node, run=None, why=str(error), is_changed=is_changed)
+        return _Job(ran=ran, run=None, why=str(error), is_changed=is_changed)
 
 
 def _is_told(job: _Job, *, is_seen: bool) -> bool:
     """Replays, and whatever did not come out as expected or as before, have a section of their own; so has a map
     that is to be seen.
     """
-    if is_seen and job.node.command == MAP and job.run is not None:
+    if is_seen and job.ran.command == MAP and job.run is not None:
         return True
-    if job.node.state in WITHOUT_A_RUN:
+    if job.ran.state in WITHOUT_A_RUN:
         return job.is_changed
-    return job.node.command == REPLAY or job.node.state != AS_EXPECTED or job.is_changed
+    return job.ran.command == REPLAY or job.ran.state != DONE or job.is_changed
 
 
 def _section(
     request: WriteReportRequest, batch: BatchFolder, job: _Job, scenes: dict[str, str], *, has_space: bool
 ) -> RunSection:
-    node, run = job.node, job.run
+    ran, run = job.ran, job.run
     if run is None:
         return RunSection(
-            anchor=node.id,
-            title=node.id,
-            state=node.state,
-            sentence=node.sentence or node.cause or node.state,
-            lines=[f"expected: {node.expect}", *([job.why] if job.why else [])],
-            details=[_log(batch, node)],
+            anchor=ran.node,
+            title=ran.node,
+            state=ran.state,
+            sentence=ran.sentence or ran.cause or ran.state,
+            lines=[f"expected: {ran.expect}", *([job.why] if job.why else [])],
+            details=[_log(batch, ran)],
         )
     most, width = PICTURES[has_space]
-    section = section_of(run, anchor=node.id, title=node.id, most_pictures=most, width=width)
-    if node.state != AS_EXPECTED:
-        lines = [f"expected: {node.expect}", *([node.cause] if node.cause else []), *section.lines]
-        section = replace(section, state=node.state, lines=lines, details=[*section.details, _log(batch, node)])
+    section = section_of(run, anchor=ran.node, title=ran.node, most_pictures=most, width=width)
+    if ran.state != DONE:
+        lines = [f"expected: {ran.expect}", *([ran.cause] if ran.cause else []), *section.lines]
+        section = replace(section, state=ran.state, lines=lines, details=[*section.details, _log(batch, ran)])
     if not has_space:
         hint = "not in 3-D: --all-scenes has it" if run.command in WITH_SPACE else ""
         return replace(section, no_space=hint)
@@ -250,9 +251,9 @@ def _section(
 
 def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> list[Table]:
     """A row for each recording, those with the worst jobs first, and a column for each job and variant."""
-    nodes = {(job.node.recording, job.node.column): job.node for job in jobs}
-    recordings = dict.fromkeys(job.node.recording for job in jobs)
-    names = columns_of(((node.job, node.column) for node in batch.nodes), batch.jobs)
+    nodes = {(job.ran.recording, job.ran.column): job.ran for job in jobs}
+    recordings = dict.fromkeys(job.ran.recording for job in jobs)
+    names = columns_of(((ran.job, ran.column) for ran in batch.runs), batch.jobs)
     rows = [
         Row(cells=[recording, *(_cell(nodes.get((recording, name)), linked) for name in names)])
         for recording in recordings
@@ -262,38 +263,38 @@ def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> list[
     return [replace(table, rows=rows[:MOST_ROWS]), *([more] if more.rows else [])]
 
 
-def _cell(node: Node | None, linked: set[str]) -> Cell:
+def _cell(ran: Run | None, linked: set[str]) -> Cell:
     """The verdict of a job; in the colour of its state where that is not as expected."""
-    if node is None:
+    if ran is None:
         return Cell(text="-")
-    state = node.outcome if node.state == AS_EXPECTED and node.outcome else node.state
-    is_expected = node.state == AS_EXPECTED and node.outcome != PASSED
-    words = f"{node.label or node.state}{node.damage}{', as expected' if is_expected else ''}"
-    return Cell(text=words, state="" if is_expected else state, link=node.id if node.id in linked else "")
+    state = ran.outcome if ran.state == DONE and ran.outcome else ran.state
+    is_expected = ran.state == DONE and ran.outcome != PASSED
+    words = f"{ran.label or ran.state}{ran.damage}{', as expected' if is_expected else ''}"
+    return Cell(text=words, state="" if is_expected else state, link=ran.node if ran.node in linked else "")
 
 
 def _list(title: str, jobs: Sequence[_Job], linked: set[str]) -> Table:
     rows = []
     for job in jobs:
-        node = job.node
-        name = Cell(text=node.id, link=node.id if node.id in linked else "")
+        ran = job.ran
+        name = Cell(text=ran.node, link=ran.node if ran.node in linked else "")
         least = None if job.least == math.inf else round(1e3 * job.least, 1)
-        words = node.sentence or node.cause
-        cost = (node.seconds or None, node.peak_mb or None)
-        cells = (name, f"{node.label or node.state}{node.damage}", node.expect, least, words, *cost)
-        rows.append(Row(cells=cells, state=node.state))
+        words = ran.sentence or ran.cause
+        cost = (ran.seconds or None, ran.peak_mb or None)
+        cells = (name, f"{ran.label or ran.state}{ran.damage}", ran.expect, least, words, *cost)
+        rows.append(Row(cells=cells, state=ran.state))
     return Table(title=title, header=("job", "verdict", "expected", "least mm", "sentence", "s", "MB"), rows=rows)
 
 
 def _versions(batch: BatchFolder) -> str:
-    versions = sorted({node.version for node in batch.nodes if node.version})
-    recordings = len({node.recording for node in batch.nodes})
-    return f"{recordings} recordings, {len(batch.nodes)} jobs; splatctrl {', '.join(versions) or 'unknown'}"
+    versions = sorted({ran.version for ran in batch.runs if ran.version})
+    recordings = len({ran.recording for ran in batch.runs})
+    return f"{recordings} recordings, {len(batch.runs)} jobs; splatctrl {', '.join(versions) or 'unknown'}"
 
 
-def _log(batch: BatchFolder, node: Node) -> Table:
+def _log(batch: BatchFolder, ran: Run) -> Table:
     try:
-        lines = batch.inside(node.log).read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = batch.inside(ran.log).read_text(encoding="utf-8", errors="replace").splitlines()
     except (OSError, InputError):
         lines = ["no log"]
     return Table(title="Log", text="\n".join(lines[-LOG_LINES:]))

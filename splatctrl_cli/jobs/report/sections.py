@@ -47,6 +47,8 @@ def section_of(
         )
         replayed = {"timeline": drawn, "legend": legend(states.clearance)}
     found = (run.json_of("summary.json") or {}).get("when_and_why", []) if states is not None else []
+    held = _reasons(verdict, holds=True)
+    figures = [Row(cells=(name, value)) for name, value in run.metrics.items() if not isinstance(value, dict | list)]
     return RunSection(
         anchor=anchor,
         title=title,
@@ -55,7 +57,12 @@ def section_of(
         reasons=_reasons(verdict, holds=False),
         lines=[str(line) for line in found],
         pictures=_pictures(run, most_pictures, width, has_timeline=states is not None),
-        details=[*_held(verdict), _metrics(run), _settings(run), _provenance(run)],
+        details=[
+            *([replace(held, title=f"Criteria that hold ({len(held.rows)})")] if held.rows else []),
+            Table(title="Figures", header=("name", "value"), rows=figures[:MOST_METRICS]),
+            _settings(run),
+            _provenance(run),
+        ],
         **replayed,
     )
 
@@ -69,11 +76,6 @@ def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
         if (reason["outcome"] == PASSED) is holds:
             rows.append(Row(cells=(reason["criterion"], reason["outcome"], words), state=reason["outcome"]))
     return Table(header=("criterion", "outcome", "found"), rows=rows)
-
-
-def _held(verdict: Mapping[str, Any]) -> list[Table]:
-    table = _reasons(verdict, holds=True)
-    return [replace(table, title=f"Criteria that hold ({len(table.rows)})")] if table.rows else []
 
 
 def _events(run: RunFolder) -> dict[str, list[tuple[float, float]]]:
@@ -93,11 +95,6 @@ def _pictures(run: RunFolder, most: int | None, width: int, *, has_timeline: boo
     files.sort(key=lambda path: not path.name.startswith("worst_"))
     words = {path: next((w for start, w in PICTURES.items() if path.name.startswith(start)), "") for path in files}
     return [picture(path, f"{path.name}: {words[path]}".removesuffix(": "), width) for path in files[:most]]
-
-
-def _metrics(run: RunFolder) -> Table:
-    rows = [Row(cells=(name, value)) for name, value in run.metrics.items() if not isinstance(value, dict | list)]
-    return Table(title="Figures", header=("name", "value"), rows=rows[:MOST_METRICS])
 
 
 def _settings(run: RunFolder) -> Table:

@@ -161,8 +161,7 @@ def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding:
     chosen = spread(times, when)
     sets = [SplatsAt(time_s=times[i] if n else 0.0, splats=used[i].splats()) for n, i in enumerate(chosen)]
     at = max((i for i in chosen if times[i] <= when), default=None)
-    grid_then = None if at is None else used[at].occupancy()
-    return _with_unknown(Space(splats=sets), grid_then, scene)
+    return _with_unknown(Space(splats=sets), None if at is None else used[at].occupancy(), scene)
 
 
 def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
@@ -244,8 +243,7 @@ def position_of(states: States, robot: RobotModel, state: int) -> Float64:
 
 def _deciding(run: RunFolder, states: States, robot: RobotModel) -> Deciding | None:
     """The first reason of the verdict that has a time and a place; else the least clearance and what was near."""
-    reasons = run.verdict.get("reasons", [])
-    for reason in reasons:
+    for reason in run.verdict.get("reasons", []):
         if reason["outcome"] != "passed" and reason["place"] is not None and reason["time_s"] is not None:
             words = f"{reason['sentence']} at {reason['time_s']:.2f} s, {reason['cause']}"
             return _decided(states, robot, words, float(reason["time_s"]), reason["place"], str(reason["who"]))

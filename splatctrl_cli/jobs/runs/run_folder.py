@@ -5,7 +5,7 @@ of a batch: the last state of each of its jobs.
 import csv
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ import numpy as np
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.verdict import damage_mark
 from splatctrl_cli.files.output import PARTIAL, Parts, sha256
+from splatctrl_cli.jobs.batch.ledger import FILE, FILE_VERSION, FORMAT, Run, run_of_document
 from splatctrl_cli.records import Float64, Stamps
 
 REPLAY = "replay"
@@ -113,11 +113,7 @@ class RunFolder:
         if self.command != REPLAY or not self.parts.has(file):
             return None
         try:
-            with self.parts.checked(file).open(encoding="utf-8", newline="") as stream:
-                rows = csv.reader(stream)
-                header = next(rows)
-                columns = dict(zip(header, zip(*rows, strict=True), strict=False))
-            return _states(columns)
+            return _states(read_columns(self.parts.checked(file)))
         except (ValueError, KeyError, StopIteration) as error:
             raise InputError(f"{file}: expected the columns of a replay: {error}") from None
 
@@ -170,16 +166,35 @@ def open_run(path: Path) -> RunFolder:
         raise InputError(
             f"{path}: no run: it has no run.json", remedy="give a folder that a command wrote with --out"
         )
-    try:
-        run = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from None
-    if not isinstance(run, dict) or "command" not in run:
+    run = read_object(file)
+    if "command" not in run:
         raise InputError(f"{file}: expected what a command of splatctrl writes", remedy="make the run again")
     version = str(run.get("splatctrl", ""))
     if _numbers(version) > _numbers(__version__):  # its values may mean something else
         raise InputError(f"{file}: written by splatctrl {version}, this is {__version__}", remedy="update splatctrl")
     return RunFolder(path, run)
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """The object in a JSON file. Raises InputError where there is none."""
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file}: cannot be read: {error}") from None
+    if not isinstance(document, dict):
+        raise InputError(
+            f"{file}: expected what a command of splatctrl writes, got {type(document).__name__}",
+            remedy="make it again",
+        )
+    return document
+
+
+def read_columns(file: Path) -> dict[str, tuple[str, ...]]:
+    """The cells of a CSV table with rows, by column."""
+    with file.open(encoding="utf-8", newline="") as stream:
+        rows = csv.reader(stream)
+        header = next(rows)
+        return dict(zip(header, zip(*rows, strict=True), strict=False))
 
 
 def _numbers(version: str) -> tuple[int, ...]:
@@ -201,55 +216,14 @@ def _states(columns: Mapping[str, tuple[str, ...]]) -> States:
     )
 
 
-FILE, FORMAT, VERSION = "batch.json", "splatctrl-batch", 1
-AS_EXPECTED = "done"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Node:
-    """One job of a batch: its command on a recording, and what came of it.
-
-    words: the command line. state: done (as expected), failed (judged, not as expected), error, or skipped (what it
-    needs is not there). out, log: paths below the batch. peak_mb: of memory. cause: of an error.
-    """
-
-    id: str
-    recording: str = ""
-    job: str = ""
-    command: str = ""
-    words: tuple[str, ...] = ()
-    state: str = ""
-    expect: str | None = None
-    outcome: str | None = None
-    label: str | None = None
-    sentence: str | None = None
-    exit_code: int | None = None
-    seconds: float | None = None
-    peak_mb: float | None = None
-    out: str = ""
-    log: str = ""
-    version: str | None = None
-    cause: str | None = None
-
-    @property
-    def damage(self) -> str:
-        """The word of a damaged recording, or nothing."""
-        return damage_mark(self.sentence, self.exit_code)
-
-    @property
-    def column(self) -> str:
-        """The job and its variant."""
-        return self.id.removeprefix(f"{self.recording}/")
-
-
 @dataclass(frozen=True, kw_only=True)
 class BatchFolder:
-    """A batch and its nodes; jobs: the names of the suite's, in its order."""
+    """A batch and the last run of each of its nodes; jobs: the names of the suite's, in its order."""
 
     path: Path
     suite: str
     jobs: tuple[str, ...]
-    nodes: tuple[Node, ...]
+    runs: tuple[Run, ...]
 
     def inside(self, name: str) -> Path:
         """A path that the batch names. Raises InputError where it leads out of its folder."""
@@ -269,15 +243,13 @@ def open_batch(path: Path) -> BatchFolder:
         batch = json.loads(file.read_text(encoding="utf-8"))
         if batch["format"] != FORMAT:
             raise ValueError(f"format {batch['format']}")
-        version, suite, nodes = int(batch["version"]), str(batch["suite"]), batch["nodes"]
-        jobs = tuple(map(str, batch["jobs"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file}: expected what batch writes: {error!r}", remedy="run the batch again") from None
-    if version > VERSION:
-        raise InputError(f"{file}: version {version}, this program reads {VERSION}", remedy="update splatctrl")
-    known = {each.name for each in fields(Node)}
-    try:
-        made = tuple(Node(**{key: value for key, value in node.items() if key in known}) for node in nodes)
-    except (TypeError, AttributeError) as error:
-        raise InputError(f"{file}: nodes: {error}", remedy="run the batch again") from None
-    return BatchFolder(path=path, suite=suite, jobs=jobs, nodes=made)
+        if int(batch["version"]) > FILE_VERSION:
+            raise InputError(
+                f"{file}: version {batch['version']}, this program reads {FILE_VERSION}", remedy="update splatctrl"
+            )
+        jobs, runs = map(str, batch["jobs"]), map(run_of_document, batch["nodes"])
+        return BatchFolder(path=path, suite=str(batch["suite"]), jobs=tuple(jobs), runs=tuple(runs))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{file}: expected what batch writes, with suite, jobs and nodes: {error!r}", remedy="run the batch again"
+        ) from None

@@ -14,7 +14,7 @@ from splatctrl_cli.jobs.recordings.open_recording import (
     open_held_out,
     refuse_scan_options,
 )
-from splatctrl_cli.jobs.recordings.same_recording import changed_files, differences
+from splatctrl_cli.jobs.recordings.provenance import changed_files, differences
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.folder.dtu_source import DtuSource
 from splatctrl_cli.recording.source import lacks_depth, open_session, open_source

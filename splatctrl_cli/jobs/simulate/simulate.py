@@ -1,24 +1,42 @@
-"""A simulation from its request to its result: a recorded log of an arm at a table, with its truth."""
+"""A simulation from its request to its result: a recorded log of an arm at a table, with its truth.
 
-from collections.abc import Callable, Mapping
+Another arm takes its files, its spheres, and a motion that brings its tip where ours goes.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import UsageError
+import numpy as np
+from defusedxml import ElementTree
+
+from splatctrl_cli.config import ControlConfig, fixed
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
+from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.simulate.simulated_arm import adapted_motion, copied_arm
+from splatctrl_cli.libraries import trimesh
+from splatctrl_cli.planner.planned import goal_postures
 from splatctrl_cli.recording.container.mcap_writer import mcap_log
 from splatctrl_cli.recording.folder.dtu import DtuView, write_dtu
 from splatctrl_cli.recording.folder.idr import write_idr
-from splatctrl_cli.records import JointState
+from splatctrl_cli.records import Float64, JointState
+from splatctrl_cli.robot.coverage import coverage_of_solids
+from splatctrl_cli.robot.link_meshes import mesh_path, read_solids
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.simulate.arm import SHAPES, SLIM, arm_spheres_yaml, arm_urdf
-from splatctrl_cli.simulate.primitives import luminance_std
-from splatctrl_cli.simulate.recording import Recording, RecordingOptions, Scene
+from splatctrl_cli.robot.self_collision import random_postures
+from splatctrl_cli.robot.self_margins import SelfSurfaces
+from splatctrl_cli.robot.sphere_files import spheres_yaml
+from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
+from splatctrl_cli.robot.urdf import MeshShape, UrdfFile, read_urdf
+from splatctrl_cli.simulate.arm import SHAPES, SLIM, Motion, arm_spheres_yaml, arm_urdf, hand_pose
+from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, luminance_std
+from splatctrl_cli.simulate.recording import START_NS, Recording, RecordingOptions, Scene
 from splatctrl_cli.simulate.tabletop import object_mask, turntable_views
-from splatctrl_cli.simulate.truth import Truth, truth_document
+from splatctrl_cli.simulate.truth import Truth, distance_to, truth_document
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,3 +199,168 @@ def _metrics(truth: Truth, num_frames: Mapping[str, int]) -> dict[str, Any]:
         "min_luminance_std": round(min(truth.luminance_std[name] for name in training), 4),
         "min_clearance": round(float(truth.clearance.min()), 4),
     }
+
+
+LATE = 1e3  # [rad/s] a second longer than its time costs as much: every way in time is better
+REMEDY = "give the URDF of an arm whose base stands on the table's top"
+
+
+def copied_arm(
+    urdf: Path, given: Path | None, packages: Sequence[Path], folder: Path, progress: Progress
+) -> tuple[RobotModel, SelfSurfaces]:
+    """Write ``robot.urdf``, the meshes that it names into ``meshes/``, and ``robot_spheres.yaml`` (a copy of the file
+    `given`, or fitted) into a folder, and read them back as the robot and the surfaces of its links.
+
+    Raises InputError for a URDF without collision geometry, or whose collision meshes are missing.
+    """
+    original = read_urdf(urdf)
+    solids = read_solids(original, packages)
+    copy = folder / "robot.urdf"
+    copy.write_text(_with_own_meshes(original, packages, folder, progress), encoding="utf-8")
+    spheres = folder / "robot_spheres.yaml"
+    if given is not None:
+        shutil.copyfile(given, spheres)
+    else:
+        fitted = fit_spheres(solids, FitOptions(max_spheres=max(fixed.DEFAULT_SPHERES, len(solids))))
+        spheres.write_text(spheres_yaml(fitted, [f"Fitted to {urdf.name} by: splatctrl simulate."]), encoding="utf-8")
+    moved = [joint.name for joint in original.joints if joint.kind != "fixed" and joint.name not in original.grippers]
+    model = RobotModel.from_urdf(copy, spheres).moved_by(moved)
+    report = coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=fixed.COVERED_COARSE)
+    model = model.with_coverage(report)
+    return model, SelfSurfaces(model, solids)
+
+
+def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Motion:
+    """The scene's motion for another arm: at each waypoint its tip (the last link of its URDF, z pointing away from
+    the arm) is where the hand of the simulated arm is, as far as it reaches, and any way round.
+
+    Among the postures found, those of the shortest way that keeps clear of everything there and of the arm itself;
+    where none is within its velocity limits, the way that has to be slowed down least. An arm whose tip is there in
+    the same postures moves as the simulated arm does. Raises InputError where none leads to a waypoint, or every way
+    runs into something.
+    """
+    times, ours = scene.motion.times, scene.motion.waypoints
+    if ours.shape[1] == model.num_joints and all(
+        np.allclose(model.frame_pose(q, model.frame_names[-1]), hand_pose(q), atol=1e-6) for q in ours
+    ):
+        return scene.motion
+    reached = [_postures(model, hand_pose(q), q) for q in ours]
+    costs, before = np.zeros(len(reached[0])), []
+    for start, (here, there) in enumerate(pairwise(reached)):
+        ways = [Motion(times=times[start : start + 2], waypoints=np.array(ends)) for ends in product(here, there)]
+        legs = np.array([_cost(scene, model, surfaces, leg) for leg in ways]).reshape(len(here), len(there))
+        before.append(np.argmin(costs[:, None] + legs, axis=0))
+        costs = np.min(costs[:, None] + legs, axis=0)
+    chosen = [int(np.argmin(costs))]
+    if not np.isfinite(costs[chosen[0]]):
+        raise InputError(f"{model.urdf.path}: expected a way between the waypoints, got none", remedy=REMEDY)
+    for choice in reversed(before):
+        chosen.insert(0, int(choice[chosen[0]]))
+    waypoints = np.array([postures[k] for postures, k in zip(reached, chosen, strict=True)])
+    return Motion(times=times, waypoints=waypoints)
+
+
+def _with_own_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
+    """The URDF's text with its collision meshes, and as STL its visual ones, copied beside it: the folder needs no
+    package. A link whose visual mesh cannot be read is seen by its collision geometry, if it has any.
+    """
+    root, copies = ElementTree.fromstring(urdf.text), dict[tuple[str, str], str]()
+    parts = [(link, part) for link in root.iter("link") for tag in ("collision", "visual") for part in link.iter(tag)]
+    for link, part in parts:
+        mesh, is_visual = part.find("geometry/mesh"), part.tag == "visual"
+        if mesh is None:
+            continue
+        name = mesh.get("filename", "")
+        shape = MeshShape(link=str(link.get("name")), filename=name, scale=(1.0, 1.0, 1.0), T_link_mesh=np.eye(4))
+        if (part.tag, name) not in copies:
+            try:
+                copies[part.tag, name] = _copy(mesh_path(urdf.path, shape, packages), folder, copies, is_visual)
+            except InputError as error:
+                if not is_visual:
+                    raise
+                progress.log(f"simulate: {error.message}; link '{shape.link}' is seen by its collision geometry")
+                if link.find("collision") is not None:
+                    link.remove(part)
+                continue
+        mesh.set("filename", copies[part.tag, name])
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _copy(source: Path, folder: Path, copies: Mapping[tuple[str, str], str], is_visual: bool) -> str:
+    """Copy a mesh into the folder, under a name that no other copy has; that name."""
+    kind = "meshes/visual" if is_visual else "meshes"
+    stem = f"{source.stem}.stl" if is_visual else source.name
+    name = f"{kind}/{stem}" if f"{kind}/{stem}" not in copies.values() else f"{kind}/{len(copies)}_{stem}"
+    (folder / kind).mkdir(parents=True, exist_ok=True)
+    if is_visual:
+        seen = load_mesh(source)
+        trimesh.Trimesh(seen.vertices, seen.faces, process=False).export(folder / name)
+    else:
+        shutil.copyfile(source, folder / name)
+    return name
+
+
+def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
+    """Postures (K, J) with the tip at a pose (4, 4), or nearer to the base where it does not reach it.
+
+    q: of the simulated arm there, from which the search for an arm of as many joints begins.
+    """
+    tip = model.frame_names[-1]
+    guesses = [model.middle, *random_postures(model, fixed.SIMULATED_GUESSES, seed=0)]
+    if len(q) == model.num_joints:
+        guesses.insert(0, np.clip(q, model.lower, model.upper))
+    for nearer in fixed.SIMULATED_NEARER ** np.arange(fixed.SIMULATED_NEARINGS):
+        found = [
+            posture
+            for pose in _turns(T_base_hand, nearer)
+            for posture in goal_postures(
+                model, tip, pose, np.array(guesses), ControlConfig(), at_most=fixed.SIMULATED_POSTURES
+            )
+        ]
+        if found:
+            return np.array(found)
+    raise InputError(
+        f"{model.urdf.path}: expected {tip} to reach ({', '.join(f'{x:.2f}' for x in T_base_hand[:3, 3])}) m "
+        "or nearer, pointing down, got no posture",
+        remedy=REMEDY,
+    )
+
+
+def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
+    """The pose turned about its own z, its place that share as far from the base's axis."""
+    for angle in 2 * np.pi * np.arange(fixed.SIMULATED_TURNS) / fixed.SIMULATED_TURNS:
+        T = T_base_hand.copy()
+        c, s = np.cos(angle), np.sin(angle)
+        T[:3, :3] = T[:3, :3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        T[:2, 3] *= nearer
+        yield T
+
+
+def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
+    """The cost of a leg between two postures: its length [rad], and more where it comes near anything, most where it
+    has to be slowed down; infinite where it runs into something or itself.
+
+    A leg that is slowed down is elsewhere when things come and leave: it keeps clear of all of them, and is refused
+    where something moves.
+    """
+    slowed = leg.within(model.velocity_limit)
+    is_late = slowed.times[-1] > leg.times[-1]
+    if is_late and any(primitive.track is not None for primitive in scene.primitives):
+        return np.inf
+    solids: Sequence[Primitive] = scene.primitives
+    if is_late:
+        solids = [replace(primitive, from_ns=ALWAYS[0], to_ns=ALWAYS[1]) for primitive in solids]
+    seconds = np.linspace(leg.times[0], leg.times[-1], fixed.SIMULATED_SAMPLES)
+    positions = np.array([leg.at(second)[0] for second in seconds])
+    centers = model.sphere_centers_batch(positions)
+    moving = model.moving_spheres
+    radii, least = model.sphere_set.radii[moving], np.inf
+    for second, points in zip(seconds, centers[:, moving], strict=True):
+        gap = distance_to(solids, points, START_NS + round(second * 1e9)) - radii
+        least = min(least, float(gap.min()))
+    if least <= 0 or np.any(surfaces.gaps(positions, centers, 0.0) < 0):
+        return np.inf
+    shortfall = max(0.0, fixed.SIMULATED_CLEARANCE - least) / fixed.SIMULATED_CLEARANCE
+    longer = float(np.ptp(slowed.times) - np.ptp(leg.times))
+    length = float(np.linalg.norm(leg.waypoints[1] - leg.waypoints[0]))
+    return length + fixed.SIMULATED_SHORTFALL * shortfall + LATE * longer

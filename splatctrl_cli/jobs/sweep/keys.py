@@ -197,8 +197,9 @@ def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
 
     options = {name: placed(value) for name, value in options.items()}
     _check_inputs(run, found)
-    of_map = run.path / "scene" / "run.json"
-    metrics = json.loads(of_map.read_text())["metrics"] if "lockstep" in options and of_map.is_file() else run.metrics
+    of_map = run.path / "scene"
+    has_map = "lockstep" in options and (of_map / "run.json").is_file()
+    metrics = open_run(of_map).metrics if has_map else run.metrics
     return Stage(command=run.command, options=options, cameras=tuple(metrics.get("cameras") or ()))
 
 

@@ -57,8 +57,7 @@ def find_flip(
     ordered = _ordered(known, start)
     tried = list(ordered)
     index = next((k for k, value in enumerate(tried) if known[value] != known[start]), None)
-    gaps = [abs(b - a) for a, b in itertools.pairwise(tried[:index])]
-    spacing = max(gaps, default=0.0)
+    spacing = max([abs(b - a) for a, b in itertools.pairwise(tried[:index])], default=0.0)
     if index is None:
         return Flip(last=None, first=None, outcomes=ordered, is_monotone=True, spacing=spacing)
     last, first = tried[index - 1], tried[index]

@@ -110,7 +110,15 @@ class SweepResult:
         """Plain values, the same of every sweep with these settings."""
         return {
             "before": {name: self.before[name] for name in ("outcome", "label", "sentence")},
-            "keys": {flip.key.name: _plain(flip) for flip in self.flips},
+            "keys": {
+                flip.key.name: {
+                    "unit": flip.key.unit,
+                    "is_declared_monotone": flip.key.is_monotone,
+                    "sentence": flip.sentence,
+                    **{name: value for name, value in asdict(flip).items() if name != "key"},
+                }
+                for flip in self.flips
+            },
             "least": None if self.least is None else asdict(self.least),
         }
 
@@ -207,9 +215,12 @@ class Runs:
     def suite(self, values: Mapping[str, float]) -> Suite:
         """The run with these values, as a batch has it."""
         name = f"{self.run.path.absolute().name}-swept"
-        recording = Recording(name=name, paths=(self.run.path,))
         return Suite(
-            name=name, folder=Path.cwd(), out=self.out, recordings=(recording,), jobs=self.chain.jobs(values)
+            name=name,
+            folder=Path.cwd(),
+            out=self.out,
+            recordings=(Recording(name=name, paths=(self.run.path,)),),
+            jobs=self.chain.jobs(values),
         )
 
     def nodes_at(self, values: Mapping[str, float]) -> list[Node]:
@@ -351,11 +362,6 @@ def _together(
         return None
     last, first = runs.at([values_at(found.last), values_at(found.first)])
     return LeastFlip(length=float(f"{found.length:.6g}"), last=last, first=first)
-
-
-def _plain(flip: KeyFlip) -> dict[str, Any]:
-    first = {"unit": flip.key.unit, "is_declared_monotone": flip.key.is_monotone, "sentence": flip.sentence}
-    return first | {name: value for name, value in asdict(flip).items() if name != "key"}
 
 
 def _write(out: Path, asked: Mapping[str, Any], result: SweepResult | None) -> None:

@@ -9,7 +9,8 @@ import trimesh
 
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.formats.splat.splats import read_ply, write_ply
-from splatctrl_cli.jobs.bake.bake import BakeResult, counts_of
+from splatctrl_cli.jobs.bake.accuracy import counts_of
+from splatctrl_cli.jobs.bake.bake import BakeResult
 from splatctrl_cli.simulate.truth import load_truth
 from tests.cli.replay_desk import write_scene
 from tests.field.scenes import splat_set

@@ -21,7 +21,7 @@ from splatctrl_cli.field.grid_cells import GridLayout
 from splatctrl_cli.formats.grid.grid_format import GridSlabs
 from splatctrl_cli.formats.grid.grid_formats import FORMATS
 from splatctrl_cli.formats.splat.splats import write_ply
-from splatctrl_cli.jobs.bake import slabs as bake_slabs
+from splatctrl_cli.jobs.bake import bake as bake_slabs
 from splatctrl_cli.jobs.bake.bake import BakeResult
 from splatctrl_cli.records import Label
 from tests.field.scenes import cloud, splat_set

@@ -13,8 +13,8 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.formats.splat.gaussian_ply import write_gaussian_ply
 from splatctrl_cli.formats.splat.splats import FORMATS, as_gaussians, read_ply, write_ply
+from splatctrl_cli.jobs.export import export as job
 from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult
-from splatctrl_cli.jobs.export.export import export as job
 from splatctrl_cli.records import Float64, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.render import Rendering
 from tests.jobs.export.export_scene import ball, written

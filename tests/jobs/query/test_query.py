@@ -16,8 +16,7 @@ from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.formats import ply
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.splat.splats import write_ply
-from splatctrl_cli.jobs.query.point_answers import TITLES
-from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
+from splatctrl_cli.jobs.query.query import TITLES, QueryRequest, QueryResult, query
 from splatctrl_cli.records import Float64, Label
 from tests.cli.replay_desk import splats_of, write_scene
 from tests.jobs.bake.baked import baked

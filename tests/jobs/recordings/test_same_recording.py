@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.geometry import look_at
-from splatctrl_cli.jobs.recordings.same_recording import changed_files, differences, first_frame
+from splatctrl_cli.jobs.recordings.provenance import changed_files, differences, first_frame
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 from tests.plain import plain_frame
 

@@ -13,7 +13,7 @@ from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.replay import evidence_criteria as evidence
-from splatctrl_cli.jobs.replay.control_criteria import controller
+from splatctrl_cli.jobs.replay.criteria import controller
 from splatctrl_cli.jobs.replay.motion_criteria import surface_clearance
 from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
 from splatctrl_cli.voxels import EvidenceClass

@@ -3,8 +3,7 @@
 import numpy as np
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.jobs.replay.detours import certified_distance
-from splatctrl_cli.jobs.replay.known_scene import splat_fields
+from splatctrl_cli.jobs.replay.known_scene import certified_distance, splat_fields
 from tests.cli.replay_desk import splats_of
 
 

@@ -15,9 +15,9 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.jobs.replay import known_scene
+from splatctrl_cli.jobs.replay import replay as job
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, from_splats
 from splatctrl_cli.jobs.replay.lockstep import check_lockstep, from_log
-from splatctrl_cli.jobs.replay.replay import replay as job
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.container.mcap_log import McapLog

@@ -8,7 +8,7 @@ import pytest
 
 from splatctrl_cli.checks.clock_offset import ClockOffset
 from splatctrl_cli.config.fixed import UNSEEN
-from splatctrl_cli.jobs.replay.replay import replay as job
+from splatctrl_cli.jobs.replay import replay as job
 from splatctrl_cli.jobs.replay.verdict import CRITERIA
 from tests.cli.replay_desk import SECOND, START, grid_seen
 from tests.jobs.replay.broken import (

@@ -9,7 +9,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
-from splatctrl_cli.jobs.recordings.same_recording import first_frame
+from splatctrl_cli.jobs.recordings.provenance import first_frame
 from splatctrl_cli.jobs.score import score as score_job
 from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.recording.container.raw_log import RawMessage

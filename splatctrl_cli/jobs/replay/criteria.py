@@ -1,23 +1,77 @@
-"""Criteria of a replay's verdict: that the evidence is of the time that it judges."""
+"""What the criteria of a replay's verdict look at, and those of time and of what a controller did."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.config.fixed import CLOCKS_APART, SAME_MOMENT_NS
-from splatctrl_cli.control.events import EventKind
-from splatctrl_cli.evaluate.verdict import Reason, counted, failed, held, lacking
-from splatctrl_cli.jobs.replay.criteria_input import (
-    CONTACT,
-    MARGIN,
-    SLOW,
-    Judged,
-    events_of,
-    mm,
-    nearby,
-    seconds_at,
-)
-from splatctrl_cli.jobs.replay.metrics import is_blank
+from splatctrl_cli.config.fixed import CLOCKS_APART, LIMIT_EXCEEDED, SAME_MOMENT_NS, SLIGHTLY_UNDER
+from splatctrl_cli.control.events import Event, EventKind
+from splatctrl_cli.control.replay import Outcome as LoopOutcome
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, counted, failed, held, lacking
+from splatctrl_cli.jobs.replay.inputs import LoggedStates
+from splatctrl_cli.jobs.replay.metrics import Metrics, is_blank
+from splatctrl_cli.jobs.replay.request import OutsideRun, Replay, ReplayInputs, ReplayRequest
+from splatctrl_cli.records import Float64
+
+SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
+BROKEN, UNKNOWN = "failed", "*not evaluable*"  # as the table of the criteria has them
+SLOW = "log joint states more often"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judged:
+    """What the criteria look at."""
+
+    request: ReplayRequest
+    inputs: ReplayInputs
+    logged: LoggedStates
+    replay: Replay
+    metrics: Metrics
+
+    @property
+    def threshold(self) -> float:
+        """The margin [m], less what solver and rounding may leave."""
+        return self.replay.margin - SLIGHTLY_UNDER
+
+    @property
+    def num_states(self) -> int:
+        """That were judged."""
+        return len(self.replay.audit.stamp_ns)
+
+    @property
+    def past_end_s(self) -> float:
+        """How long a driven motion goes on after the log's last state [s]."""
+        return max(int(self.replay.audit.stamp_ns[-1]) - int(self.inputs.states.stamp_ns[-1]), 0) * 1e-9
+
+
+def events_of(replay: Replay, kind: EventKind, source: str = "") -> Sequence[Event]:
+    return [event for event in replay.events if event.kind is kind and event.source == source]
+
+
+def least_of(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float | None:
+    there = values[~np.isnan(values)]
+    return float(there.min()) if len(there) else None
+
+
+def time_of_least(judged: Judged, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    return seconds_at(judged, int(np.nanargmin(values)))
+
+
+def seconds_at(judged: Judged, index: int) -> float:
+    """Of a state, since the first."""
+    stamps = judged.replay.audit.stamp_ns
+    return float(stamps[index] - stamps[0]) * 1e-9
+
+
+def mm(metres: float) -> str:
+    return f"{1e3 * metres:.1f} mm"
+
+
+def nearby(judged: Judged, values: Float64) -> tuple[float, float, int] | None:
+    """The largest of values (T,) about the arm, when [s], and over how many states; None without one."""
+    num = int(np.isfinite(values).sum())
+    return (float(np.nanmax(values)), seconds_at(judged, int(np.nanargmax(values))), num) if num else None
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
@@ -25,7 +79,19 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
     there was none for half a second the next shows nothing in the arm's place of that time. Frames without depth do
     not count; a baked field does not say when it was seen (a note).
     """
-    yield from _unwatched(judged)
+    first_ns, margin = int(judged.replay.audit.stamp_ns[0]), judged.replay.margin
+    for found in judged.replay.unwatched:
+        since, until, when = ((ns - first_ns) * 1e-9 for ns in (found.since_ns, found.until_ns, found.stamp_ns))
+        yield lacking(
+            sentence=f"no camera gave depth from about the arm from {since:.2f} to {until:.2f} s, and then a thing "
+            f"is {mm(found.clearance)} from where the arm was, margin {mm(margin)},",
+            value=found.clearance,
+            threshold=margin,
+            unit="m",
+            time_s=when,
+            remedy="nobody can say when it came: cameras must give depth all the time",
+            count=judged.num_states,
+        )
     ahead = nearby(judged, judged.replay.near["ahead"])
     allowed = SAME_MOMENT_NS / 1e9  # the frames of one time step lie apart
     if ahead is not None and ahead[0] > allowed:
@@ -62,28 +128,10 @@ def _after_end(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
     empty.
     """
     lasts = float(judged.replay.audit.stamp_ns[-1] - judged.replay.audit.stamp_ns[0]) * 1e-9 - judged.past_end_s
-    at_end = age - (time_s - lasts)
-    if not judged.past_end_s or at_end > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
+    if not judged.past_end_s or (age - (time_s - lasts)) > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
         return "", ""
     remedy = f"end it with the log (--set control.max_time={max(lasts, 0.01):.3g}), start earlier (--start-time), or"
     return f"the motion goes on {judged.past_end_s:.2f} s past the end of the log, and ", f"{remedy} record longer"
-
-
-def _unwatched(judged: Judged) -> Iterator[Reason]:
-    """What the next depth shows of a time without any."""
-    first_ns, margin = int(judged.replay.audit.stamp_ns[0]), judged.replay.margin
-    for found in judged.replay.unwatched:
-        since, until, when = ((ns - first_ns) * 1e-9 for ns in (found.since_ns, found.until_ns, found.stamp_ns))
-        yield lacking(
-            sentence=f"no camera gave depth from about the arm from {since:.2f} to {until:.2f} s, and then a thing "
-            f"is {mm(found.clearance)} from where the arm was, margin {mm(margin)},",
-            value=found.clearance,
-            threshold=margin,
-            unit="m",
-            time_s=when,
-            remedy="nobody can say when it came: cameras must give depth all the time",
-            count=judged.num_states,
-        )
 
 
 def map_age(judged: Judged) -> Iterator[Reason]:
@@ -178,7 +226,17 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
             remedy="stamp every state with its own time, or give --stamps log",
             count=len(stamps),
         )
-    yield from _lead_in(judged)
+    replay = judged.replay
+    if replay.lead_in_s > config.lead_in:
+        yield lacking(
+            sentence=f"the first {replay.lead_in_s:.2f} s ({replay.num_before_scene} states) come before the first "
+            "map",
+            value=replay.lead_in_s,
+            threshold=config.lead_in,
+            unit="s",
+            remedy="judge the rest alone with --start-time first-map",
+            count=judged.num_states,
+        )
 
 
 def _gaps(judged: Judged) -> Iterator[Reason]:
@@ -222,16 +280,100 @@ def clocks(judged: Judged) -> Iterator[Reason]:
     )
 
 
-def _lead_in(judged: Judged) -> Iterator[Reason]:
-    """States before the first map."""
-    replay = judged.replay
-    if not replay.lead_in_s > judged.request.config.verdict.lead_in:
+def controller(judged: Judged) -> Iterator[Reason]:
+    """Closed loop: every step is solved; a controller of one's own answers every time, and as it should."""
+    if judged.replay.outside is not None:
+        yield _answers(judged, judged.replay.outside)
         return
-    yield lacking(
-        sentence=f"the first {replay.lead_in_s:.2f} s ({replay.num_before_scene} states) come before the first map",
-        value=replay.lead_in_s,
-        threshold=judged.request.config.verdict.lead_in,
-        unit="s",
-        remedy="judge the rest alone with --start-time first-map",
+    trace, metrics = judged.replay.closed_loop, judged.metrics
+    if trace is None:
+        return
+    bad = {name: metrics[f"num_{name}"] or 0 for name in ("relaxed", "minimum_violation", "hold")}
+    if not sum(bad.values()):
+        yield held(f"all {len(trace.steps)} steps solved", 0.0, 0.0, "", len(trace.steps))
+        return
+    kinds = (EventKind.RELAXED, EventKind.MINIMUM_VIOLATION, EventKind.HOLD)
+    first = min((e for kind in kinds for e in events_of(judged.replay, kind)), key=lambda e: e.first_ns)
+    found = ", ".join(f"{int(count)} {name.replace('_', ' ')}" for name, count in bad.items() if count)
+    yield failed(
+        sentence=f"its rows could not be kept at {found} of {len(trace.steps)} steps, first",
+        value=float(sum(bad.values())),
+        threshold=0.0,
+        time_s=first.start_s,
+        who=first.worst_name,
+        cause="" if first.obstacle is None else f"near {first.obstacle}",
+        count=len(trace.steps),
+        label=CONTROL,
+    )
+
+
+def _answers(judged: Judged, outside: OutsideRun) -> Reason:
+    """Whether a controller of one's own did what it should."""
+    num, failure = outside.num_answers, outside.failure
+    if failure is None:
+        return held(f"all {num} steps answered", 0.0, 0.0, "", num)
+    return failed(
+        sentence=f"{failure.fault}: {failure.sentence}; after {counted(num, 'answer')},",
+        value=1.0,
+        threshold=0.0,
+        time_s=float(failure.stamp_ns - judged.replay.audit.stamp_ns[0]) * 1e-9,
+        count=num + 1,
+        label=CONTROL,
+    )
+
+
+def scene_hits(judged: Judged) -> Iterator[Reason]:
+    """Closed loop: nothing appears inside the arm."""
+    trace = judged.replay.closed_loop
+    if trace is None:
+        return
+    hits = judged.metrics["num_scene_hits"] or 0
+    if hits:
+        change = next(change for change in trace.scene_changes if change.is_hit)
+        yield failed(
+            sentence=f"the scene came into the arm {int(hits)} times, first",
+            value=float(hits),
+            threshold=0.0,
+            time_s=float(change.stamp_ns - judged.replay.audit.stamp_ns[0]) * 1e-9,
+            count=len(trace.scene_changes),
+            label=CONTACT,
+        )
+
+
+def goal(judged: Judged) -> Iterator[Reason]:
+    """Closed loop: the goal is reached."""
+    trace, request = judged.replay.closed_loop, judged.request
+    if trace is None or request.follow or request.twist_topic is not None:
+        return
+    reached = trace.outcome is LoopOutcome.GOAL_REACHED
+    has_way = trace.outcome not in (LoopOutcome.GOAL_REACHED, LoopOutcome.CONTROLLER_FAILED)
+    yield Reason(
+        outcome=Outcome.PASSED if reached else Outcome.FAILED,
+        sentence="reached" if reached else f"not reached: {trace.outcome}",
+        value=float(reached),
+        threshold=1.0,
+        count=len(trace.steps),
+        label="goal not reached",
+        remedy="--set control.max_detours=3 lets the planner find a way round" if has_way else "",
+    )
+
+
+def commanded(judged: Judged) -> Reason | None:
+    """Where a controller of one's own commands more than the limits; None where it does not."""
+    replay = judged.replay
+    if replay.outside is None or replay.kept_steps is None:
+        return None
+    shares = np.abs(np.asarray(replay.kept_steps.figures.rows("velocity"))) / replay.model.velocity_limit
+    if not np.nanmax(shares, initial=0.0) > LIMIT_EXCEEDED:
+        return None
+    state, joint = np.unravel_index(np.nanargmax(shares), shares.shape)
+    name, most = replay.model.joint_names[joint], float(shares[state, joint])
+    return failed(
+        sentence=f"{name} is commanded {most:.2f} times its limit",
+        value=most,
+        threshold=1.0,
+        time_s=seconds_at(judged, int(state)),
+        who=name,
         count=judged.num_states,
+        label=LIMITS,
     )
