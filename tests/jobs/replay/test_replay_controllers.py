@@ -12,7 +12,7 @@ from splatctrl_cli.jobs.replay.metrics import metric_names
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, Desk, splats_of, write_scene
 from tests.cli.test_replay_modes import ball_ahead, events, moving
-from tests.jobs.stage import QUARTER, Stage, decisive
+from tests.jobs.stage import MOVE, QUARTER, Stage, decisive, passing
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -91,6 +91,7 @@ def alike(a: str, b: str) -> bool:
 
 def test_a_controller_that_is_good_is_safe_and_named(stage: Stage) -> None:
     shutil.copy(EXAMPLES / "reach.py", stage.desk.folder)
+    stage.states = passing(0.3 * MOVE)
     code, verdict = stage.judged("--controller", "reach:Reach", "--controller-twice", mode="closed-loop")
     assert (code, verdict["label"], decisive(verdict)) == (0, "safe", {})
     (reason,) = [reason for reason in verdict["reasons"] if reason["criterion"] == "controller"]
@@ -108,8 +109,9 @@ def test_a_controller_that_goes_elsewhere_does_not_reach_the_goal(stage: Stage) 
 
 
 def test_a_motion_of_its_own_is_judged_by_every_criterion(stage: Stage) -> None:
+    stage.states = passing(0.4 * MOVE)
     stage.balls = [*stage.balls, stage.ball_at_the_end(0.005)]
-    code, verdict = stage.judged("--controller", "own:Constant", "--set", "control.max_time=8", mode="closed-loop")
+    code, verdict = stage.judged("--controller", "own:Constant", "--set", "control.max_time=4", mode="closed-loop")
     assert code == 1 and {"clearance", "goal"} <= set(decisive(verdict))
     assert {event["kind"] for event in events(stage.desk)} >= {"below-margin", "row-broken"}
 
@@ -171,11 +173,11 @@ def test_the_examples_drive_alike(stage: Stage) -> None:
     if compiler is None:
         pytest.skip("no C++ compiler (c++): docs/controllers/reach.cpp is not tried")
     program, source = stage.desk.folder / "reach", EXAMPLES / "reach.cpp"
-    subprocess.run([compiler, "-std=c++17", "-Wall", "-Wextra", "-Werror", "-O2", "-o", program, source], check=True)
+    subprocess.run([compiler, "-std=c++17", "-Wall", "-Wextra", "-Werror", "-o", program, source], check=True)
     shutil.copy(EXAMPLES / "reach.py", stage.desk.folder)
-    moving(stage.desk)
+    moving(stage.desk, 0.4 * MOVE)
     stage.states = stage.desk.source.states
-    stage.balls = [*stage.balls, ball_ahead(stage.arm, 0.03)]
+    stage.balls = [*stage.balls, stage.ball_at_the_end(0.03)]
     scene = stage.scene()
     code, _ = stage.judged("--controller", "reach:Reach", mode="closed-loop", scene=scene)
     python = stage.desk.rows()
