@@ -25,7 +25,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, ranges
 from splatctrl_cli.formats.unpacking import PIECE
 from splatctrl_cli.libraries import of_extra
-from splatctrl_cli.records import Float64, Stamps
+from splatctrl_cli.records import Stamps
 
 DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a place in it lies before its start
     *(zipfile.BadZipFile, zlib.error, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError),
@@ -174,12 +174,8 @@ class ArrayFile(ABC):
         self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
     ) -> tuple[Stamps, dict[str, Rows]]:
         """`stamps`, and of each group of names its `columns`."""
-        return self.stamps(time, unit_ns, epoch_ns), {key: self.columns(names) for key, names in groups.items()}
-
-    def numbers(self, names: Sequence[str]) -> Float64:
-        """`columns`, all rows at once."""
-        rows = self.columns(names)
-        return rows[: len(rows)]
+        columns = {key: self.columns(names) for key, names in groups.items()}
+        return self.stamps(time, unit_ns, epoch_ns), columns
 
     def rows(self, name: str) -> Rows:
         """An array (T, ...), each row in its shape; T may be 0. Raises InputError where it holds no numbers."""
