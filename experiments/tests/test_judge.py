@@ -51,15 +51,10 @@ def test_an_arm_that_folds_into_itself_has_hit_itself(problem: Problem, views: V
     assert judge.against_truth(free, np.array([problem.start, folded]), views).cause == judge.HIT_SELF
 
 
-@pytest.mark.parametrize("sees", [True, False])
 def test_the_back_of_a_thing_that_the_arm_at_rest_hid_from_all_cameras_is_not_safe(
-    sees: bool, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Once driven and judged safe: 9 mm from a cylinder of which the map has the far side, 70 mm away."""
-    if not sees:  # without that rule it would still pass
-        monkeypatch.setattr(
-            evidence_criteria, "LIMITS", [limit for limit in LIMITS if limit.column != "blind_to_surface"]
-        )
     hidden_back = read_problem("tabletop-0388", None)
     views = views_of(hidden_back, 2, width=320, num_steps=5)
     rig = Rig(problem=hidden_back, views=views, config=SETTINGS, threads=1, stopwatch=Stopwatch())
@@ -68,8 +63,10 @@ def test_the_back_of_a_thing_that_the_arm_at_rest_hid_from_all_cameras_is_not_sa
     way = np.linspace(hidden_back.start, end, 116)
     assert judge.against_truth(hidden_back, way, views).clearance < 0.01
     assert known is not None
-    verdict = judge.verdict_on(robot, way, rig.task.stamp_ns, known, SETTINGS)
-    assert verdict.label == ("not evaluable" if sees else "safe")
+    assert judge.verdict_on(robot, way, rig.task.stamp_ns, known, SETTINGS).label == "not evaluable"
+    without = [limit for limit in LIMITS if limit.column != "blind_to_surface"]
+    monkeypatch.setattr(evidence_criteria, "LIMITS", without)
+    assert judge.verdict_on(robot, way, rig.task.stamp_ns, known, SETTINGS).label == "safe"  # it would still pass
 
 
 def passed(*_: object) -> Verdict:
