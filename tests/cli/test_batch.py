@@ -164,7 +164,8 @@ def test_nodes_that_an_interrupted_batch_did_not_come_to_are_to_do(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     suite, out = tmp_path / "nightly.toml", tmp_path / "nightly.out"
-    suite.write_text(f'[[recordings]]\nname = "good"\npaths = ["{LOG}"]\n[jobs.info]\n[jobs.check]\nquick = 3\n')
+    make_log(tmp_path / "good.mcap", LogRecipe(num_frames=20))
+    suite.write_text('[[recordings]]\npaths = ["good.mcap"]\n[jobs.info]\n[jobs.check]\nquick = 3\n')
     suite.write_text(suite.read_text() + "[jobs.look]\ncommand = 'check'\nquick = 3\n")
     assert main(["batch", str(suite), "-q"]) == 0
     suite.write_text(suite.read_text().replace("quick = 3", "quick = 4"))
