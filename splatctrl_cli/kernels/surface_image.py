@@ -1,6 +1,7 @@
 """The depth image that a camera would measure of solids and triangles; compiled."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -9,20 +10,24 @@ from splatctrl_cli.kernels import Float32, Float64, Int16, native
 BOX, CYLINDER, BALL, CAPSULE = 0.0, 1.0, 2.0, 3.0
 
 
+SurfaceMesh: Any = native.SurfaceMesh
+"""SurfaceMesh(corners, links): triangles (F, 3, 3) float64 [m], counter-clockwise seen from outside, in the frames of
+links (F,) int16, numbers of at least 0. Corners that triangles of a link share are kept once.
+"""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SurfaceScene:
-    """Solids (P) in a camera's optical frame and triangles (F) in the frames of links (L) [m].
+    """Solids (P) in a camera's optical frame and a mesh in the frames of links (L) [m].
 
     solids (P, 16) float64: kind, the rotation (9) and shift (3) from the optical frame to the solid's own, its size:
     half edges of a box; radius, half length along z and 0 of a cylinder or a capsule; radius, 0, 0 of a ball.
-    triangles (F, 3, 3) float64: corners; link_poses (L, 3, 4) lead from links to the optical frame. The links (P,)
-    and (F,) are numbers of at least 0.
+    link_poses (L, 3, 4) lead from links to the optical frame. solid_links (P,) are numbers of at least 0.
     """
 
     solids: Float64
     solid_links: Int16
-    triangles: Float64
-    triangle_links: Int16
+    mesh: Any
     link_poses: Float64
 
 
@@ -55,7 +60,7 @@ def render_surface(
     shape = (int(intrinsics[5]), int(intrinsics[4]))
     depth, link, inside = np.empty(shape, np.float32), np.empty(shape, np.int16), np.empty(shape, np.int16)
     native.render_surface(
-        intrinsics, scene.solids, scene.solid_links, scene.triangles, scene.triangle_links, scene.link_poses,
-        measured, tolerance, quadratic, depth, link, inside, num_threads,
+        intrinsics, scene.solids, scene.solid_links, scene.mesh, scene.link_poses, measured,
+        tolerance, quadratic, depth, link, inside, num_threads,
     )  # fmt: skip
     return SurfaceImage(depth=depth, link=link, inside=inside)

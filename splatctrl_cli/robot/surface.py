@@ -3,6 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from splatctrl_cli.kernels.surface_image import (
     CAPSULE,
     CYLINDER,
     SurfaceImage,
+    SurfaceMesh,
     SurfaceScene,
     render_surface,
 )
@@ -34,10 +36,11 @@ class RobotSurface:
     """Solids (P) and triangles (F), each fixed to one of `links` (L) [m].
 
     kinds (P,) as `kernels.surface_image` numbers them, sizes (P, 3) (half edges; radius and half length; radius),
-    T_link_solid (P, 4, 4), solid_links (P,); triangles (F, 3, 3) in the frame of triangle_links (F,), `trees` of them
-    by their number. by_spheres: links that collision spheres stand for, because their geometry is missing or cannot
-    be read. notes: in words, for which links something else stands than their visual geometry, and why. fixed: links
-    that no joint moves. num_carried: the last of `links` again, one for each box around what they carry.
+    T_link_solid (P, 4, 4), solid_links (P,); triangles (F, 3, 3) in the frame of triangle_links (F,), a `mesh` of all
+    to draw and `trees` by the links' numbers to measure. by_spheres: links that collision spheres stand for, because
+    their geometry is missing or cannot be read. notes: in words, for which links something else stands than their
+    visual geometry, and why. fixed: links that no joint moves. num_carried: the last of `links` again, one for each
+    box around what they carry.
     """
 
     links: tuple[str, ...]
@@ -47,6 +50,7 @@ class RobotSurface:
     solid_links: Int16
     triangles: Float64
     triangle_links: Int16
+    mesh: Any
     trees: Mapping[int, TriangleTree] = field(default_factory=dict)
     by_spheres: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
@@ -109,6 +113,7 @@ class RobotSurface:
             solid_links=np.array([number[s.link] for s in shapes], np.int16),
             triangles=corners,
             triangle_links=owners.astype(np.int16),
+            mesh=SurfaceMesh(corners, owners.astype(np.int16)),
             trees={int(k): TriangleTree(corners[owners == k]) for k in np.unique(owners)},
             by_spheres=by_spheres,
             fixed=fixed,
@@ -149,7 +154,8 @@ class RobotSurface:
         triangles, owners = np.concatenate([self.triangles, *(p for _, p in pieces)]), self.triangle_links
         owners = np.concatenate([owners, *added])
         trees = {int(k): TriangleTree(triangles[owners == k]) for k in np.unique(np.concatenate([[], *added]))}
-        return replace(self, triangles=triangles, triangle_links=owners, trees={**self.trees, **trees})
+        mesh, trees = SurfaceMesh(triangles, owners), {**self.trees, **trees}
+        return replace(self, triangles=triangles, triangle_links=owners, mesh=mesh, trees=trees)
 
     @property
     def vague(self) -> list[int]:
@@ -203,8 +209,7 @@ class RobotSurface:
         scene = SurfaceScene(
             solids=self._solids(T_solid_camera),
             solid_links=self.solid_links,
-            triangles=self.triangles,
-            triangle_links=self.triangle_links,
+            mesh=self.mesh,
             link_poses=np.ascontiguousarray(T_camera_link[:, :3]),
         )
         packed = np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height], np.float64)

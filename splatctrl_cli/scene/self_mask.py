@@ -75,8 +75,8 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     lens = replace(k, cx=k.cx + border, cy=k.cy + border, width=k.width + 2 * border, height=k.height + 2 * border)
     wider = _mask_within(replace(frame, intrinsics=lens, depth=np.pad(frame.depth, border)), robot, config)
     image = slice(border, border + k.height), slice(border, border + k.width)
-    kinds, depth = (np.ascontiguousarray(of_all[image]) for of_all in (wider.kinds, wider.robot_depth))
-    return replace(wider, kinds=kinds, robot_depth=depth)
+    kinds, depth = wider.kinds[image], wider.robot_depth[image]
+    return replace(wider, kinds=np.ascontiguousarray(kinds), robot_depth=np.ascontiguousarray(depth))
 
 
 def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
@@ -103,18 +103,21 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     link, inside = shown.link[part], shown.inside[part]
     has_depth, is_robot = depth > 0, rendered > 0
     tolerance = tolerance_at(depth, config)
-    is_behind = depth >= nearest_within(rendered, is_robot, reach) - tolerance
+    nearest = nearest_within(rendered, is_robot, reach)
+    farthest = farthest_within(rendered, reach)
+    is_behind = depth >= nearest - tolerance
     is_explained = has_depth & is_behind
-    is_explained &= depth <= farthest_within(rendered, reach) + tolerance
+    is_explained &= depth <= farthest + tolerance
     if surface.vague:
         is_explained |= np.isin(inside, surface.vague)
-    nearest = nearest_within(rendered, is_robot, wide)
+    nearest_at_edge = _least_within(nearest, edge - reach)  # infinite away from the outline
+    nearest = _least_within(nearest_at_edge, wide - edge)
     beside = np.isfinite(nearest) & has_depth
-    nearest_at_edge = nearest_within(rendered, is_robot, edge)  # infinite away from the outline
+    is_core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     is_sure = depth < nearest_at_edge
-    is_sure |= cv2.erode(is_robot.view(np.uint8), _window(edge)).view(bool)
+    is_sure |= cv2.erode(is_core.view(np.uint8), _window(edge - reach)).view(bool)
     if surface.trees:
-        is_near = depth < farthest_within(rendered, wide) + CONTACT_THICKNESS
+        is_near = depth < farthest_within(farthest, wide - reach) + CONTACT_THICKNESS
         v, u = np.nonzero(beside & is_near & ~is_explained)
         rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
         sure = tolerance_at(depth[v, u], config, MASK_SURE) + edge * depth[v, u] / np.float32(frame.intrinsics.fx)
@@ -131,11 +134,11 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0).astype(np.float64)
     is_object, is_edge = kinds == PixelKind.OBJECT, np.isfinite(nearest_at_edge)
     _judge(kinds, depth, beside, area, surface_steps(is_object, depth, is_edge, edge, tolerance, config.depth_error))
-    core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     offset = depth - rendered
-    is_told = core & has_depth & (np.abs(offset) <= MASK_FAR_OFF) & (link < len(surface.links) - surface.num_carried)
+    is_told = is_core & has_depth & (np.abs(offset) <= MASK_FAR_OFF)
+    is_told &= link < len(surface.links) - surface.num_carried
     is_told &= rendered - nearest < MASK_STEP  # beside a nearer part stereo may give it that part's depth
-    is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
+    is_inside = is_core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
         mask,
         reach=float(np.median(tolerance_at(rendered[is_robot], config))),
@@ -369,7 +372,11 @@ def nearest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:
     """Least depth (H, W) of the chosen pixels within `reach` pixels; inf where there are none."""
     kept = np.full(depth.shape, np.inf, np.float32)
     cv2.copyTo(depth, chosen.view(np.uint8), kept)
-    return np.asarray(cv2.erode(kept, _window(reach), borderType=cv2.BORDER_REPLICATE), np.float32)
+    return _least_within(kept, reach)
+
+
+def _least_within(image: Float32, reach: int) -> Float32:
+    return np.asarray(cv2.erode(image, _window(reach), borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def farthest_within(depth: Float32, reach: int) -> Float32:

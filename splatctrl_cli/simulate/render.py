@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.kernels.surface_image import SurfaceScene, render_surface
+from splatctrl_cli.kernels.surface_image import SurfaceMesh, SurfaceScene, render_surface
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, UInt8
 from splatctrl_cli.simulate.primitives import Primitive, Texture, hit, normals
 
@@ -128,8 +128,7 @@ class Renderer:
                 scene = SurfaceScene(
                     solids=np.zeros((0, 16)),
                     solid_links=np.zeros(0, np.int16),
-                    triangles=meshes.triangles[part],
-                    triangle_links=np.arange(len(owners), dtype=np.int16),
+                    mesh=SurfaceMesh(meshes.triangles[part], np.arange(len(owners), dtype=np.int16)),
                     link_poses=np.ascontiguousarray(T_camera[owners, :3]),
                 )
                 seen = render_surface(scene, at_ray, nothing, tolerance=0.0, quadratic=0.0)

@@ -1,5 +1,8 @@
 """The rendered surface of solids and triangles against one ray at a time."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -11,11 +14,12 @@ from splatctrl_cli.kernels.surface_image import (
     CAPSULE,
     CYLINDER,
     SurfaceImage,
+    SurfaceMesh,
     SurfaceScene,
     render_surface,
 )
 from splatctrl_cli.records import Float64
-from tests.reference.surface import is_inside_spans, span
+from tests.reference.surface import is_inside_spans, span, triangle_depth
 
 K = np.array([60.0, 55.0, 24.3, 17.1, 51.0, 37.0])
 KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": BALL, "capsule": CAPSULE}
@@ -49,8 +53,7 @@ def scene_of(solids: list[tuple[str, tuple[float, ...], Float64]], triangles: Fl
     return SurfaceScene(
         solids=np.array(rows).reshape(-1, 16),
         solid_links=np.arange(len(solids), dtype=np.int16),
-        triangles=faces,
-        triangle_links=np.full(len(faces), 7, np.int16),
+        mesh=SurfaceMesh(faces, np.full(len(faces), 7, np.int16)),
         link_poses=np.tile(np.eye(4)[:3], (8, 1, 1)),
     )
 
@@ -115,6 +118,49 @@ def test_triangles_show_what_their_solid_shows() -> None:
     assert ((ball.depth > 0) != (faces.depth > 0)).sum() < 20
     assert np.abs(ball.depth - faces.depth)[both].mean() < 1e-3
     assert (faces.link[faces.depth > 0] == 7).all()
+
+
+def mesh_scene(triangles: Float64, links: Sequence[int]) -> SurfaceScene:
+    return replace(scene_of([]), mesh=SurfaceMesh(np.ascontiguousarray(triangles), np.array(links, np.int16)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_nearest_triangle_shows_from_whichever_side(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sides = rng.normal(0.0, 0.15, (60, 3, 3))
+    triangles = rng.uniform([-0.3, -0.2, 0.6], [0.3, 0.2, 1.2], (60, 1, 3)) + sides
+    links = rng.integers(0, 8, 60)
+    image = rendered(mesh_scene(triangles, links))
+    num_shown = 0
+    for (v, u), direction in zip(np.ndindex(image.depth.shape), rays().reshape(-1, 3), strict=True):
+        depths = np.array([triangle_depth(corners, direction) for corners in triangles])
+        if not np.isfinite(depths).any():
+            assert image.depth[v, u] == 0 and image.link[v, u] == -1
+            continue
+        num_shown += 1
+        assert image.depth[v, u] == pytest.approx(depths.min(), rel=1e-6)
+        assert image.link[v, u] == links[depths.argmin()]
+    assert num_shown > 300 and (image.depth == 0).sum() > 100
+
+
+@pytest.mark.parametrize("is_first_from_inside", [False, True])
+def test_of_two_triangles_in_one_place_the_first_shows(is_first_from_inside: bool) -> None:
+    corners = np.array([[-0.2, -0.2, 1.0], [0.2, -0.2, 1.0], [0.0, 0.3, 1.0]])
+    both = np.array([corners, corners[::-1]])
+    image = rendered(mesh_scene(both[::-1] if is_first_from_inside else both, [3, 5]))
+    assert (image.link[image.depth > 0] == 3).all() and (image.depth > 0).sum() > 100
+
+
+def test_a_triangle_that_reaches_behind_the_camera_hides_none() -> None:
+    near = np.array([[-0.2, -0.2, 0.5], [0.2, -0.2, 0.5], [0.0, 0.3, -0.1]])
+    far = np.array([[-0.2, -0.2, 1.0], [0.2, -0.2, 1.0], [0.0, 0.3, 1.0]])
+    image = rendered(mesh_scene(np.array([near, far]), [1, 2]))
+    assert set(np.unique(image.link)) == {-1, 2}
+
+
+def test_a_mesh_without_poses_for_all_its_links_is_refused() -> None:
+    with pytest.raises(ValueError, match="no such link"):
+        rendered(mesh_scene(np.ones((1, 3, 3)), [8]))
 
 
 def test_a_solid_that_holds_the_camera_is_not_seen() -> None:

@@ -29,14 +29,15 @@ def expected_areas(depth: Float32, steps: Float32, area: Float64, is_object: Boo
     return np.where(asked, total[piece[:-1]].reshape(height, width), np.inf)
 
 
+@pytest.mark.parametrize("is_asked_here_and_there", [False, True])
 @pytest.mark.parametrize("share", [0.3, 0.9])
-def test_a_piece_is_what_small_steps_join(share: float) -> None:
+def test_a_piece_is_what_small_steps_join(share: float, is_asked_here_and_there: bool) -> None:
     rng = np.random.default_rng(0)
     depth = rng.choice(np.array([1.0, 1.005, 1.01, 1.04], np.float32), (40, 50))
     steps = rng.choice(np.array([0.004, 0.006, 0.02], np.float32), depth.shape)
     area, is_object = rng.random(depth.shape), rng.random(depth.shape) < share
-    asked = is_object & (np.arange(50) < 35)
+    asked = is_object & ((rng.random(depth.shape) < 0.02) if is_asked_here_and_there else (np.arange(50) < 35))
     total = np.empty(depth.shape)
     native.piece_areas(depth, steps, area, is_object.view(np.uint8), asked.view(np.uint8), total)
     np.testing.assert_array_equal(total, expected_areas(depth, steps, area, is_object, asked))
-    assert len(np.unique(total)) > 10 and np.isinf(total[asked]).any()
+    assert np.isinf(total[asked]).any() and (is_asked_here_and_there or len(np.unique(total)) > 10)

@@ -31,6 +31,15 @@ def span(kind: str, size: tuple[float, ...], origin: Float64, direction: Float64
     return (near, far) if near <= far else (np.inf, -np.inf)
 
 
+def triangle_depth(corners: Float64, direction: Float64) -> float:
+    """t where t direction is on a triangle (3, 3), from whichever side; infinite where it never is."""
+    try:
+        t, across, along = np.linalg.solve(np.column_stack([direction, *(corners[0] - corners[1:])]), corners[0])
+    except np.linalg.LinAlgError:
+        return np.inf
+    return float(t) if min(t, across, along, 1 - across - along) >= 0 else np.inf
+
+
 def is_inside_spans(measured: float, tolerance: float, spans: list[tuple[float, float]]) -> bool:
     """Whether a measured depth lies by more than `tolerance` behind the front and before the back of one solid."""
     return any(near < measured - tolerance and measured + tolerance < far and near > 0 for near, far in spans)

@@ -43,11 +43,21 @@ void bind_surface(nb::module_& m) {
       },
       nb::arg("points").noconvert(), nb::arg("solids").noconvert(), nb::arg("solid_links").noconvert(),
       nb::arg("distance").noconvert(), nb::arg("num_threads"));
+  nb::class_<SurfaceMesh>(m, "SurfaceMesh")
+      .def(
+          "__init__",
+          [](SurfaceMesh* self, const Array<const double>& corners, const Array<const std::int16_t>& links) {
+            expect(corners.size() == 9 * links.size(), "expected corners (F, 3, 3) and links (F,)");
+            expect(std::all_of(links.data(), links.data() + links.size(), [](int link) { return link >= 0; }),
+                   "links: expected numbers of at least 0");
+            const nb::gil_scoped_release release;
+            new (self) SurfaceMesh(corners.data(), links.data(), static_cast<int>(links.size()));
+          },
+          nb::arg("corners").noconvert(), nb::arg("links").noconvert());
   m.def(
       "render_surface",
       [](const Array<const double>& intrinsics, const Array<const double>& solids,
-         const Array<const std::int16_t>& solid_links, const Array<const double>& triangles,
-         const Array<const std::int16_t>& triangle_links, const Array<const double>& link_poses,
+         const Array<const std::int16_t>& solid_links, const SurfaceMesh& mesh, const Array<const double>& link_poses,
          const Array<const float>& measured, float tolerance, float quadratic, const Array<float>& depth,
          const Array<std::int16_t>& link, const Array<std::int16_t>& inside, int num_threads) {
         expect(intrinsics.size() == 6, "intrinsics: expected 6 numbers");
@@ -56,21 +66,15 @@ void bind_surface(nb::module_& m) {
         const std::size_t size = static_cast<std::size_t>(camera.width) * camera.height;
         expect(measured.size() == size && depth.size() == size && link.size() == size && inside.size() == size,
                "expected images (H, W)");
-        expect(triangles.size() == 9 * triangle_links.size(), "triangles: expected (F, 3, 3) and links (F,)");
+        expect(link_poses.size() >= 12 * static_cast<std::size_t>(mesh.num_links()), "triangles: no such link");
         const std::vector<SurfaceSolid> shapes = solids_from(solids, solid_links);
-        const int num = static_cast<int>(triangle_links.size());
-        for (int i = 0; i < num; ++i) {
-          const int number = triangle_links.data()[i];
-          expect(number >= 0 && 12 * static_cast<std::size_t>(number) < link_poses.size(), "triangles: no such link");
-        }
         const nb::gil_scoped_release release;
         render_surface(camera, shapes.data(), static_cast<int>(shapes.size()),
-                       {triangles.data(), link_poses.data(), triangle_links.data(), num},
-                       {measured.data(), tolerance, quadratic}, {depth.data(), link.data(), inside.data()},
-                       num_threads);
+                       {mesh, link_poses.data()}, {measured.data(), tolerance, quadratic},
+                       {depth.data(), link.data(), inside.data()}, num_threads);
       },
       nb::arg("intrinsics").noconvert(), nb::arg("solids").noconvert(), nb::arg("solid_links").noconvert(),
-      nb::arg("triangles").noconvert(), nb::arg("triangle_links").noconvert(), nb::arg("link_poses").noconvert(),
+      nb::arg("mesh"), nb::arg("link_poses").noconvert(),
       nb::arg("measured").noconvert(), nb::arg("tolerance"), nb::arg("quadratic"),
       nb::arg("depth").noconvert(), nb::arg("link").noconvert(), nb::arg("inside").noconvert(), nb::arg("num_threads"));
   m.def(

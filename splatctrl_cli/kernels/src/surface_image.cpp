@@ -164,106 +164,53 @@ void cast_row(const SurfaceSolid& solid, const PixelBox& box, const SurfaceCamer
   }
 }
 
-// What triangles alone show: nearest depth and its link.
-struct TriangleImage {
-  std::vector<float> near;
-  std::vector<std::int16_t> link;
-};
-
-inline double cross(const double* a, const double* b, const double* p) {
-  return (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]);
-}
-
-// Of two triangles that share an edge through a pixel's centre exactly one has the pixel.
-inline bool owns_edge(const double* a, const double* b) { return b[1] < a[1] || (b[1] == a[1] && b[0] > a[0]); }
-
-// corner (3, 3): in the optical frame.
-void draw(const double* corner, std::int16_t link, const SurfaceCamera& camera, TriangleImage& out) {
-  double p[3][2], inverse[3];  // pixels, 1 / depth
-  for (int i = 0; i < 3; ++i) {
-    const double* c = corner + 3 * i;
-    if (c[2] < kNear) return;
-    inverse[i] = 1.0 / c[2];
-    p[i][0] = camera.fx * c[0] * inverse[i] + camera.cx;
-    p[i][1] = camera.fy * c[1] * inverse[i] + camera.cy;
-  }
-  const auto least = [&](int k) { return std::min({p[0][k], p[1][k], p[2][k]}); };
-  const auto most = [&](int k) { return std::max({p[0][k], p[1][k], p[2][k]}); };
-  if (most(0) < 0 || most(1) < 0 || least(0) > camera.width - 1 || least(1) > camera.height - 1) return;
-  const int left = static_cast<int>(std::ceil(std::max(least(0), 0.0)));
-  const int right = static_cast<int>(std::floor(std::min(most(0), camera.width - 1.0)));
-  const int top = static_cast<int>(std::ceil(std::max(least(1), 0.0)));
-  const int bottom = static_cast<int>(std::floor(std::min(most(1), camera.height - 1.0)));
-  if (left > right || top > bottom) return;
-  double area = cross(p[0], p[1], p[2]);
-  if (area == 0.0) return;
-  if (area > 0.0) {  // v points down: seen from inside
-    std::swap(p[1], p[2]);
-    std::swap(inverse[1], inverse[2]);
-    area = -area;
-  }
-  for (int v = top; v <= bottom; ++v) {
-    for (int u = left; u <= right; ++u) {
-      const double at[2] = {double(u), double(v)};
-      const double w[3] = {cross(p[1], p[2], at), cross(p[2], p[0], at), cross(p[0], p[1], at)};  // below 0 inside
-      bool is_in = true;
-      for (int i = 0; i < 3; ++i) {
-        is_in &= w[i] < 0.0 || (w[i] == 0.0 && owns_edge(p[(i + 1) % 3], p[(i + 2) % 3]));
-      }
-      if (!is_in) continue;
-      const float z = static_cast<float>(area / (w[0] * inverse[0] + w[1] * inverse[1] + w[2] * inverse[2]));
-      const std::size_t pixel = static_cast<std::size_t>(v) * camera.width + u;
-      if (z >= out.near[pixel]) continue;
-      out.near[pixel] = z;
-      out.link[pixel] = link;
-    }
+// depth and link (W) where triangles are drawn on row v.
+void show_row(const TriangleImage& drawn, const SurfaceMesh& mesh, int v, float* depth, std::int16_t* link) {
+  const std::size_t row = static_cast<std::size_t>(v - drawn.top) * drawn.width;
+  for (int x = 0; x < drawn.width; ++x) {
+    const std::int32_t number = drawn.number[row + x];
+    if (number < 0) continue;
+    depth[drawn.left + x] = drawn.near[row + x];
+    link[drawn.left + x] = mesh.link(number);
   }
 }
 
 }  // namespace
 
 void render_surface(const SurfaceCamera& camera, const SurfaceSolid* solids, int num_solids,
-                    const SurfaceTriangles& triangles, const SurfaceMeasurement& measured, const SurfaceImage& out,
+                    const PlacedMesh& mesh, const SurfaceMeasurement& measured, const SurfaceImage& out,
                     int num_threads) {
-  TriangleImage drawn;
-  if (triangles.num > 0) {
-    const std::size_t size = static_cast<std::size_t>(camera.width) * camera.height;
-    drawn = {std::vector<float>(size, kFar), std::vector<std::int16_t>(size, -1)};
-    for (int i = 0; i < triangles.num; ++i) {
-      const double* pose = triangles.poses + 12 * triangles.link[i];
-      double there[9];
-      for (int k = 0; k < 9; ++k) {
-        const double *row = pose + k % 3 * 4, *c = triangles.corners + 9 * static_cast<std::size_t>(i) + k / 3 * 3;
-        there[k] = row[0] * c[0] + row[1] * c[1] + row[2] * c[2] + row[3];
-      }
-      draw(there, triangles.link[i], camera, drawn);
-    }
-  }
+  const TriangleImage drawn = mesh.triangles.draw(mesh.poses, camera);
   std::vector<PixelBox> boxes(num_solids);
   for (int i = 0; i < num_solids; ++i) boxes[i] = pixels_of(solids[i], camera);
   parallel_for(parts(camera.height, kRows), num_threads, [&](int chunk) {
     Row row(camera.width);
     for (int v = chunk * kRows; v < std::min(camera.height, (chunk + 1) * kRows); ++v) {
       const std::size_t first = static_cast<std::size_t>(v) * camera.width;
-      std::fill(row.near.begin(), row.near.end(), kFar);
-      std::fill(row.link.begin(), row.link.end(), -1);
+      float* depth = out.depth + first;
+      std::int16_t *link = out.link + first, *inside = out.inside + first;
+      std::fill_n(depth, camera.width, 0.0f);
+      std::fill_n(link, camera.width, std::int16_t{-1});
+      std::fill_n(inside, camera.width, std::int16_t{-1});
+      if (v >= drawn.top && v < drawn.top + drawn.height) show_row(drawn, mesh.triangles, v, depth, link);
+      const auto is_on_row = [&](const PixelBox& box) { return v >= box.top && v < box.bottom; };
+      if (std::none_of(boxes.begin(), boxes.end(), is_on_row)) continue;
       std::fill(row.inside.begin(), row.inside.end(), -1);
       for (int u = 0; u < camera.width; ++u) {
         const float m = measured.depth[first + u];
         row.measured[u] = m;
         row.tolerance[u] = measured.tolerance + measured.quadratic * m * m;
-        if (triangles.num == 0) continue;
-        row.near[u] = drawn.near[first + u];
-        row.link[u] = drawn.link[first + u];
+        row.near[u] = link[u] >= 0 ? depth[u] : kFar;
+        row.link[u] = link[u];
       }
       for (int i = 0; i < num_solids; ++i) {
-        if (v >= boxes[i].top && v < boxes[i].bottom) cast_row(solids[i], boxes[i], camera, v, row);
+        if (is_on_row(boxes[i])) cast_row(solids[i], boxes[i], camera, v, row);
       }
       for (int u = 0; u < camera.width; ++u) {
         const bool is_seen = row.link[u] >= 0;
-        out.depth[first + u] = is_seen ? row.near[u] : 0.0f;
-        out.link[first + u] = static_cast<std::int16_t>(row.link[u]);
-        out.inside[first + u] = static_cast<std::int16_t>(row.inside[u]);
+        depth[u] = is_seen ? row.near[u] : 0.0f;
+        link[u] = static_cast<std::int16_t>(row.link[u]);
+        inside[u] = static_cast<std::int16_t>(row.inside[u]);
       }
     }
   });

@@ -4,6 +4,8 @@
 
 #include <cstdint>
 
+#include "surface_mesh.h"
+
 namespace splatctrl {
 
 enum class SolidKind { kBox, kCylinder, kBall, kCapsule };
@@ -17,16 +19,10 @@ struct SurfaceSolid {
   std::int16_t link;
 };
 
-// Triangles (num, 3, 3) in the frames of links; poses (L, 3, 4) lead from those to the optical frame.
-struct SurfaceTriangles {
-  const double *corners, *poses;
-  const std::int16_t* link;
-  int num;
-};
-
-struct SurfaceCamera {
-  double fx, fy, cx, cy;
-  int width, height;
+// poses (L, 3, 4) lead from the links of the triangles to the optical frame.
+struct PlacedMesh {
+  const SurfaceMesh& triangles;
+  const double* poses;
 };
 
 // measured (H, W) [m] along the optical axis, 0 = none. A measured point is inside where it lies by more than
@@ -47,7 +43,7 @@ struct SurfaceImage {
 };
 
 void render_surface(const SurfaceCamera& camera, const SurfaceSolid* solids, int num_solids,
-                    const SurfaceTriangles& triangles, const SurfaceMeasurement& measured, const SurfaceImage& out,
+                    const PlacedMesh& mesh, const SurfaceMeasurement& measured, const SurfaceImage& out,
                     int num_threads);
 
 }  // namespace splatctrl

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <cstring>
 #include <limits>
 #include <vector>
 
@@ -44,16 +45,23 @@ void piece_areas(const PieceImage& image, double* total) {
     if (!(std::fabs(image.depth[pixel] - image.depth[other]) < step)) return;
     pieces.join(image.asked[pixel] ? pixel + 1 : kBeyond, image.asked[other] ? other + 1 : kBeyond);
   };
+  const auto has_asked = [&](int first, int num) { return std::memchr(image.asked + first, 1, num) != nullptr; };
+  constexpr int kBlock = 16;  // pixels of a row; where none of them or beside them is asked, there is nothing to join
   for (int v = 0; v < image.height; ++v) {
-    for (int u = 0; u < width; ++u) {
-      const int pixel = v * width + u;
-      if (!image.is_object[pixel]) continue;
-      if (image.asked[pixel]) pieces.add(pixel + 1);
-      if (u > 0) join(pixel, pixel - 1);
-      if (v == 0) continue;
-      if (u > 0) join(pixel, pixel - width - 1);
-      join(pixel, pixel - width);
-      if (u + 1 < width) join(pixel, pixel - width + 1);
+    for (int left = 0; left < width; left += kBlock) {
+      const int right = std::min(left + kBlock, width), row = v * width;
+      const int first = std::max(left - 1, 0), num = std::min(right + 1, width) - first;
+      if (!has_asked(row + first, num) && (v == 0 || !has_asked(row - width + first, num))) continue;
+      for (int u = left; u < right; ++u) {
+        const int pixel = row + u;
+        if (!image.is_object[pixel]) continue;
+        if (image.asked[pixel]) pieces.add(pixel + 1);
+        if (u > 0) join(pixel, pixel - 1);
+        if (v == 0) continue;
+        if (u > 0) join(pixel, pixel - width - 1);
+        join(pixel, pixel - width);
+        if (u + 1 < width) join(pixel, pixel - width + 1);
+      }
     }
   }
   std::vector<double> areas(size + 1, 0.0);

@@ -5,8 +5,8 @@
 
 namespace splatctrl {
 
-// Pixels (H, W) of a depth image [m]: `is_object` are those that show objects, `asked` of these those whose piece is
-// wanted. steps (H, W) [m]: neighbours on one surface differ by less than the steps of both. area (H, W) [m^2]: what a
+// Pixels (H, W) of a depth image [m]: `is_object` (1, else 0) are those that show objects, `asked` (1, else 0) of these
+// those whose piece is wanted. steps (H, W) [m]: neighbours on one surface differ by less than the steps of both. area (H, W) [m^2]: what a
 // pixel counts for.
 struct PieceImage {
   const float *depth, *steps;

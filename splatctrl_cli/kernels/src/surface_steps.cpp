@@ -8,44 +8,48 @@
 namespace splatctrl {
 namespace {
 
-// Of the support in one column of a window: its number, and sums of y, y^2, 1/z, y/z and 1/z^2.
+// Of the support in each column of a window: its number, and sums of y, y^2, 1/z, y/z and 1/z^2.
 struct ColumnSums {
-  double num, y, yy, i, yi, ii;
+  std::vector<double> num, y, yy, i, yi, ii;
+
+  explicit ColumnSums(int width) : num(width), y(width), yy(width), i(width), yi(width), ii(width) {}
 };
 
-void add_row(std::vector<ColumnSums>& columns, const PlaneImage& image, int row, double sign) {
+void add_row(ColumnSums& sums, const PlaneImage& image, int row, double sign) {
   const std::size_t first = static_cast<std::size_t>(row) * image.width;
-  const double y = row, signed_y = sign * y;
+  const float* depth = image.depth + first;
+  const std::uint8_t* support = image.support + first;
+  const double y = row, signed_y = sign * y, signed_yy = signed_y * y;
+  double *num = sums.num.data(), *sum_y = sums.y.data(), *yy = sums.yy.data();
+  double *i = sums.i.data(), *yi = sums.yi.data(), *ii = sums.ii.data();
+#pragma GCC ivdep
   for (int x = 0; x < image.width; ++x) {
-    if (!image.support[first + x]) continue;
-    const double inverse = 1.0 / image.depth[first + x], signed_inverse = sign * inverse;
-    ColumnSums& sums = columns[x];
-    sums.num += sign;
-    sums.y += signed_y;
-    sums.yy += signed_y * y;
-    sums.i += signed_inverse;
-    sums.yi += signed_inverse * y;
-    sums.ii += signed_inverse * inverse;
+    const double inverse = support[x] ? 1.0 / depth[x] : 0.0, signed_inverse = sign * inverse;
+    num[x] += support[x] ? sign : 0.0;
+    sum_y[x] += support[x] ? signed_y : 0.0;
+    yy[x] += support[x] ? signed_yy : 0.0;
+    i[x] += signed_inverse;
+    yi[x] += signed_inverse * y;
+    ii[x] += signed_inverse * inverse;
   }
 }
 
 // How far [1/m] 1 / z of pixel (u, v) lies from the plane of the columns first to last; 0 where there is none.
-double off_plane(const std::vector<ColumnSums>& columns, int first, int last, int u, int v, double inverse,
+double off_plane(const ColumnSums& sums, int first, int last, int u, int v, double inverse,
                  const PlaneRule& rule) {
   double num = 0, x = 0, y = 0, i = 0, xx = 0, xy = 0, yy = 0, xi = 0, yi = 0, ii = 0;
   for (int at = first; at <= last; ++at) {  // x and y from the pixel
-    const ColumnSums& column = columns[at];
-    const double dx = at - u, dy = column.y - v * column.num;
-    num += column.num;
-    x += dx * column.num;
+    const double dx = at - u, dy = sums.y[at] - v * sums.num[at];
+    num += sums.num[at];
+    x += dx * sums.num[at];
     y += dy;
-    i += column.i;
-    xx += dx * dx * column.num;
+    i += sums.i[at];
+    xx += dx * dx * sums.num[at];
     xy += dx * dy;
-    yy += column.yy - v * (column.y + dy);
-    xi += dx * column.i;
-    yi += column.yi - v * column.i;
-    ii += column.ii;
+    yy += sums.yy[at] - v * (sums.y[at] + dy);
+    xi += dx * sums.i[at];
+    yi += sums.yi[at] - v * sums.i[at];
+    ii += sums.ii[at];
   }
   if (num < 3) return 0.0;
   x /= num, y /= num, i /= num;
@@ -62,7 +66,7 @@ double off_plane(const std::vector<ColumnSums>& columns, int first, int last, in
 }  // namespace
 
 void surface_steps(const PlaneImage& image, int reach, const PlaneRule& rule, float* steps) {
-  std::vector<ColumnSums> columns(image.width);
+  ColumnSums columns(image.width);
   for (int row = 0; row < std::min(reach, image.height); ++row) add_row(columns, image, row, 1.0);
   for (int v = 0; v < image.height; ++v) {
     if (v + reach < image.height) add_row(columns, image, v + reach, 1.0);
