@@ -100,11 +100,11 @@ def learn(
         elif found := _grow_link(surface, number, boxes[number], used, reach):
             learned += found
         else:
-            unknown[link] = f"no camera sees it in {NUM_CONFIGURATIONS} configurations"
+            unknown[link] = f"seen in fewer than {NUM_CONFIGURATIONS} configurations"
     if not learned:
         reasons = {why: ", ".join(link for link in unknown if unknown[link] == why) for why in unknown.values()}
         raise InputError(
-            f"{name}: no link can be learned: {'; '.join(f'{each} {why}' for why, each in reasons.items())}",
+            f"{name}: no link can be learned: {'; '.join(f'{each}: {why}' for why, each in reasons.items())}",
             remedy=f"record the arm moving by {1e3 * NUM_CONFIGURATIONS * STEP:.0f} mm in view of the cameras",
         )
     return SelfModel(links=tuple(links), digest=surface_digest(surface), learned=tuple(learned), unknown=unknown)
