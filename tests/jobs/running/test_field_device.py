@@ -10,7 +10,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.jobs.bake import request as bake_request
-from splatctrl_cli.jobs.query.query import query
+from splatctrl_cli.jobs.query import query
 from splatctrl_cli.kernels.cuda import driver
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from tests.cli.test_reconstruct import contents
