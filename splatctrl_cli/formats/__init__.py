@@ -1,1 +1,1 @@
-"""Files of one format each: splats, grids, the folder of a reconstruction, and what they are made of."""
+"""File formats: splats, grids, scene folders, and the arrays, images and point tables in them."""

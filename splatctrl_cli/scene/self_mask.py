@@ -80,7 +80,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
 
 
 def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
-    """As `self_mask`, of the robot within the image."""
+    """The mask by the part of the robot within the image alone."""
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     shown = surface.render(
         T_world_link,

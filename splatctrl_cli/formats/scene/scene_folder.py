@@ -52,25 +52,25 @@ class Snapshot:
 
     def occupancy(self) -> OccupancyGrid | None:
         """The grid of that moment, as coarse as `write_states` keeps it; None in a scene of an older version."""
-        return self._of_voxels(read_states)
+        return self._read_voxels(read_states)
 
     def seen(self) -> SeenVoxels | None:
         """When each voxel was last seen; None in a scene of an older version."""
-        return self._of_voxels(read_seen)
+        return self._read_voxels(read_seen)
 
     def unrepresented(self) -> Balls | None:
         """The occupied voxels that had no splat then; None in a scene of an older version."""
-        return self._of_voxels(read_unrepresented)
+        return self._read_voxels(read_unrepresented)
 
     def splats(self) -> SplatSet:
         return read_world_splats(self.path if self.parts is None else self.parts.checked(self.path))
 
     @property
     def shell_path(self) -> Path:
-        """What lay beyond the robot's reach then; not there where nothing did."""
+        """The file of what lay beyond the robot's reach; absent where nothing did."""
         return self.path.with_suffix(f".{SHELL_FILE}")
 
-    def _of_voxels(self, read: Callable[[Path], T]) -> T | None:
+    def _read_voxels(self, read: Callable[[Path], T]) -> T | None:
         path = self.occupancy_path
         if self.parts is None:
             return read(path) if path.is_file() else None
@@ -148,7 +148,7 @@ class SceneFolder:
 
     path: Path
     names_its_views: ClassVar[bool] = True
-    """Whether it is recorded which views trained the scene."""
+    """The scene records which views trained it."""
 
     @cached_property
     def run(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a baked field comes to: its report and verdict, beside a truth, a mesh, and depth that trained nothing."""
+"""The report and verdict of a baked field, and its errors against a truth, a mesh and held-out depth."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -187,7 +187,7 @@ class FieldReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Those on the splats' health, and on a box that no splat is near."""
+        """Warnings about the splats' health, and about a box far from every splat."""
         health, lowest = self.grid.header["health"], self.statistics.lowest
         assert isinstance(health, dict)
         if lowest is None or lowest <= FAR_GRID:
@@ -213,7 +213,7 @@ class FieldReport:
         }
 
     def summary(self) -> dict[str, Any]:
-        """What is printed, and what --json has beside the accuracy."""
+        """The figures that are printed; --json adds the accuracy to them."""
         header: Mapping[str, Any] = self.grid.header
         num_used, health = sum(header["splats_used"].values()), header["health"]
         # cells where the kernel field of sdf, alone, exceeds the exact distance
@@ -253,7 +253,7 @@ def counts_of(metrics: Mapping[str, float | None]) -> dict[str, int]:
 def bake_verdict(
     request: BakeRequest, report: FieldReport, metrics: Mapping[str, float | None], *, has_occupancy: bool
 ) -> Verdict:
-    """What cells may lose [m], that a camera saw some of them where that is known, and each ``--require``."""
+    """Judge what the channels lose of the distance [m], whether a camera saw the box, and each ``--require``."""
     statistics, voxel = report.statistics, report.grid.voxel
     num_cells, loss = statistics.num_cells, LOSS * voxel
     reasons = [

@@ -69,7 +69,7 @@ class Run:
 
     @property
     def damage(self) -> str:
-        """The word of a damaged recording, or nothing."""
+        """The mark of a run on a damaged recording, else empty."""
         return damage_mark(self.sentence, self.exit_code)
 
     @property
@@ -78,7 +78,7 @@ class Run:
         return self.node.removeprefix(f"{self.recording}/")
 
     def document(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """The run as an entry of the batch's JSON file; `run_of_document` reads it back."""
         plain = asdict(self) | {name: json.loads(getattr(self, name)) for name in _OF_JSON}
         return {"id": plain.pop("node"), **plain, "outcome": self.outcome or None}
 
@@ -250,7 +250,10 @@ def write_csv(path: Path, runs: Iterable[Run]) -> None:
 
 
 def run_of_document(plain: Mapping[str, Any]) -> Run:
-    """What `Run.document` gave, of another version, too. Raises TypeError, KeyError or AttributeError for others."""
+    """The run of an entry of the batch's JSON file, of this or another version.
+
+    Raises TypeError, KeyError or AttributeError for anything else.
+    """
     known = {name: value for name, value in plain.items() if name in COLUMNS and value is not None}
     return Run(node=plain["id"], **known | {name: json.dumps(known[name]) for name in _OF_JSON if name in known})
 

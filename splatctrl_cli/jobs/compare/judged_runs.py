@@ -98,7 +98,7 @@ def read_judged(path: Path) -> Judged:
     if path.name.endswith(PARTIAL) or is_begun:
         raise InputError(f"{path}: is still being written, or was interrupted", remedy="wait for it, or run it again")
     if has_batch:
-        return Judged(path=path, kind="batch", runs={run.name: run for run in _of_batch(open_batch(path))})
+        return Judged(path=path, kind="batch", runs={run.name: run for run in _nodes_of(open_batch(path))})
     if not has_run:
         what = "no run.json and no batch.json in it" if path.is_dir() else "no such folder"
         raise InputError(f"{path}: expected the output folder of a command or a batch, got {what}")
@@ -115,7 +115,7 @@ def read_judged(path: Path) -> Judged:
 def _judged_run(
     name: str, recording: str, job: str, command: str, document: Mapping[str, Any], folder: Path | None
 ) -> JudgedRun:
-    """From what a command wrote into ``run.json``, or printed with --json, and then without a folder."""
+    """The run of a document: a command's ``run.json``, or what it printed with --json (`folder` is None)."""
     verdict, known = document["verdict"], scales().get(command, {})
     metrics = document["metrics"] if isinstance(document.get("metrics"), dict) else {}
     return JudgedRun(
@@ -137,8 +137,8 @@ def _judged_run(
     )
 
 
-def _of_batch(batch: BatchFolder) -> Iterator[JudgedRun]:
-    """The run of each node: by its folder, without one by what it printed."""
+def _nodes_of(batch: BatchFolder) -> Iterator[JudgedRun]:
+    """The judged run of each node, from its folder, or else from the JSON that it printed."""
     for ran in batch.runs:
         variant = ", ".join(f"{key}={value}" for key, value in sorted(json.loads(ran.variant).items()))
         job = f"{ran.job} ({variant})" if variant else ran.job

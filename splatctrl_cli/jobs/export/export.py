@@ -228,9 +228,7 @@ def _num_outside(source: GaussianSet, held: GaussianSet) -> int:
 
 
 def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
-    """How differently two sets look, seen from around `a`: largest difference, PSNR and share that is covered, as
-    `ExportResult` has them.
-    """
+    """Render both sets from around `a`: their largest difference, PSNR and covered share, as in `ExportResult`."""
     intrinsics, poses, size = _views(a.centers)
     largest, covered, squared = 0.0, 0.0, 0.0
     for T_world_camera in poses:

@@ -48,7 +48,7 @@ _DECIMALS = 7  # of a length [m]: finer than float32
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Of Q points, world: None for what is not known of any point, NaN or -1 for what is not known of one.
+    """Answers at Q points, world frame: None where no point has one, NaN or -1 where a single point has none.
 
     in_box (Q,): in the box that was asked; distance (Q,) [m] and its gradient (Q, 3); bound (Q,) [m]: the exact
     distance to the splats is not less; probability (Q,) of collision; label (Q,) `Label` and splat (Q,), the index in
@@ -107,7 +107,7 @@ class SceneAnswers:
         self._reach = float(np.abs(splats.centers - self._spheres.points.anchor).max())
 
     def at(self, points: Float64) -> Answers:
-        """Everything, at points (Q, 3) [m], world."""
+        """All answers at points (Q, 3) [m], world."""
         distance, gradient = self._field.query(points)
         nearest = self._exact.nearest(points)
         walked = march(self._field, self._exact, points, steps=MARCH_STEPS)
@@ -125,8 +125,8 @@ class SceneAnswers:
             rest=walked.rest,
         )
 
-    def beside(self, points: Float64, of_grid: Answers) -> Answers:
-        """What a grid answered, and the rest of the scene; the probability is that of the grid's distance."""
+    def complete(self, points: Float64, of_grid: Answers) -> Answers:
+        """Add the scene's answers to those of a grid; the probability is that of the grid's distance."""
         mine = self.at(points)
         probability = self._probability.at(points, of_grid.distance)
         return replace(
@@ -143,7 +143,7 @@ class GridAnswers:
     """The channels of a baked grid: distances between its cells' centres, labels and observations of the nearest."""
 
     def __init__(self, grid: DistanceGrid, where: str) -> None:
-        """Raises InputError as `GridField`, and for a cell whose label or state is none of ours."""
+        """Raises InputError as `GridField` does, and for a cell with an unknown label or state."""
         self._field = GridField(grid)
         self.box = self._field.box
         self._has_bound = "bound" in grid.channels
@@ -158,7 +158,7 @@ class GridAnswers:
             self._cells[name] = partial(observed_at, values, grid.origin, grid.voxel)
 
     def at(self, points: Float64) -> Answers:
-        """What the grid holds at points (Q, 3) [m], world; nothing outside the box of the cell centres."""
+        """The grid's answers at points (Q, 3) [m], world; none outside the box of the cell centres."""
         inside = self._field.contains(points)
         distance, gradient = self._field.query(points)
         probability = None if self._probability is None else self._probability.query(points)[0]
@@ -276,8 +276,8 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
 
 @dataclass(frozen=True, kw_only=True)
 class _Asked:
-    """What answers: its kind, its box where it has one, whether it is a grid, which has no distance outside, and the
-    device of a scene.
+    """The source of the answers: its kind, its box if any, whether it is a grid (no distance outside its box), and
+    the device of a scene.
     """
 
     kind: str
@@ -317,13 +317,13 @@ def _asked(request: QueryRequest, progress: Progress) -> _Asked:
     both = _scene(source_of_grid(where, grid, request.scene), request, labels, config, device)
 
     def at(points: Float64) -> Answers:
-        return both.beside(points, of_grid.at(points))
+        return both.complete(points, of_grid.at(points))
 
     return _Asked(kind="field and scene", at=at, box=of_grid.box, is_grid=True, device=device)
 
 
 def _is_enough(points: Path | TextIO) -> bool:
-    """Whether as many points are known of as a card pays for."""
+    """Whether the table has enough points for a card to be faster."""
     return isinstance(points, Path) and points.is_file() and points.stat().st_size >= CARD_LEAST_TABLE
 
 
@@ -395,7 +395,7 @@ class _Figures:
         self._least_bound = min(self._least_bound, float(bounds.min(initial=np.inf)))
 
     def metrics(self) -> dict[str, float | None]:
-        """As `QueryResult` has them."""
+        """The metrics of `QueryResult`."""
         num = self._num
         return {
             "num_points": num["points"],
@@ -409,7 +409,7 @@ class _Figures:
         }
 
     def notes(self, asked: _Asked) -> tuple[str, ...]:
-        """On points without a distance, and on those that no camera saw."""
+        """Notes about points without a distance, and about points that no camera saw."""
         num, notes = self._num, []
         if num["outside"] and asked.box is not None:
             lower, upper = (", ".join(f"{x:.4g}" for x in corner) for corner in (asked.box.lower, asked.box.upper))

@@ -62,7 +62,7 @@ def first_frame(frame: RgbdFrame) -> FirstFrame:
 
 
 def differences(recorded: Sequence[Mapping[str, Any]], records: Iterator[Record]) -> list[str]:
-    """In words with figures, how `records` differ from a scene's first frames `recorded`; empty where they agree.
+    """Sentences on how `records` differ from a scene's first frames `recorded`; empty where they agree.
 
     Reads until each frame was met, or passed by.
     """
@@ -86,7 +86,7 @@ def differences(recorded: Sequence[Mapping[str, Any]], records: Iterator[Record]
 
 
 def changed_files(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """In words, which files have the name but not the digest of `then`; descriptions (.toml) may change."""
+    """A sentence on files of the same name but another digest than `then`; descriptions (.toml) may change."""
     common = [name for name in then if name in now and not name.endswith(".toml")]
     changed = [name for name in common if then[name] != now[name]]
     if not changed:

@@ -1,4 +1,4 @@
-"""What the criteria of a replay's verdict look at, and those of time and of what a controller did."""
+"""The input of a replay's criteria, and the criteria of time and of the controller."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ SLOW = "log joint states more often"
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """What the criteria look at."""
+    """The input of every criterion of a replay."""
 
     request: ReplayRequest
     inputs: ReplayInputs
@@ -36,7 +36,7 @@ class Judged:
 
     @property
     def num_states(self) -> int:
-        """That were judged."""
+        """Number of judged states."""
         return len(self.replay.audit.stamp_ns)
 
     @property
@@ -59,7 +59,7 @@ def time_of_least(judged: Judged, values: np.ndarray[tuple[int], np.dtype[np.flo
 
 
 def seconds_at(judged: Judged, index: int) -> float:
-    """Of a state, since the first."""
+    """Time [s] of a state since the first one."""
     stamps = judged.replay.audit.stamp_ns
     return float(stamps[index] - stamps[0]) * 1e-9
 
@@ -281,7 +281,7 @@ def clocks(judged: Judged) -> Iterator[Reason]:
 
 
 def controller(judged: Judged) -> Iterator[Reason]:
-    """Closed loop: every step is solved; a controller of one's own answers every time, and as it should."""
+    """Closed loop: every step is solved; a user's controller gives a valid answer every time."""
     if judged.replay.outside is not None:
         yield _answers(judged, judged.replay.outside)
         return
@@ -308,7 +308,7 @@ def controller(judged: Judged) -> Iterator[Reason]:
 
 
 def _answers(judged: Judged, outside: OutsideRun) -> Reason:
-    """Whether a controller of one's own did what it should."""
+    """Judge whether a user's controller gave a valid answer every time."""
     num, failure = outside.num_answers, outside.failure
     if failure is None:
         return held(f"all {num} steps answered", 0.0, 0.0, "", num)
@@ -359,7 +359,7 @@ def goal(judged: Judged) -> Iterator[Reason]:
 
 
 def commanded(judged: Judged) -> Reason | None:
-    """Where a controller of one's own commands more than the limits; None where it does not."""
+    """The reason where a user's controller commands more than the limits, else None."""
     replay = judged.replay
     if replay.outside is None or replay.kept_steps is None:
         return None

@@ -1,4 +1,4 @@
-"""What a replay is held against: depth that did not train the map (``--evidence``), and the truth of a simulated log.
+"""The references of a replay: held-out depth (``--evidence``), and the truth of a simulated log.
 
 The field's value at a surface point is how far the map misses it. Where a sphere's true clearance is d and p the
 true surface point nearest to it, the map's clearance is at most d plus the miss at p, because the exact distance is
@@ -278,7 +278,7 @@ class TrueSurfaces:
         self.seen = np.zeros(len(stamp_ns), dtype=np.bool_)
 
     def watching(self, frames: Iterable[RgbdFrame]) -> Iterator[RgbdFrame]:
-        """The same frames; those of a camera that made the scene are taken in on their way."""
+        """Yield the same frames, and mark what those of the scene's cameras see."""
         for frame in frames:
             if self._cameras is None or frame.camera in self._cameras:
                 mark_seen(self.seen, self._points, self._stamp_ns, frame, has_clock=self._has_clock)
@@ -286,7 +286,7 @@ class TrueSurfaces:
 
 
 def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfaces | None]:
-    """With the true clearance of every state and its events, and the surfaces that it is to; None without a truth."""
+    """Add the true clearance of every state and its events; also the true surfaces, None without a truth."""
     if inputs.truth is None:
         return replay, None
     model, trace = inputs.model, replay.audit
@@ -314,7 +314,7 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfac
 
 
 def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
-    """With how an audit agrees with the truth near surfaces that a camera saw, once all frames have been seen."""
+    """Add how an audit agrees with the truth near surfaces that a camera saw; call it after the last frame."""
     truth = np.asarray(replay.true_clearance)
     agreement = {
         name: clearance_agreement(of.distance, truth, surfaces.seen, replay.median_radius)

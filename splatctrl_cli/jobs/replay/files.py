@@ -1,6 +1,4 @@
-"""What a replay leaves in its folder: steps, events, a summary, plots, and pictures of the moments at which it was
-nearest to the scene.
-"""
+"""The files of a replay: steps, events, a summary, plots, and pictures of the moments nearest to the scene."""
 
 import math
 import re
@@ -326,7 +324,7 @@ def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterabl
 
 
 def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | None]) -> list[str]:
-    """Write worst_1.png, worst_2.png ...; what there is to say of it."""
+    """Write worst_1.png, worst_2.png ..., and return notes about pictures that are missing."""
     seen = [sight for sight in sights if sight is not None]
     for number, sight in enumerate(seen, start=1):
         first, *rest = sight.moment.caption

@@ -55,7 +55,7 @@ Declared = tuple[Metric[Replay], ...]
 
 
 def num_states(replay: Replay) -> int:
-    """That were judged."""
+    """Number of judged states."""
     return len(replay.audit.stamp_ns)
 
 

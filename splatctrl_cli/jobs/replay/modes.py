@@ -265,7 +265,7 @@ def _task(
 
 
 def planned_ways_out(inputs: ReplayInputs, task: ReplayTask, config: Config) -> PlanDetour | None:
-    """What plans the closed loop's ways out of local minima; None where it may take none."""
+    """The planner of detours out of a closed loop's local minima; None where detours are off."""
     if config.control.max_detours == 0:
         return None
     return planned_detours(

@@ -1,4 +1,4 @@
-"""What a replay is asked for, what it reads of it, and what it finds: audit, trace, and what stands beside them."""
+"""The request of a replay, its inputs, and its result: audit, trace and their references."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -90,7 +90,7 @@ class ReplayRequest(RobotOptions, RunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayInputs:
-    """Everything a replay reads; states in the model's joint order. mismatches: of what does not belong together.
+    """Everything a replay reads; states in the model's joint order. mismatches: inputs that do not belong together.
     surfaces: of the robot's links, None where they cannot be read; kept: what pairs of them keep of the margin.
     """
 
@@ -180,12 +180,12 @@ class Replay:
 
     @property
     def margin(self) -> float:
-        """Of clearance [m]."""
+        """The least clearance [m] that is allowed."""
         return self.config.control.margin
 
     @property
     def mode(self) -> str:
-        """As --mode has it."""
+        """The mode, named as by --mode."""
         return "closed-loop" if self.closed_loop else "open-loop" if self.open_loop else "audit"
 
     @property

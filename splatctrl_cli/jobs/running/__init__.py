@@ -1,1 +1,1 @@
-"""How a job runs: what it says, where it computes, how an interrupted one continues."""
+"""Progress, device and resumption of a job."""

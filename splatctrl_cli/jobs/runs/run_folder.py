@@ -1,6 +1,4 @@
-"""The folder of one run as a report reads it: its ``run.json``, a replay's states and events, its pictures; and that
-of a batch: the last state of each of its jobs.
-"""
+"""What a finished run left in its folder (``run.json``, a replay's states, pictures), and a batch in its own."""
 
 import csv
 import json
@@ -108,7 +106,7 @@ class RunFolder:
 
     @cached_property
     def states(self) -> States | None:
-        """Of a replay, None of other commands. Raises InputError for a table that is not the one written."""
+        """The states of a replay; None of other commands. Raises InputError for a table with other columns."""
         file = self.path / "steps.csv"
         if self.command != REPLAY or not self.parts.has(file):
             return None
@@ -239,8 +237,8 @@ def is_batch(path: Path) -> bool:
 def open_batch(path: Path) -> BatchFolder:
     """The batch in a folder. Raises InputError for a file that is not one, or that a newer version wrote."""
     file = path / FILE
+    batch = read_object(file)
     try:
-        batch = json.loads(file.read_text(encoding="utf-8"))
         if batch["format"] != FORMAT:
             raise ValueError(f"format {batch['format']}")
         if int(batch["version"]) > FILE_VERSION:
@@ -249,7 +247,8 @@ def open_batch(path: Path) -> BatchFolder:
             )
         jobs, runs = map(str, batch["jobs"]), map(run_of_document, batch["nodes"])
         return BatchFolder(path=path, suite=str(batch["suite"]), jobs=tuple(jobs), runs=tuple(runs))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        why = f"no {error}" if isinstance(error, KeyError) else f"{error}"
         raise InputError(
-            f"{file}: expected what batch writes, with suite, jobs and nodes: {error!r}", remedy="run the batch again"
+            f"{file}: not what a batch writes (suite, jobs and nodes): {why}", remedy="run the batch again"
         ) from None

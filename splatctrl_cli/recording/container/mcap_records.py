@@ -28,7 +28,7 @@ class _Fields(ReadDataStream):  # type: ignore[misc]
     """Reads the fields of a record one after the other, within its bytes."""
 
     def read(self, length: int) -> bytes:
-        """So many bytes; the package gives fewer where the record ends within a field."""
+        """The next `length` bytes. Raises EndOfFile where the record ends before (the package returns fewer)."""
         found: bytes = super().read(length)
         if len(found) < length:
             raise EndOfFile
@@ -38,7 +38,7 @@ class _Fields(ReadDataStream):  # type: ignore[misc]
         return self.read(self.read4()).decode("utf-8", "replace")
 
     def rest(self) -> bytes:
-        """All bytes that are left."""
+        """The bytes that are left."""
         return bytes(self._stream.read())
 
 
@@ -55,7 +55,7 @@ class Chunk(NamedTuple):
 
     @classmethod
     def read(cls, fields: _Fields) -> "Chunk":
-        """From its bytes, of which the last may be missing."""
+        """Parse a chunk whose last bytes may be missing."""
         numbers = (fields.read8(), fields.read8(), fields.read8(), fields.read4())
         compression, size = fields.read_prefixed_string(), fields.read8()
         return cls(*numbers, compression, size, fields.rest()[:size])

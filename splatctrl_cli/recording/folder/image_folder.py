@@ -39,8 +39,8 @@ _NOT_FOR_FOLDERS = (
 
 
 class ImageFolderSource(Recording):
-    """Records of an image folder, of one camera or of several, each with a description that differs in its files, its
-    lens and its poses alone; no joint states.
+    """Frames of an image folder, without joint states. Each camera has its own description; these differ in files,
+    lens and poses alone.
     """
 
     joint_names: tuple[str, ...] = ()

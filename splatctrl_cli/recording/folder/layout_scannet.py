@@ -55,7 +55,7 @@ _AGAIN = "copy the file again"
 
 @dataclass(frozen=True, kw_only=True)
 class _Sens:
-    """What a file says before its frames: lenses of both cameras (4, 4) [px], where they are in the rig's base,
+    """The head of a file: lenses of both cameras (4, 4) [px], their poses in the rig's base,
     metres per count of depth, how images are stored, where the frames begin, and how many there are.
     """
 

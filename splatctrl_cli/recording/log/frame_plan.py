@@ -84,7 +84,7 @@ class FramePlan:
         return num
 
     def _keep(self, T: Float64 | None) -> bool:
-        """Write a pose where it is known; whether it is."""
+        """Store a pose if it is known, and return whether it is."""
         if T is not None:
             self._poses.append(T[None])
         return T is not None

@@ -316,7 +316,7 @@ class Undistortion:
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
-    """What a camera's images go through: the intrinsics (of the result), and what its lens and its depth need."""
+    """Corrections of a camera's images: intrinsics (of the result), lens distortion, registration of depth."""
 
     intrinsics: Intrinsics
     undistortion: Undistortion | None = None

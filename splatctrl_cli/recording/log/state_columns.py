@@ -108,11 +108,11 @@ class StateColumns(Sequence[JointState]):
         return plain._changed(moved, OF_JOINTS)
 
     def tables(self) -> dict[str, Table]:
-        """Those columns of `COLUMNS` that there are."""
+        """The columns of `COLUMNS` that are present."""
         return {name: table for name in COLUMNS if (table := getattr(self, name)) is not None}
 
     def _changed(self, change: Callable[[Table, str], Table], names: Collection[str], **others: Any) -> Self:
-        """With what `change` makes of the named columns that there are."""
+        """A copy with `change` applied to the named columns that are present."""
         changed: dict[str, Any] = {
             name: change(table, name) for name, table in self.tables().items() if name in names
         }

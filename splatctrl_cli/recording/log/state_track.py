@@ -251,7 +251,7 @@ def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
 
 
 def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
-    """How many states have a velocity that the positions have to give, joints (J,) that move at zero, and why."""
+    """Number of states whose velocity comes from positions, joints (J,) that move at velocity 0, and the note."""
     num, num_joints = raw.position.shape[:2]
     low, high = np.full(num_joints, np.inf), np.full(num_joints, -np.inf)
     is_still, is_missing, is_there = (np.full(num_joints, first) for first in (True, False, False))

@@ -139,7 +139,7 @@ def write_rows(stream: IO[bytes], rows: Table) -> None:
 
 
 def _blocks(path: Path) -> Iterator[Float64]:
-    """Of a .npy file as `write_rows` writes it. Raises ValueError for another."""
+    """Read a .npy file that `write_rows` wrote. Raises ValueError for another one."""
     with path.open("rb") as stream:
         shape, is_by_columns, dtype = npy_head(stream)
         if dtype != np.dtype("<f8") or is_by_columns or not shape:

@@ -219,7 +219,7 @@ def test_a_scene_of_a_batch_opens_when_it_is_asked_for_and_closes_the_other(batc
     ("change", "words"),
     [
         ({"version": 2}, "version 2, this program reads 1"),
-        ({"format": "other"}, "expected what batch writes"),
+        ({"format": "other"}, "not what a batch writes"),
         ({"nodes": [3]}, "nodes"),
     ],
 )
