@@ -16,6 +16,7 @@ from splatctrl_cli.jobs.robot.logged_robot import TAKE, differs, logged_urdf
 from splatctrl_cli.recording.source import open_logs
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.sphere_files import own_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
 
@@ -115,7 +116,8 @@ def posed_robot(
                 raise UsageError(f"--{name}: expected --urdf beside it")
         return None
     T_world_base = None if base is None else transform_from(base[:3], base[3:])
-    return RobotModel.from_urdf(file, spheres, T_world_base=T_world_base, locked=locked, packages=packages)
+    asked = own_spheres(file) if spheres is None else spheres
+    return RobotModel.from_urdf(file, asked, T_world_base=T_world_base, locked=locked, packages=packages)
 
 
 def _agreement(report: CheckReport) -> Iterator[Finding]:

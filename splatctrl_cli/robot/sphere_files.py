@@ -28,20 +28,27 @@ RENAMED = (
 
 
 def spheres_of(urdf: UrdfFile) -> SphereSet:
-    """The spheres of a URDF whose collision geometry is spheres and nothing else.
-
-    Raises InputError where it has none, or holds other shapes too, which the spheres would leave uncovered.
-    """
-    others = len(urdf.meshes) + len(urdf.other_shapes) + sum(shape.kind != "sphere" for shape in urdf.shapes)
-    if others or not urdf.shapes:
+    """`own_spheres`. Raises InputError where there are none."""
+    found = own_spheres(urdf)
+    if not len(found.radii):
+        others = len(urdf.meshes) + len(urdf.other_shapes) + sum(shape.kind != "sphere" for shape in urdf.shapes)
         raise InputError(
             f"{urdf.path}: expected collision geometry of spheres only, got {others} other shapes",
             remedy="give a spheres YAML file, or fit one with: splatctrl robot spheres",
         )
+    return found
+
+
+def own_spheres(urdf: UrdfFile) -> SphereSet:
+    """The spheres of a URDF whose collision geometry is spheres and nothing else; else none, as they would leave
+    other shapes uncovered.
+    """
+    has_others = urdf.meshes or urdf.other_shapes or any(shape.kind != "sphere" for shape in urdf.shapes)
+    shapes = () if has_others else urdf.shapes
     return SphereSet(
-        links=tuple(shape.link for shape in urdf.shapes),
-        centers=np.array([shape.T_link_shape[:3, 3] for shape in urdf.shapes]),
-        radii=np.array([shape.size[0] for shape in urdf.shapes]),
+        links=tuple(shape.link for shape in shapes),
+        centers=np.array([shape.T_link_shape[:3, 3] for shape in shapes]).reshape(-1, 3),
+        radii=np.array([shape.size[0] for shape in shapes]),
     )
 
 

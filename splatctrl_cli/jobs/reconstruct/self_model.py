@@ -1,10 +1,12 @@
 """The job of `robot learn`: it chooses frame sets in which the arm has moved, and fuses what they show of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from splatctrl_cli.calibration.evidence import Arm
 from splatctrl_cli.config.fixed import STATES_CLOSE_NS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import output_path
@@ -17,10 +19,12 @@ from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import Float64, RgbdFrame, SphereSet, spread
+from splatctrl_cli.records import RgbdFrame, spread
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_fusion import REACH, choose_moments, learn
 from splatctrl_cli.robot.self_model import SelfModel
+from splatctrl_cli.robot.sphere_files import own_spheres
+from splatctrl_cli.robot.urdf import read_urdf
 
 MOST_MOMENTS = 2000  # of a recording, among which those are chosen that are read
 
@@ -44,7 +48,7 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
     """Learn and write the self-model. Raises InputError for a recording that shows no link moving."""
     model = RobotModel.from_urdf(
         request.urdf,
-        request.spheres or SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0)),
+        request.spheres or own_spheres(read_urdf(request.urdf)),
         T_world_base=None if request.base is None else transform_from(request.base[:3], request.base[3:]),
         locked=request.locked,
         packages=request.packages,
@@ -53,43 +57,39 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
         source = open_source(request.log, request.options)
         if not source.joint_names:
             raise InputError(f"{source.name}: expected joint states, got none", remedy="record /joint_states")
-        found = learn_from(model.moved_by(source.joint_names), source, progress, reach=request.reach)
+        arm = arm_of(model.moved_by(source.joint_names), source)
+        found = learn_from(arm, frames_of(arm, source, progress), source.name, request.reach)
         savez(partial, found.arrays())
     return found
 
 
-def learn_from(
-    model: RobotModel, source: FrameSource, progress: Progress = SILENT, *, reach: float = REACH
-) -> SelfModel:
-    """The self-model of a robot by a log that moves its joints. Raises InputError where no link can be learned."""
-    frames, T_world_link = _read(model, source, progress)
-    return learn(model.surface, model.urdf.links, frames, T_world_link, name=source.name, reach=reach)
+def arm_of(model: RobotModel, source: FrameSource) -> Arm:
+    """The robot with the joint positions of a log that moves its joints."""
+    return Arm(model, source.states.of_log(*model.joint_columns(source.joint_names)).postures(STATES_CLOSE_NS))
 
 
-def _read(model: RobotModel, source: FrameSource, progress: Progress) -> tuple[list[RgbdFrame], Float64]:
-    """Frames of the moments between which the arm moved farthest, by stamp, and the poses (V, L, 4, 4) of the links
-    of its surface.
+def learn_from(arm: Arm, frames: Sequence[RgbdFrame], name: str, reach: float = REACH) -> SelfModel:
+    """The self-model by frames that the arm is posed in. Raises InputError where no link can be learned."""
+    poses = np.array([arm.surface_poses(frame.stamp_ns) for frame in frames])
+    return learn(arm.surface, arm.model.urdf.links, frames, poses, name=name, reach=reach)
+
+
+def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> list[RgbdFrame]:
+    """Frames of the moments between which the arm moved farthest, by stamp. Raises InputError where it is posed in
+    none.
     """
-    posture = source.states.of_log(*model.joint_columns(source.joint_names)).postures(STATES_CLOSE_NS)
-    surface, stamps = model.surface, stamps_by_camera(source)
+    stamps = stamps_by_camera(source)
     stamps = {camera: its for camera, its in stamps.items() if camera in training_cameras(source)}
-
-    def placed(stamp_ns: int) -> Float64 | None:
-        q = posture(stamp_ns)
-        return None if q is None else surface.poses({link: model.frame_pose(q, link) for link in surface.links})
-
-    found = [(stamp, placed(stamp)) for stamp in spread(min(stamps.values(), key=len), MOST_MOMENTS)]
+    found = [(stamp, arm.surface_poses(stamp)) for stamp in spread(min(stamps.values(), key=len), MOST_MOMENTS)]
     posed = [(stamp, T) for stamp, T in found if T is not None]
     if not posed:
         raise InputError(f"{source.name}: no frame has a joint state within {1e-9 * STATES_CLOSE_NS:g} s")
-    order = choose_moments(surface, np.array([T for _, T in posed]))
+    order = choose_moments(arm.surface, np.array([T for _, T in posed]))
     chosen = frames_nearest(stamps, [posed[number][0] for number in order])
-    frames, poses = [], []
-    for item in source.stored():
-        if isinstance(item, StoredFrame) and (item.camera, item.stamp_ns) in chosen:
-            T = placed(item.stamp_ns)
-            if T is not None:
-                frames.append(depth_frame(item))
-                poses.append(T)
-    progress.log(f"robot learn: {len(frames)} frames, moments: {len(order)}")
-    return frames, np.array(poses)
+    frames = [
+        depth_frame(item)
+        for item in source.stored()
+        if isinstance(item, StoredFrame) and (item.camera, item.stamp_ns) in chosen and arm.is_posed(item.stamp_ns)
+    ]
+    progress.log(f"the robot is looked at in {len(frames)} frames of {len(order)} moments")
+    return frames

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import MASK_PIXELS
+from splatctrl_cli.config.fixed import MASK_PIXELS, MISPLACED
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, FAULTS, Better, Scale
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, note, noted, verdict_of
@@ -21,6 +21,7 @@ GATED = {
     "unrepresented_volume": Scale(unit="m3", better=Better.LOWER, absolute=1e-4, relative=0.05),
     "max_unrepresented_voxels": UNREPRESENTED,
     "self_mask_residual_mm": Scale(unit="mm", better=Better.LOWER, absolute=0.5, relative=0.02),
+    "camera_displacement_mm": Scale(unit="mm", better=Better.LOWER, absolute=0.5, relative=0.1),
     "inside_robot_points": FAULTS,
     "pose_residual": Scale(unit="m", better=Better.LOWER, absolute=5e-4, relative=0.05),
     "depth_bend": DESCRIBES,
@@ -74,6 +75,7 @@ def counts_of(made: Reconstructed) -> dict[str, int]:
         "robot_splats": sum(seen),
         "inside_robot_points": sum(seen),
         "self_mask_residual_mm": sum(num for num in seen if num >= MASK_PIXELS),
+        "camera_displacement_mm": sum(row["num_pixels"] for row in made.metrics["displaced_cameras"].values()),
         "loss": sum(row.loss is not None for row in made.rows),
         "psnr": sum(row.psnr is not None for row in made.rows),
     }
@@ -162,7 +164,19 @@ def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
 
 
 def _calibration(made: Reconstructed) -> Iterator[Reason]:
-    """Measured against rendered depth of the robot."""
+    """Measured against rendered depth of the robot, by camera and by link."""
+    for camera, row in made.metrics["displaced_cameras"].items():
+        if row["distance_mm"] - row["sigma_mm"] > 1e3 * MISPLACED:
+            yield note(
+                criterion="calibration",
+                sentence=f"{camera} sees the robot {row['distance_mm']:.1f} mm from where its joints put it",
+                value=row["distance_mm"],
+                threshold=1e3 * MISPLACED,
+                unit="mm",
+                who=camera,
+                remedy="find the cameras' poses ('splatctrl calibrate'), and give --calibration",
+                count=row["num_pixels"],
+            )
     told = {
         link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["num_pixels"] >= MASK_PIXELS
     }

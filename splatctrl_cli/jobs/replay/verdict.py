@@ -1,13 +1,14 @@
 """The verdict of a replay: every criterion of *safe*, with what it found, when, where and what to do about it."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from operator import attrgetter
 
 from splatctrl_cli.control.line_process import shown
 from splatctrl_cli.evaluate.gates import gate_reasons
-from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.jobs.replay.criteria import CONTACT, SAFE, Judged, nearby
-from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words
+from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words, displaced
 from splatctrl_cli.jobs.replay.metrics import counts_of, first_time
 from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION
 from splatctrl_cli.jobs.replay.request import ReplayRequest
@@ -22,6 +23,7 @@ SMALLER_IS_LAXER = (
     *("config.verdict.confidence", "config.verdict.evidence_reach"),
     *("config.control.margin", "config.control.self_margin"),
 )
+BY_MAP = ("clearance", "clearance of people", "static clearance", "scene hits", "map age", "controller", "goal")
 CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
 
 
@@ -29,6 +31,9 @@ def replay_verdict(judged: Judged) -> Verdict:
     """The verdict on a replay: every criterion, and each ``--require`` of its request."""
     replay, request = judged.replay, judged.request
     reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
+    if displaced(judged) is not None:
+        reasons = [_doubted(reason) for reason in reasons]
+        reasons.sort(key=lambda reason: reason.criterion != "calibration")
     reasons.sort(key=lambda reason: reason.label != CONTACT)  # by any measure, before what only broke a margin
     counts = counts_of(replay, judged.logged, judged.metrics)
     reasons += gate_reasons(
@@ -51,6 +56,12 @@ def replay_verdict(judged: Judged) -> Verdict:
         is_damaged=bool(judged.inputs.source.loss.damaged),
         counts=counts,
     )
+
+
+def _doubted(reason: Reason) -> Reason:
+    """A failure by the map, which a camera that is off may have made of the robot itself, is no failure."""
+    is_doubted = reason.outcome is Outcome.FAILED and reason.criterion in BY_MAP
+    return replace(reason, outcome=Outcome.NOT_EVALUABLE, label="") if is_doubted else reason
 
 
 def _how(judged: Judged) -> str:

@@ -5,8 +5,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.errors import InputError
@@ -26,6 +24,7 @@ from splatctrl_cli.robot.sphere_files import (
     SphereFile,
     are_links_renamed,
     matched_links,
+    own_spheres,
     read_sphere_file,
     read_spheres,
     spheres_yaml,
@@ -207,10 +206,8 @@ def robot_pairs(request: RobotRequest) -> PairsResult:
 def describe_robot(request: RobotRequest) -> RobotResult:
     """The joints, links, shapes and spheres of a robot; without `spheres`, those of the URDF if it has only such."""
     urdf = read_urdf(request.urdf)
-    has_own = bool(urdf.shapes) and all(shape.kind == "sphere" for shape in urdf.shapes) and not urdf.meshes
-    none = SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
     locked = urdf.with_followers(request.locked)
-    spheres = request.spheres if request.spheres is not None or has_own else none
+    spheres = own_spheres(urdf) if request.spheres is None else request.spheres
     model = RobotModel.from_urdf(request.urdf, spheres, locked=locked)
     return RobotResult(model=model, locked=locked, lost_meshes=_lost_meshes(urdf, request.packages))
 

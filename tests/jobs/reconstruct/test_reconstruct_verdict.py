@@ -43,6 +43,8 @@ def made(*rows: AuditRow, loss: LossReport | None = None, is_seeded: bool = Fals
         "time_steps": len(rows),
         "splats": 100,
         "robot_splats": 40,
+        "camera_displacement_mm": None,
+        "displaced_cameras": {},
         "self_mask": {"hand": {"median_mm": -1.0, "sign": -1, "num_pixels": 5000}},
         "self_mask_residual_mm": 1.0,
         "psnr": 20.0,
@@ -122,6 +124,16 @@ def test_a_robot_that_is_not_where_its_joints_put_it_is_noted_with_link_and_sign
     assert "calibrate" in said.remedy
     del links["hand"]
     assert notes(made(*STEPS, self_mask=links)) == ()
+
+
+def test_a_camera_that_sees_the_robot_elsewhere_is_noted() -> None:
+    off = {
+        "left": {"distance_mm": 6.2, "sigma_mm": 1.1, "num_pixels": 5000},
+        "right": {"distance_mm": 5.9, "sigma_mm": 1.0, "num_pixels": 4000},
+    }
+    (said,) = notes(made(*STEPS, displaced_cameras=off))
+    assert (said.who, said.value, said.threshold, said.count) == ("left", 6.2, 5.0, 5000)
+    assert "left sees the robot 6.2 mm from where its joints put it" in said.sentence
 
 
 def test_points_inside_the_robot_are_noted_with_the_first_link_and_time() -> None:

@@ -40,6 +40,13 @@ def coarse_voxels(stage: Stage) -> None:
     stage.run = {"metrics": metrics}
 
 
+def displaced_camera(stage: Stage) -> None:
+    """The scene of a camera that sees the robot 9 mm from where its joints put it."""
+    off = {"cam0": {"distance_mm": 9.0, "sigma_mm": 1.0, "num_pixels": 5000}}
+    metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": stage.map_stamps[-1], "displaced_cameras": off}
+    stage.run = {"metrics": metrics}
+
+
 def near_margin(stage: Stage) -> None:
     stage.balls = [FAR, stage.ball_at_the_end(0.01)]
 
@@ -289,10 +296,11 @@ ALONE: dict[str, Broken] = {
         "not evaluable",
         "within 45.0 mm of hand was taken for",
     ),
+    "displaced camera": (displaced_camera, (), "calibration", "not evaluable", "cam0 sees the robot 9.0 mm"),
     "starved map": (without_a_splat, (), "clearance", "not evaluable", "raise --max-splats"),
 }
 """By name: what breaks it, arguments, and the criterion, label and words of the verdict."""
 ELSEWHERE = {  # criteria that take more than a broken thing: each has a test of its own
     *("certified clearance", "true clearance", "acceleration limits", "controller", "scene hits", "goal", "clocks"),
-    *("clearance of people", "map error", "evidence", "calibration"),
+    *("clearance of people", "map error", "evidence"),
 }

@@ -80,6 +80,18 @@ def test_a_robot_seen_off_where_its_joints_put_it_is_no_evidence(residual: float
     assert outcome is Outcome.PASSED or (reason.who, reason.count) == ("hand", 500)
 
 
+@pytest.mark.parametrize(("sigma", "is_off"), [(0.9, True), (1.1, False)])
+def test_a_camera_that_sees_the_robot_elsewhere_is_no_evidence(sigma: float, is_off: bool) -> None:
+    run = judged()
+    rows = {
+        "left": {"distance_mm": 6.0, "sigma_mm": sigma, "num_pixels": 2000},
+        "right": {"distance_mm": 0.3, "sigma_mm": 0.2, "num_pixels": 4000},
+    }
+    run.inputs.scene = SimpleNamespace(figures=lambda: {"displaced_cameras": rows})
+    found = list(evidence.calibration(run))
+    assert [(r.outcome, r.who, r.count) for r in found] == [(Outcome.NOT_EVALUABLE, "left", 2000)] * is_off
+
+
 @pytest.mark.parametrize("what", ["relaxed", "minimum_violation", "hold"])
 def test_a_step_of_any_kind_that_is_not_solved_fails_the_controller(what: str) -> None:
     run = judged(closed_loop=SimpleNamespace(steps=[None] * 5), events=[event(EventKind(what.replace("_", "-")))])

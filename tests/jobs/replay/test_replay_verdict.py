@@ -15,6 +15,7 @@ from tests.jobs.replay.broken import (
     ALONE,
     ELSEWHERE,
     beside_the_mount,
+    displaced_camera,
     dropped_states,
     gap_in_the_log,
     in_contact,
@@ -94,6 +95,20 @@ def test_a_broken_margin_says_when_where_and_who(stage: Stage) -> None:
     assert np.linalg.norm(np.array(worst["place"]) - center) == pytest.approx(radius, abs=1e-5)
     assert worst["count"] == 11
     assert stage.judged("--report-only", scene=stage.desk.folder / "scene")[0] == 0
+
+
+def test_what_a_displaced_camera_shows_beside_the_arm_may_be_the_arm_itself_and_what_no_map_shows_is_not_doubted(
+    stage: Stage,
+) -> None:
+    displaced_camera(stage)
+    in_contact(stage)
+    code, verdict = stage.judged()
+    assert (code, verdict["label"]) == (5, "not evaluable")
+    assert decisive(verdict) == {"calibration": "not evaluable", "clearance": "not evaluable"}
+    assert "cam0 sees the robot 9.0 mm" in verdict["sentence"] and verdict["reasons"][0]["who"] == "cam0"
+    truth = stage.truth(FAR, stage.ball_at_the_end(-0.01))
+    code, verdict = stage.judged("--truth", str(truth), scene=stage.desk.folder / "scene")
+    assert (code, verdict["label"], verdict["reasons"][0]["criterion"]) == (1, "contact", "true clearance")
 
 
 @pytest.mark.parametrize(("gap", "code"), [(0.0185, 1), (0.0195, 0), (0.0205, 0)])

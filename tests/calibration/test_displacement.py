@@ -1,0 +1,74 @@
+"""How far from where its joints put it a camera sees the robot."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.calibration.displacement import displacement_of
+from splatctrl_cli.calibration.evidence import Arm, transform_of
+from splatctrl_cli.jobs.reconstruct.self_model import arm_of, frames_of
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
+
+CAMERA = "cam0"
+
+
+@pytest.fixture(scope="module")
+def seen(sample_data: Path) -> tuple[Arm, list[RgbdFrame]]:
+    """The sample log's arm, and frames of one camera in which it moves."""
+    tabletop = sample_data / "tabletop"
+    source = open_source(tabletop / "log.mcap", SourceOptions())
+    robot = RobotModel.from_urdf(tabletop / "robot.urdf", tabletop / "robot_spheres.yaml")
+    arm = arm_of(robot.moved_by(source.joint_names), source)
+    return arm, [frame for frame in frames_of(arm, source) if frame.camera == CAMERA]
+
+
+def moved(frames: list[RgbdFrame], twist: Float64) -> list[RgbdFrame]:
+    """The frames of a camera whose recorded pose is off by a turn [rad] and a move [m] in its own frame."""
+    T = np.linalg.inv(transform_of(twist))
+    return [replace(frame, T_world_camera=frame.T_world_camera @ T) for frame in frames]
+
+
+def test_a_camera_that_stands_where_the_log_says_sees_the_robot_in_its_place(
+    seen: tuple[Arm, list[RgbdFrame]],
+) -> None:
+    found = displacement_of(*seen)
+    assert found is not None
+    assert found.distance < 0.0005
+    assert found.sigma < 0.001
+
+
+@pytest.mark.parametrize(
+    ("turn", "move"),
+    [
+        ((0.0, 0.0, 0.0), (0.008, 0.0, 0.0)),
+        ((0.0, 0.0, 0.0), (0.0, 0.0, -0.01)),
+        ((0.0, 0.009, 0.0), (0.0, 0.0, 0.0)),
+        ((0.006, -0.005, 0.003), (0.003, 0.004, 0.005)),
+    ],
+    ids=["aside", "back", "turned", "both"],
+)
+def test_a_camera_that_stands_elsewhere_moves_what_it_sees_by_as_much(
+    seen: tuple[Arm, list[RgbdFrame]], turn: tuple[float, ...], move: tuple[float, ...]
+) -> None:
+    arm, frames = seen
+    twist = np.array([*turn, *move])
+    still = np.zeros(6)
+    shown = [arm.rows(f.depth, f.intrinsics, f.T_world_camera, still, f.stamp_ns, 0.03) for f in frames]
+    points = np.concatenate([rows.points for rows in shown if rows is not None])
+    T = transform_of(twist)
+    true = np.sqrt(np.square(points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3]).sum(axis=1).mean())
+    found = displacement_of(arm, moved(frames, twist))
+    assert found is not None
+    assert found.distance == pytest.approx(true, abs=0.0005)
+
+
+def test_too_little_of_the_robot_says_nothing_of_a_camera(seen: tuple[Arm, list[RgbdFrame]]) -> None:
+    arm, frames = seen
+    away = [replace(frame, depth=np.zeros_like(frame.depth)) for frame in frames]
+    assert displacement_of(arm, away) is None
+    assert displacement_of(arm, []) is None
