@@ -3,8 +3,17 @@
 Wording is ``thing: expected X, got Y``; the remedy follows on the same line after a semicolon.
 """
 
+import difflib
+from collections.abc import Iterable
+
 DAMAGED = 3  # exit code: done, but part of the recording is damaged
 DAMAGE = "part of the recording is damaged and left out"
+
+
+def did_you_mean(word: str, known: Iterable[str], otherwise: str, *, prefix: str = "", cutoff: float = 0.6) -> str:
+    """The remedy for an unknown word: the nearest one that is known, after a prefix, and `otherwise` without one."""
+    near = difflib.get_close_matches(word, list(known), n=1, cutoff=cutoff)
+    return f"did you mean {prefix}{near[0]}?" if near else otherwise
 
 
 class SplatCtrlError(Exception):

@@ -1,7 +1,6 @@
 """``splatctrl batch``: a suite of recordings and commands, its verdict, and the ledger of what ran."""
 
 import argparse
-import difflib
 import importlib
 import os
 import shlex
@@ -16,7 +15,7 @@ from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import publish
 from splatctrl_cli.config import load_config
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, did_you_mean
 from splatctrl_cli.jobs.batch.batch import (
     BatchRequest,
     BatchResult,
@@ -25,7 +24,7 @@ from splatctrl_cli.jobs.batch.batch import (
     planned,
     suites_of,
 )
-from splatctrl_cli.jobs.batch.graph import TABLES, Parsed, columns_of, of_shard
+from splatctrl_cli.jobs.batch.graph import TABLES, columns_of, of_shard
 from splatctrl_cli.jobs.batch.ledger import NAME, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batch.run import DONE, FAILED, told
 from splatctrl_cli.jobs.batch.suite import Table
@@ -74,7 +73,7 @@ class OfThisProgram:
     def __init__(self, threads: int) -> None:
         self._threads = threads
 
-    def parsed(self, command: str, options: Table, folder: Path) -> Parsed:
+    def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
         """Words for options by their long names, and the files among them. Raises UsageError for what is none."""
         parser, places, words = _parser_of(command), list[str](), [command]
         given = {"threads": self._threads, **options}
@@ -90,7 +89,7 @@ class OfThisProgram:
             load_config(parsed.config, parsed.set)
         values = [value for name, value in vars(parsed).items() if name != "out"]
         found = [each for value in values for each in (value if isinstance(value, list) else [value])]
-        return Parsed(words=tuple(words), inputs=tuple(path for path in found if isinstance(path, Path)))
+        return tuple(words), tuple(path for path in found if isinstance(path, Path))
 
     def options_of(self, words: Sequence[str]) -> dict[str, Any]:
         """The options that words say, by their long names: `parsed` gives words that say the same."""
@@ -134,8 +133,7 @@ def _action(parser: Parser, command: str, name: str) -> argparse.Action:
     by_name = {option.removeprefix("--"): action for option, action in parser._option_string_actions.items()}
     by_name |= {action.dest: action for action in parser._actions if not action.option_strings}
     if name not in by_name:
-        near = difflib.get_close_matches(name, by_name, n=1)
-        remedy = f"did you mean {near[0]}?" if near else f"see splatctrl {command} --help-all"
+        remedy = did_you_mean(name, by_name, f"see splatctrl {command} --help-all")
         raise UsageError(f"{command} has no option {name!r}", remedy=remedy)
     return by_name[name]
 

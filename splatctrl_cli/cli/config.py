@@ -3,7 +3,6 @@
 """
 
 import argparse
-import difflib
 import json
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.cli.reports import SCHEMA_FILE
 from splatctrl_cli.config.ranges import shown
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, did_you_mean
 from splatctrl_cli.jobs.settings import resolved_settings, template_of, toml_of
 
 ROOTS = (Path(__file__).parents[1], Path(__file__).parents[2])  # of docs/: of a wheel, of the repository
@@ -42,8 +41,7 @@ def run_help(args: argparse.Namespace) -> int:
     names = sorted(page.stem for page in folder.glob("*.md"))
     topic = args.topic or "README"
     if topic not in names:
-        near = difflib.get_close_matches(topic, names, n=1)
-        remedy = f"did you mean {near[0]}?" if near else f"give one of: {', '.join(names)}"
+        remedy = did_you_mean(topic, names, f"give one of: {', '.join(names)}")
         raise UsageError(f"help: no page {shown(topic)}", remedy=remedy)
     text = (folder / f"{topic}.md").read_text(encoding="utf-8")
     return Console(args).result({"topic": topic, "text": text}, text.splitlines())

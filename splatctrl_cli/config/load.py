@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import difflib
 import math
 import tomllib
 import types
@@ -15,7 +14,7 @@ from typing import Any, Self
 from splatctrl_cli.config.map import FieldConfig, HumanConfig, OccupancyConfig, SceneConfig
 from splatctrl_cli.config.motion import ControlConfig, PlannerConfig, VerdictConfig
 from splatctrl_cli.config.ranges import Section, Within, check, cut, shown
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, did_you_mean
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,8 +150,8 @@ def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
 
 def _check_known(name: str, known: Collection[str], where: str, prefix: str) -> None:
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-        choices = f"did you mean {prefix}{near[0]}?" if near else f"known here: {_some(known)}"
+        first = ", ".join(list(known)[:8]) + (", ... (splatctrl help config has all)" if len(known) > 8 else "")
+        choices = did_you_mean(name, known, f"known here: {first}", prefix=prefix, cutoff=0.4)
         raise UsageError(f"{where}: unknown key {prefix}{name}", remedy=choices)
 
 
@@ -172,11 +171,6 @@ def _parse_value(text: str) -> Any:
     except ValueError:
         return text
     return parsed["value"] if list(parsed) == ["value"] else text
-
-
-def _some(names: Collection[str]) -> str:
-    """The first eight; the rest is in docs/config.md."""
-    return ", ".join(list(names)[:8]) + (", ... (splatctrl help config has all)" if len(names) > 8 else "")
 
 
 def type_name(hint: Any) -> str:

@@ -1,13 +1,12 @@
 """Requirements on metrics: ``metric>=value``."""
 
-import difflib
 import math
 import operator
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, did_you_mean
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 
 FirstTime = Callable[[str, Callable[[float], bool]], float | None]
@@ -29,12 +28,8 @@ def check_gate_names(
             if name not in names and name in others:
                 raise UsageError(f"--require {requirement}: a figure of {options}", remedy="give it, or gate another")
         if name not in names:
-            near = difflib.get_close_matches(name, names, n=1)
-            choices = ", ".join(names)
-            raise UsageError(
-                f"--require {requirement}: unknown metric",
-                remedy=f"did you mean {near[0]}?" if near else f"known here: {choices}",
-            )
+            remedy = did_you_mean(name, names, f"known here: {', '.join(names)}")
+            raise UsageError(f"--require {requirement}: unknown metric", remedy=remedy)
 
 
 def gate_reasons(

@@ -8,7 +8,6 @@ reference count where P (4) . (x, y, z, 1) > 0, above the ground plane (DTU's Po
 jzhangbs/DTUeval-python, eval.py).
 """
 
-import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, did_you_mean
 from splatctrl_cli.libraries import scipy_io
 from splatctrl_cli.records import MILLIMETRES, Bool, Float64
 
@@ -157,9 +156,8 @@ def score_protocol(name: str) -> ScoreProtocol:
     if name in PROTOCOLS:
         return PROTOCOLS[name]
     choices = (*PROTOCOLS, "holdout:RULE")
-    near = difflib.get_close_matches(name, choices, n=1)
-    choice = f"did you mean {near[0]}?" if near else "use one of: " + ", ".join(choices)
-    raise UsageError(f"--protocol {name}: unknown", remedy=choice)
+    remedy = did_you_mean(name, choices, f"use one of: {', '.join(choices)}")
+    raise UsageError(f"--protocol {name}: unknown", remedy=remedy)
 
 
 def _holdout(name: str) -> ScoreProtocol:

@@ -35,21 +35,16 @@ _LONGEST = 120  # characters of a node's name
 Variant = Mapping[str, Any]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Parsed:
-    """Words of the command line that say what options say, and the files among them that are read."""
-
-    words: tuple[str, ...]
-    inputs: tuple[Path, ...]
-
-
 class CommandLine(Protocol):
     """What a batch knows of the command line that runs its nodes; `entry` is MODULE:FUNCTION, words to exit code."""
 
     entry: str
 
-    def parsed(self, command: str, options: Table, folder: Path) -> Parsed:
-        """Words for options, paths of which count from `folder`. Raises UsageError for what is not an option."""
+    def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
+        """Words for options, paths of which count from `folder`, and the files among them that are read.
+
+        Raises UsageError for what is not an option.
+        """
         ...
 
     def options_of(self, words: Sequence[str]) -> dict[str, Any]:
@@ -192,12 +187,12 @@ def _nodes_of(
                 options = _placed(_merged(job.options, chosen), values.__getitem__)
                 options |= {} if node.out is None else {"out": str(node.out), "force": True, "resume": True}
                 try:
-                    parsed = command_line.parsed(job.command, options, folder)
+                    words, read = command_line.parsed(job.command, options, folder)
                 except UsageError as error:
                     raise UsageError(f"{_where(job, recording)}: {error.message}", remedy=error.remedy) from None
                 outs = [each.out for each in before if each.out is not None]
-                inputs = (path for path in parsed.inputs if not any(out in (path, *path.parents) for out in outs))
-                made[job.name].append(replace(node, words=parsed.words, inputs=tuple(inputs)))
+                inputs = (path for path in read if not any(out in (path, *path.parents) for out in outs))
+                made[job.name].append(replace(node, words=words, inputs=tuple(inputs)))
     nodes = [node for each in made.values() for node in each]
     by_name: dict[str, Node] = {}
     for node in nodes:

@@ -1,6 +1,5 @@
 """SUITE.toml: recordings, and the commands that each goes through."""
 
-import difflib
 import glob
 import os
 import re
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.config.ranges import shown
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, did_you_mean
 
 Table = Mapping[str, Any]
 
@@ -231,8 +230,7 @@ def _check_keys(where: str, table: Table, known: Sequence[str]) -> None:
 
 
 def _near(word: str, known: Sequence[str], otherwise: str = "known here") -> str:
-    near = difflib.get_close_matches(word, known, n=1)
-    return f"did you mean {near[0]}?" if near else f"{otherwise}: {', '.join(known)}"
+    return did_you_mean(word, known, f"{otherwise}: {', '.join(known)}")
 
 
 def _checked_name(where: str, name: str) -> None:

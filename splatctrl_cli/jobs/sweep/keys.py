@@ -1,6 +1,5 @@
 """What a sweep may vary, and the jobs of a recorded run with a value of it."""
 
-import difflib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -9,7 +8,7 @@ from typing import Any
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.ranges import Within
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, UsageError, did_you_mean
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.jobs.batch.graph import CommandLine
 from splatctrl_cli.jobs.batch.suite import Job
@@ -78,10 +77,9 @@ def key_of(name: str) -> Key:
     declared = None if table is None else table.declared.get(setting)
     if not isinstance(declared, Within):
         settings = [f"{kind}.{each}" for kind, values in Config().as_dict().items() for each in values]
-        near = difflib.get_close_matches(name, [*KEYS, *settings], n=1)
-        known = f"did you mean {near[0]}?" if near else f"known here: {', '.join(KEYS)}, and settings SECTION.KEY"
+        known = f"known here: {', '.join(KEYS)}, and settings SECTION.KEY"
         what = "a setting that is no number" if declared is not None else "unknown key"
-        raise UsageError(f"--over {name}: {what}", remedy=known)
+        raise UsageError(f"--over {name}: {what}", remedy=did_you_mean(name, [*KEYS, *settings], known))
     at, whole = {REPLAY: f"set.{name}"}, type(getattr(table, setting)) is int
     is_of_map = section in FITTED
     options = {FIT: f"set.{name}"} if is_of_map else {BAKE: f"set.{name}", **at} if section == "field" else at
