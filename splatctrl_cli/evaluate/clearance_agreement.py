@@ -1,7 +1,5 @@
 """How far the clearances of a motion agree with a known truth, where a camera saw the surface."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from splatctrl_cli.config.fixed import CLEARANCE_NEAR, MAP_ALLOWANCE
@@ -9,49 +7,28 @@ from splatctrl_cli.evaluate.views import seen_by
 from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.records import Bool, Float64, FloatRows, RgbdFrame, Stamps
 
-
-@dataclass(frozen=True, kw_only=True)
-class ClearanceAgreement:
-    """Over `num_states` compared states: |clearance - truth| as median, 95 % and largest [m], the largest
-    over-estimate [m], and the share of states within `tolerance` [m].
-    """
-
-    num_states: int
-    median: float | None
-    p95: float | None
-    largest: float | None
-    largest_over: float | None
-    tolerance: float
-    share_within: float | None
+FIGURES = ("num_compared", "median", "p95", "largest", "largest_over", "tolerance", "share_within")
 
 
 def clearance_agreement(
     clearance: Float64, truth: Float64, is_seen: Bool, median_radius: float
-) -> ClearanceAgreement:
-    """Clearance (T,) against the truth (T,) [m], over states nearer than 10 cm to a surface that was seen (T,)."""
+) -> dict[str, float | None]:
+    """Clearance (T,) against the truth (T,) [m], over states nearer than 10 cm to a surface that was seen (T,).
+
+    By the names of `FIGURES`: how many states are compared; |clearance - truth| as median, 95 % and largest [m]; the
+    largest over-estimate [m]; the share of states within the tolerance [m]. None where no state is compared.
+    """
     tolerance = MAP_ALLOWANCE + median_radius
     compared = (truth < CLEARANCE_NEAR) & is_seen & np.isfinite(clearance)
     error = clearance[compared] - truth[compared]
     if not len(error):
-        return ClearanceAgreement(
-            num_states=0,
-            median=None,
-            p95=None,
-            largest=None,
-            largest_over=None,
-            tolerance=tolerance,
-            share_within=None,
-        )
+        return dict.fromkeys(FIGURES) | {"num_compared": 0, "tolerance": tolerance}
     size = np.abs(error)
-    return ClearanceAgreement(
-        num_states=len(error),
-        median=float(np.median(size)),
-        p95=float(np.percentile(size, 95)),
-        largest=float(size.max()),
-        largest_over=float(max(error.max(), 0.0)),
-        tolerance=tolerance,
-        share_within=float(np.mean(size <= tolerance)),
-    )
+    over, share = max(error.max(), 0.0), np.mean(size <= tolerance)
+    found = (len(error), np.median(size), np.percentile(size, 95), size.max(), over, tolerance, share)
+    return {
+        name: value if name == "num_compared" else float(value) for name, value in zip(FIGURES, found, strict=True)
+    }
 
 
 def mark_seen(

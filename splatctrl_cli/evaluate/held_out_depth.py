@@ -43,28 +43,6 @@ OTHER_UNITS = (1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for e
 SURFACE_ERROR = Scale(unit="m", better=Better.LOWER, absolute=2e-4, relative=0.02)
 
 
-@dataclass(frozen=True, kw_only=True)
-class CloudScore:
-    """accuracy: mean distance [m] of the surface's points to the reference; completeness: of the reference's points
-    to the surface; chamfer: the mean of both. Points farther than the maximum distance count only in the `*_beyond`
-    shares. completeness_seen: over reference points that a training camera saw. nan where no point is left.
-    """
-
-    accuracy: float
-    completeness: float
-    completeness_seen: float
-    chamfer: float
-    accuracy_beyond: float
-    completeness_beyond: float
-    completeness_seen_beyond: float
-    num_points: int
-    num_reference: int
-
-    def figures(self) -> dict[str, float]:
-        """By flat name."""
-        return {name: float(value) for name, value in vars(self).items()}
-
-
 def cloud_score(
     points: Float64,
     reference: Float64,
@@ -74,11 +52,14 @@ def cloud_score(
     counts: Bool | None = None,
     unit: float = 1.0,
     threads: int = 1,
-) -> CloudScore:
+) -> dict[str, float]:
     """Distances between the surface's points (P, 3) and the reference's (R, 3) [m], world; seen (R,).
 
     As DTU's evaluation and jzhangbs/DTUeval-python, eval.py, have it: means over distances below `max_distance`.
     counts (P,): points that enter the accuracy, all where None; the completeness is over the whole reference.
+    accuracy: mean distance [m] of the surface's points to the reference; completeness: of the reference's points to
+    the surface; chamfer: the mean of both. Points farther than the maximum distance count only in the `*_beyond`
+    shares. completeness_seen: over reference points that a training camera saw. nan where no point is left.
     unit: metres per unit of the reference's file, for the words of a refusal. Raises NotEvaluableError where nothing
     lies that near, or the reference would fit in another unit.
     """
@@ -100,17 +81,17 @@ def cloud_score(
     accuracy, accuracy_beyond = _mean_below(to_reference, max_distance)
     completeness, completeness_beyond = _mean_below(to_surface, max_distance)
     completeness_seen, completeness_seen_beyond = _mean_below(to_surface[seen], max_distance)
-    return CloudScore(
-        accuracy=accuracy,
-        completeness=completeness,
-        completeness_seen=completeness_seen,
-        chamfer=(accuracy + completeness) / 2,
-        accuracy_beyond=accuracy_beyond,
-        completeness_beyond=completeness_beyond,
-        completeness_seen_beyond=completeness_seen_beyond,
-        num_points=len(counted),
-        num_reference=len(reference),
-    )
+    return {
+        "accuracy": accuracy,
+        "completeness": completeness,
+        "completeness_seen": completeness_seen,
+        "chamfer": (accuracy + completeness) / 2,
+        "accuracy_beyond": accuracy_beyond,
+        "completeness_beyond": completeness_beyond,
+        "completeness_seen_beyond": completeness_seen_beyond,
+        "num_points": float(len(counted)),
+        "num_reference": float(len(reference)),
+    }
 
 
 def _check_unit(points: Float64, reference: Float64, margin: float, unit: float) -> None:
@@ -135,7 +116,7 @@ def _overlap(points: Float64, others: Float64, margin: float) -> float:
     return shared / (sum(each) - shared)
 
 
-CLOUD_SCALES = {  # by the names of `CloudScore.figures`
+CLOUD_SCALES = {  # by the names of `cloud_score`
     **dict.fromkeys(("accuracy", "completeness", "completeness_seen", "chamfer"), SURFACE_ERROR),
     **dict.fromkeys(("accuracy_beyond", "completeness_beyond", "completeness_seen_beyond"), BAD_SHARE),
     **dict.fromkeys(("num_points", "num_reference"), DESCRIBES),

@@ -16,22 +16,22 @@ def test_agreement_takes_near_and_seen_states_only() -> None:
     clearance = np.array([0.04, 0.07, 0.05, 0.9, 0.9, np.nan])
     seen = np.array([True, True, True, False, True, True])
     agreement = clearance_agreement(clearance, truth, seen, 0.005)
-    assert agreement.num_states == 3
-    assert agreement.median == pytest.approx(0.01)
-    assert agreement.largest == pytest.approx(0.02)
-    assert agreement.largest_over == pytest.approx(0.02)
-    assert agreement.tolerance == pytest.approx(0.015)
-    assert agreement.share_within == pytest.approx(2 / 3)
+    assert agreement["num_compared"] == 3
+    assert agreement["median"] == pytest.approx(0.01)
+    assert agreement["largest"] == pytest.approx(0.02)
+    assert agreement["largest_over"] == pytest.approx(0.02)
+    assert agreement["tolerance"] == pytest.approx(0.015)
+    assert agreement["share_within"] == pytest.approx(2 / 3)
 
 
 def test_an_under_estimate_is_no_over_estimate() -> None:
     agreement = clearance_agreement(np.array([0.01]), np.array([0.05]), np.array([True]), 0.005)
-    assert agreement.largest_over == 0.0 and agreement.share_within == 0.0
+    assert agreement["largest_over"] == 0.0 and agreement["share_within"] == 0.0
 
 
 def test_without_a_state_to_compare_there_is_no_figure() -> None:
     agreement = clearance_agreement(np.ones(2), np.ones(2), np.ones(2, bool), 0.005)
-    assert agreement.num_states == 0 and agreement.median is None and agreement.share_within is None
+    assert agreement["num_compared"] == 0 and agreement["median"] is None and agreement["share_within"] is None
 
 
 @pytest.mark.parametrize("block", [1, 4, 6])

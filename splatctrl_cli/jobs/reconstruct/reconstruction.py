@@ -176,7 +176,7 @@ class Reconstruction:
             return None
         for frame in step.frames:
             if frame.camera not in self.first_frames:
-                self.first_frames[frame.camera] = asdict(first_frame(frame))
+                self.first_frames[frame.camera] = first_frame(frame)
         if self.fitter is None:
             self._fit_to(RecordedDepth.of(step.frames), console)
             frames, self.corrected = self.request.corrections.of(

@@ -35,30 +35,20 @@ from splatctrl_cli.simulate.truth import Truth
 TILES = (6, 8)  # rows and columns of the picture that is kept of a first frame
 
 
-@dataclass(frozen=True, kw_only=True)
-class FirstFrame:
+def first_frame(frame: RgbdFrame) -> dict[str, Any]:
     """What ``run.json`` keeps of the first frame that a camera trained with.
 
     intrinsics: fx, fy, cx, cy, width, height [px]; T_world_camera: 16 numbers by row; tiles: mean colours (0 to 255)
     of a coarse picture.
     """
-
-    camera: str
-    stamp_ns: int
-    intrinsics: list[float]
-    T_world_camera: list[float]
-    tiles: list[float]
-
-
-def first_frame(frame: RgbdFrame) -> FirstFrame:
     k = frame.intrinsics
-    return FirstFrame(
-        camera=frame.camera,
-        stamp_ns=frame.stamp_ns,
-        intrinsics=[k.fx, k.fy, k.cx, k.cy, float(k.width), float(k.height)],
-        T_world_camera=[round(float(value), 9) for value in frame.T_world_camera.ravel()],
-        tiles=[round(value, 1) for value in _tiles(frame.color)],
-    )
+    return {
+        "camera": frame.camera,
+        "stamp_ns": frame.stamp_ns,
+        "intrinsics": [k.fx, k.fy, k.cx, k.cy, float(k.width), float(k.height)],
+        "T_world_camera": [round(float(value), 9) for value in frame.T_world_camera.ravel()],
+        "tiles": [round(value, 1) for value in _tiles(frame.color)],
+    }
 
 
 def differences(recorded: Sequence[Mapping[str, Any]], records: Iterator[Record]) -> list[str]:
@@ -98,7 +88,7 @@ def changed_files(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 def _differences(first: Mapping[str, Any], frame: RgbdFrame) -> list[str]:
     camera, lines = frame.camera, []
-    then, now = np.array(first["intrinsics"], np.float64), np.array(first_frame(frame).intrinsics)
+    then, now = np.array(first["intrinsics"], np.float64), np.array(first_frame(frame)["intrinsics"])
     if then[4:].tolist() != now[4:].tolist():
         return [f"{camera}: images of {now[4]:g}x{now[5]:g}, not {then[4]:g}x{then[5]:g}"]
     gap = float(np.abs(then[:4] - now[:4]).max())

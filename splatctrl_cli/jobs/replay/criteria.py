@@ -7,11 +7,12 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import CLOCKS_APART, LIMIT_EXCEEDED, SAME_MOMENT_NS, SLIGHTLY_UNDER
 from splatctrl_cli.control.events import Event, EventKind
+from splatctrl_cli.control.outside import OutsideController
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, counted, failed, held, lacking
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.metrics import Metrics, is_blank
-from splatctrl_cli.jobs.replay.request import OutsideRun, Replay, ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.records import Float64
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
@@ -81,7 +82,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
     """
     first_ns, margin = int(judged.replay.audit.stamp_ns[0]), judged.replay.margin
     for found in judged.replay.unwatched:
-        since, until, when = ((ns - first_ns) * 1e-9 for ns in (found.since_ns, found.until_ns, found.stamp_ns))
+        since, until, when = ((ns - first_ns) * 1e-9 for ns in (found.since_ns, found.depth_ns, found.stamp_ns))
         yield lacking(
             sentence=f"no camera gave depth from about the arm from {since:.2f} to {until:.2f} s, and then a thing "
             f"is {mm(found.clearance)} from where the arm was, margin {mm(margin)},",
@@ -307,7 +308,7 @@ def controller(judged: Judged) -> Iterator[Reason]:
     )
 
 
-def _answers(judged: Judged, outside: OutsideRun) -> Reason:
+def _answers(judged: Judged, outside: OutsideController) -> Reason:
     """Judge whether a user's controller gave a valid answer every time."""
     num, failure = outside.num_answers, outside.failure
     if failure is None:

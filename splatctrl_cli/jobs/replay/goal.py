@@ -24,7 +24,7 @@ from splatctrl_cli.control.step import OURS, Commander, ControlStep
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.jobs.replay.request import OutsideRun, ReplayRequest
+from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.state.twists import read_twists
 from splatctrl_cli.records import Float64, FloatRows, Stamps
@@ -283,13 +283,6 @@ def commander_of(
             console.log(
                 f"replay: {outside.num_answers} answers, {1e3 * mean:.2g} ms each, at most {1e3 * slowest:.2g}"
             )
-
-
-def outside_run(commander: Commander) -> OutsideRun | None:
-    """What there is to say of a user's controller, None of ours."""
-    if not isinstance(commander, OutsideController):
-        return None
-    return OutsideRun(name=commander.name, num_answers=commander.num_answers, failure=commander.failure)
 
 
 def _named_command(request: ReplayRequest) -> tuple[str, tuple[str, ...]]:

@@ -18,26 +18,18 @@ ClearanceIn = Callable[[int, Stamps, Float64], Float64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unwatched:
-    """A stretch of time without depth from about the arm, from `since_ns` to `until_ns`, after which a thing stands
-    in its place: the arm of `stamp_ns`, in that time, is `clearance` [m] from it, less than the margin.
-    """
-
-    since_ns: int
-    until_ns: int
-    stamp_ns: int
-    clearance: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Overtaken:
+class LaterDepth:
     """A state that keeps the margin in the map that was known at `stamp_ns`, and is `clearance` [m], less than the
     margin, from a thing that the depth of `depth_ns` shows, which that map did not have yet.
+
+    since_ns: where the state is of a stretch of time without depth from about the arm, the stamp that it begins at;
+    it ends with this depth.
     """
 
     depth_ns: int
     stamp_ns: int
     clearance: float
+    since_ns: int = 0
 
 
 class NewerDepth:
@@ -47,7 +39,7 @@ class NewerDepth:
         self._scene, self._margin, self._clearance_in = scene, margin, clearance_in
         self._waiting: list[tuple[int, Float64]] = []  # states whose own depth is not known yet
         self._last: tuple[int, Float64] | None = None
-        self.found: list[Overtaken] = []
+        self.found: list[LaterDepth] = []
 
     def add(self, stamps: Stamps, positions: Float64, clearance: Float64) -> None:
         """The next states (T,), (T, J), and their clearances (T,) [m] in the map that was known then."""
@@ -87,7 +79,7 @@ class NewerDepth:
         depth_ns = self._scene.depth_ns(known_ns)
         if clearance[worst] < self._margin and depth_ns is not None:
             self.found.append(
-                Overtaken(depth_ns=depth_ns, stamp_ns=int(stamps[worst]), clearance=float(clearance[worst]))
+                LaterDepth(depth_ns=depth_ns, stamp_ns=int(stamps[worst]), clearance=float(clearance[worst]))
             )
 
 
@@ -99,7 +91,7 @@ class Hindsight:
         self._stamps: list[int] = []
         self._postures: list[Float64] = []
         self._seen_ns: int | None = None  # when most of the space about the arm was last seen
-        self.found: list[Unwatched] = []
+        self.found: list[LaterDepth] = []
 
     def add(self, stamps: Stamps, positions: Float64) -> None:
         """The next states (T,), (T, J) of the motion."""
@@ -149,7 +141,7 @@ class Hindsight:
             return
         worst = min(late, key=lambda k: after[k])
         self.found.append(
-            Unwatched(
-                since_ns=since_ns, until_ns=until_ns, stamp_ns=self._stamps[worst], clearance=float(after[worst])
+            LaterDepth(
+                since_ns=since_ns, depth_ns=until_ns, stamp_ns=self._stamps[worst], clearance=float(after[worst])
             )
         )

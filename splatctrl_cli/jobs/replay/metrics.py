@@ -3,7 +3,6 @@ broke a bound.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, fields
 from functools import partial
 from operator import attrgetter
 
@@ -15,7 +14,6 @@ from splatctrl_cli.control.events import first_intervention
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTrace
 from splatctrl_cli.control.terms import RowKind
-from splatctrl_cli.evaluate.clearance_agreement import ClearanceAgreement
 from splatctrl_cli.evaluate.metrics import (
     AGE,
     BAD_SHARE,
@@ -280,12 +278,11 @@ OF_MODE: dict[str, Declared] = {
     "open-loop": (*OF_STEPS, *OF_OPEN_LOOP),
     "closed-loop": (*OF_STEPS, *OF_CLOSED_LOOP),
 }
-TRUTH = tuple(("num_compared" if f.name == "num_states" else f.name) for f in fields(ClearanceAgreement))
 AGREEMENT = {
     **dict.fromkeys(("median", "p95", "largest", "largest_over"), ERROR),
     "share_within": GOOD_SHARE,
     "num_compared": DESCRIBES,
-}  # scales of TRUTH, without its tolerance
+}  # scales of what clearance_agreement gives, but of its tolerance
 
 
 def _declared(mode: str, of_fields: Sequence[str]) -> Declared:
@@ -326,10 +323,8 @@ def metrics_of(replay: Replay) -> Metrics:
     metrics: Metrics = {metric.name: metric.value(replay) for metric in _declared_of(replay)}
     metrics |= replay.twist_figures
     for name, agreement in replay.agreement.items():
-        found = dict(zip(TRUTH, asdict(agreement).values(), strict=True))
-        tolerance = found.pop("tolerance")
-        metrics |= {f"truth_{figure}_{name}": value for figure, value in found.items()}
-        metrics["truth_tolerance"] = tolerance
+        metrics |= {f"truth_{figure}_{name}": agreement[figure] for figure in agreement if figure != "tolerance"}
+        metrics["truth_tolerance"] = agreement["tolerance"]
     return metrics
 
 
@@ -340,8 +335,8 @@ def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> Counts:
     found = dict.fromkeys(metrics, num_states(replay))
     found |= {metric.name: metric.count(replay) for metric in _declared_of(replay)}
     for field, agreement in replay.agreement.items():
-        names = (name for name in TRUTH if name not in {"num_compared", "tolerance"})
-        found |= {f"truth_{name}_{field}": agreement.num_states for name in names}
+        compared = int(agreement["num_compared"] or 0)
+        found |= {f"truth_{name}_{field}": compared for name in AGREEMENT if name != "num_compared"}
     return {name: (found | logged.counts())[name] for name in metrics}
 
 

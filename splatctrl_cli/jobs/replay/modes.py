@@ -9,11 +9,12 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.goals import LoggedMotion, PlanDetour, TwistTrack
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
+from splatctrl_cli.control.outside import OutsideController
 from splatctrl_cli.control.preconditions import StaticViolation, check_within_limits, static_violations
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence, scene_change
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.jobs.recordings.provenance import times_apart
-from splatctrl_cli.jobs.replay.goal import commander_of, goal_waypoints, outside_run, twist_figures, twist_track
+from splatctrl_cli.jobs.replay.goal import commander_of, goal_waypoints, twist_figures, twist_track
 from splatctrl_cli.jobs.replay.inputs import check_inside
 from splatctrl_cli.jobs.replay.known_scene import Certified, KnownScene, certified_distance
 from splatctrl_cli.jobs.replay.request import FIRST_MAP, Replay, ReplayInputs, ReplayRequest
@@ -76,7 +77,7 @@ def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
         open_loop=asked,
         kept_steps=asked.kept,
         twist_figures=figures,
-        outside=outside_run(commander),
+        outside=commander if isinstance(commander, OutsideController) else None,
     )
 
 
@@ -131,7 +132,7 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, consol
         twist_figures=twist_figures(
             model, config.control, task.frame, task.twists, trace.stamp_ns, trace.position, trace.steps
         ),
-        outside=outside_run(commander),
+        outside=commander if isinstance(commander, OutsideController) else None,
     )
 
 

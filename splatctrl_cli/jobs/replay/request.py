@@ -9,15 +9,14 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.control.events import Event
 from splatctrl_cli.control.goals import LoggedMotion
-from splatctrl_cli.control.outside import STEP_LIMIT, Failure
+from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController
 from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
 from splatctrl_cli.control.step import ControlStep
-from splatctrl_cli.evaluate.clearance_agreement import ClearanceAgreement
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.jobs.reconstruct.verdict import LONGEST_BLIND
 from splatctrl_cli.jobs.recordings.provenance import Mismatch
-from splatctrl_cli.jobs.replay.hindsight import Overtaken, Unwatched
+from splatctrl_cli.jobs.replay.hindsight import LaterDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.jobs.replay.state_store import Figures, StoredAudit, StoredOpenLoop, StoredSteps
 from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
@@ -130,15 +129,6 @@ class MapError:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OutsideRun:
-    """A user's own controller: what people call it, how often it answered as it should, and what ended it."""
-
-    name: str
-    num_answers: int
-    failure: Failure | None
-
-
-@dataclass(frozen=True, kw_only=True)
 class Replay:
     """One finished replay of T states: their audit, the trace of its mode, and the truth where it is known.
 
@@ -162,8 +152,8 @@ class Replay:
     start_time_s: float
     between: Figures
     near: Figures
-    unwatched: tuple[Unwatched, ...]
-    overtaken: tuple[Overtaken, ...]
+    unwatched: tuple[LaterDepth, ...]
+    overtaken: tuple[LaterDepth, ...]
     strain: Figures
     statics: Mapping[str, tuple[float, float]]
     closest: Mapping[KeptMargin, tuple[float, int]]
@@ -172,11 +162,11 @@ class Replay:
     divergence: Figures | None = None
     kept_steps: StoredSteps | None = None
     true_clearance: FloatRows | None = None
-    agreement: Mapping[str, ClearanceAgreement] = made_by(default_factory=dict)
+    agreement: Mapping[str, Mapping[str, float | None]] = made_by(default_factory=dict)
     events: tuple[Event, ...] = ()
     twist_figures: Mapping[str, float | None] = made_by(default_factory=dict)
     map_error: MapError | None = None
-    outside: OutsideRun | None = None
+    outside: OutsideController | None = None
 
     @property
     def margin(self) -> float:

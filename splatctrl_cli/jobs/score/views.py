@@ -238,7 +238,7 @@ def cloud_figures(
     if space is not None:
         reference, points = reference[space.above(reference)], points[space.near(points)]
         counts = space.observed(points)
-    score = cloud_score(
+    return cloud_score(
         points,
         reference,
         seen_by(reference, frames),
@@ -247,7 +247,6 @@ def cloud_figures(
         unit=settings.unit,
         threads=threads or -1,
     )
-    return score.figures()
 
 
 def _reference(settings: CloudSettings) -> Float64:

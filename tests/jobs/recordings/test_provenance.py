@@ -23,7 +23,7 @@ def frame(camera: str = "cam0", second: float = 1.0, eye: tuple[float, ...] = (0
 
 def kept(*frames: RgbdFrame) -> list[dict[str, object]]:
     """As ``run.json`` holds them."""
-    return list(json.loads(json.dumps([vars(first_frame(f)) for f in frames])))
+    return list(json.loads(json.dumps([first_frame(f) for f in frames])))
 
 
 def turned(T: Float64, degrees: float) -> Float64:
