@@ -1,6 +1,8 @@
 """A tiny study from end to end: a trial for each cell, kept and gone on with; and what it does not take for whole."""
 
 import shutil
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,28 +13,34 @@ from experiments.environments import ENVIRONMENTS
 from experiments.problem_run import TRIALS, read_trials, verdict_on_trials
 from experiments.problems import archive_of
 from experiments.study import StudyRequest, StudyResult, merged_study, run_study
-from experiments.trial import CAMERAS, OURS, TRUTH, Trial
+from experiments.trial import OURS, TRUTH, Trial
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome
+
+CAMERAS = (2,)
 
 
 def request(out: Path) -> StudyRequest:
     return StudyRequest(study="table2", out=out, trials=1, methods=(OURS, TRUTH), width=32)
 
 
-def ran(asked: StudyRequest) -> StudyResult:
-    return run_study(asked)
-
-
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StudyResult, StudyResult]:
-    """A study of which one of two shards ran first, and what came of that and of the whole."""
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, StudyResult, StudyResult]]:
+    """A study of two cameras, of which one of two shards ran first, and what came of that and of the whole.
+
+    Its problems run in threads; in processes of their own those of test_shared_workspace do.
+    """
     out = tmp_path_factory.mktemp("study") / "table2"
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("SPLATCTRL_REAL_DATA", raising=False)
-        part = ran(replace(request(out), shard=(1, 2)))
+        patch.setattr(
+            "experiments.study.ProcessPoolExecutor", lambda max_workers, **_: ThreadPoolExecutor(max_workers)
+        )
+        patch.setattr("experiments.trial.CAMERAS", CAMERAS)
+        patch.setattr("experiments.table2.CAMERAS", CAMERAS)
+        part = run_study(replace(request(out), shard=(1, 2)))
         assert not (out / TRIALS).exists()
-        return out, part, ran(request(out))
+        yield out, part, run_study(request(out))
 
 
 def test_a_study_with_a_shard_missing_is_not_whole_and_says_which_problem_lacks(
@@ -58,13 +66,13 @@ def test_every_cell_has_a_trial_and_those_of_before_are_kept(whole: tuple[Path, 
 def test_other_settings_do_not_go_on_in_the_folder(whole: tuple[Path, StudyResult, StudyResult]) -> None:
     out = whole[0]
     with pytest.raises(UsageError, match="was begun with other settings: width"):
-        ran(replace(request(out), width=48))
+        run_study(replace(request(out), width=48))
     with pytest.raises(UsageError, match="was begun with other settings: methods"):
-        ran(replace(request(out), methods=(TRUTH,)))
+        run_study(replace(request(out), methods=(TRUTH,)))
     (out.parent / "other").mkdir()
     (out.parent / "other" / "run.json").write_text("{}")
     with pytest.raises(UsageError, match="is no study, but something else"):
-        ran(request(out.parent / "other"))
+        run_study(request(out.parent / "other"))
 
 
 def test_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
@@ -99,7 +107,7 @@ def test_trials_made_elsewhere_come_to_the_same_table(
 
 def test_a_method_and_an_archive_that_are_none_are_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--methods luck: expected some of ours, tsdf, truth"):
-        ran(replace(request(tmp_path / "out"), methods=("luck",)))
+        run_study(replace(request(tmp_path / "out"), methods=("luck",)))
     with pytest.raises(InputError, match=r"has no problems\.tar\.bz2"):
         archive_of(tmp_path)
     assert not (tmp_path / "out").exists()

@@ -1,6 +1,6 @@
 """What replays share."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,32 +11,30 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from splatctrl_cli.jobs.replay import files, inputs, lockstep
 from splatctrl_cli.recording.state import state_source
 from splatctrl_cli.records import SphereSet
-from splatctrl_cli.robot import coverage
+from splatctrl_cli.robot.coverage import CoverageReport
 from splatctrl_cli.robot.link_meshes import Solid
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
 from tests.cli.replay_desk import Desk, FakeSource, logged
 
-Solids = Mapping[str, Sequence[Solid]]
-MEASURED: dict[tuple[bytes, ...], coverage.CoverageReport] = {}
 
+@pytest.fixture(scope="session", autouse=True)
+def coverage_once() -> Iterator[None]:
+    """What spheres leave uncovered of a robot is measured once for all replays: it takes longer than most of them."""
+    measure, measured = inputs.coverage_of_solids, dict[object, CoverageReport]()
 
-@pytest.fixture
-def coverage_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What spheres leave uncovered of a robot without meshes is measured once: that takes longer than a replay."""
-    measure = coverage.coverage_of_solids
+    def known(
+        urdf: UrdfFile, solids: Mapping[str, Sequence[Solid]], spheres: SphereSet, **how: Any
+    ) -> CoverageReport:
+        meshes = [(s.link, s.slack, s.surface.corners.tobytes()) for parts in solids.values() for s in parts]
+        key = (urdf.text, repr((how, spheres.links)), spheres.centers.tobytes(), spheres.radii.tobytes(), *meshes)
+        if key not in measured:
+            measured[key] = measure(urdf, solids, spheres, **how)
+        return measured[key]
 
-    def known(urdf: UrdfFile, solids: Solids, spheres: SphereSet, **how: Any) -> coverage.CoverageReport:
-        text = urdf.text.encode()
-        if b"<mesh" in text:
-            return measure(urdf, solids, spheres, **how)
-        names = repr((how, spheres.links)).encode()
-        key = (text, names, spheres.centers.tobytes(), spheres.radii.tobytes())
-        if key not in MEASURED:
-            MEASURED[key] = measure(urdf, solids, spheres, **how)
-        return MEASURED[key]
-
-    monkeypatch.setattr(inputs, "coverage_of_solids", known)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(inputs, "coverage_of_solids", known)
+        yield
 
 
 @pytest.fixture
@@ -59,7 +57,7 @@ def arm(plain_arm: Path) -> RobotModel:
 
 
 @pytest.fixture
-def desk(tmp_path: Path, plain_arm: Path, monkeypatch: pytest.MonkeyPatch, coverage_once: None) -> Desk:
+def desk(tmp_path: Path, plain_arm: Path, monkeypatch: pytest.MonkeyPatch) -> Desk:
     tabletop = plain_arm / "tabletop"
     robot = ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
     desk = Desk(folder=tmp_path, source=FakeSource(states=logged()), robot=robot)

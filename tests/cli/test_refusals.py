@@ -322,7 +322,6 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.usefixtures("coverage_once")
 @pytest.mark.parametrize(("words", "code", "said"), [*refusals()])
 def test_what_cannot_be_done_is_one_line_with_its_code_and_leaves_nothing(
     world: Path, monkeypatch: pytest.MonkeyPatch, words: str, code: int, said: str
@@ -336,7 +335,6 @@ def test_what_cannot_be_done_is_one_line_with_its_code_and_leaves_nothing(
     assert contents(world) == before
 
 
-@pytest.mark.usefixtures("coverage_once")
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
