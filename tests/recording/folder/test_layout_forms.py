@@ -342,15 +342,15 @@ def test_a_pose_of_tum_that_is_none_is_named_by_its_line(tmp_path: Path, word: s
         open_source(folder)
 
 
-def test_a_lens_of_arkit_scenes_that_is_none_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("lens", "said"),
+    [
+        ("inf 6 10 11 3.5 2.5", r"expected width, height, fx, fy, cx, cy, got .*copy the file again"),
+        ("8 6 1e-320 11 3.5 2.5", "expected a positive number of pixels, got 1e-320"),
+    ],
+)
+def test_a_lens_of_arkit_scenes_that_is_none_is_refused(tmp_path: Path, lens: str, said: str) -> None:
     folder = make_arkit(tmp_path)
-    next((folder / "41069021_frames/lowres_wide_intrinsics").iterdir()).write_text("inf 6 10 11 3.5 2.5")
-    with pytest.raises(InputError, match=r"expected width, height, fx, fy, cx, cy, got .*copy the file again"):
-        open_source(folder)
-
-
-def test_a_focal_length_of_next_to_nothing_is_refused(tmp_path: Path) -> None:
-    folder = make_arkit(tmp_path)
-    next((folder / "41069021_frames/lowres_wide_intrinsics").iterdir()).write_text("8 6 1e-320 11 3.5 2.5")
-    with pytest.raises(InputError, match="expected a positive number of pixels, got 1e-320"):
+    next((folder / "41069021_frames/lowres_wide_intrinsics").iterdir()).write_text(lens)
+    with pytest.raises(InputError, match=said):
         open_source(folder)
