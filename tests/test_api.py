@@ -9,6 +9,9 @@ import pytest
 
 import splatctrl_cli
 from splatctrl_cli import api
+from tests.cli.conftest import coverage_once, short_sample
+
+__all__ = ["coverage_once", "short_sample"]
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "api.md"
@@ -49,9 +52,9 @@ def test_the_page_lists_every_job_with_its_request_and_result() -> None:
 
 
 def test_the_examples_of_the_page_run_on_the_sample_data(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    short_sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "sample_data").symlink_to(ROOT / "sample_data")
+    (tmp_path / "sample_data").symlink_to(short_sample)
     monkeypatch.chdir(tmp_path)
     examples = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
     scope: dict[str, object] = {}

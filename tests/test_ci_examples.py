@@ -8,8 +8,10 @@ import pytest
 import yaml
 from junitparser import JUnitXml
 
+from tests.cli.conftest import short_sample
 from tests.cli.here import splatctrl
 
+__all__ = ["short_sample"]
 ROOT = Path(__file__).parent.parent
 CI = ROOT / "docs" / "ci"
 
@@ -42,9 +44,9 @@ def test_the_github_example_is_a_workflow() -> None:
 
 
 def test_the_commands_of_the_examples_run_and_leave_the_reports_that_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "sample_data").symlink_to(ROOT / "sample_data")
+    (tmp_path / "sample_data").symlink_to(short_sample)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("GITHUB_ACTIONS", raising=False)
     install, *commands = [shlex.split(line) for line in gitlab_lines()]
