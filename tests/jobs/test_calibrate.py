@@ -27,6 +27,7 @@ from splatctrl_cli.simulate.recording import RecordingOptions, Scene
 from tests.calibration.scan import calibrated, robot_in
 
 SMALL = RecordingOptions(duration_s=3.0, fps=2.0, width=160, height=120, color_rays=0)
+TINY = replace(SMALL, width=120, height=90)  # shows as much of a robot in view
 
 
 def largest(setup: SetUp, result: CalibrateResult, unknown: str) -> float:
@@ -115,8 +116,8 @@ def test_what_is_calibrated_is_the_recording_as_it_is(log: Path, result: Calibra
 class Biased(SetUp):
     """Three cameras, one of which measures 10 mm short at every depth."""
 
-    def __init__(self, seed: int, biased: str) -> None:
-        super().__init__(seed, SMALL)
+    def __init__(self, seed: int, biased: str, options: RecordingOptions) -> None:
+        super().__init__(seed, options)
         self.biased, self.scale = biased, 1.0
         self.off["cam0"] = np.eye(4)
 
@@ -133,7 +134,7 @@ def test_a_depth_bias_is_found_within_its_sigma_and_in_the_camera_that_has_it(
     biased: str, seed: int, has_robot: bool, tmp_path: Path, plain_arm: Path
 ) -> None:
     """A scale of the same camera, or the bias of a camera that is taken as recorded, fits nearly as well."""
-    setup = Biased(seed, biased)
+    setup = Biased(seed, biased, TINY if has_robot else SMALL)
     found = calibrated(setup, tmp_path, **(robot_in(plain_arm) if has_robot else {}))
     for name, camera in found.calibration.cameras.items():
         if name == biased:
@@ -157,7 +158,7 @@ def test_the_bias_that_would_not_be_noticed_is_said(setup: SetUp, result: Calibr
 @pytest.fixture(scope="module")
 def wrist() -> SetUp:
     """A camera on the hand, recorded 2 cm and 2 degrees off its mount, with a clock 50 ms off."""
-    setup = SetUp(2, SMALL, has_wrist=True)
+    setup = SetUp(2, TINY, has_wrist=True)
     turn, move = np.array([1, 2, -2]) / 3, np.array([2, -1, 2]) / 3
     setup.off[WRIST] = transform_of(np.concatenate([np.radians(2) * turn, 0.02 * move]))
     setup.clock = 0.05
