@@ -33,7 +33,6 @@ class Lens:
     model: str = "plumb_bob"
     D: Sequence[float] = ()
     bends: tuple[str, Sequence[float]] = ("plumb_bob", ())
-    projection: float | None = None
 
     @property
     def K(self) -> Float64:
@@ -42,7 +41,6 @@ class Lens:
     def info(self, stamp: int) -> Any:
         P = np.zeros((3, 4))
         P[:, :3] = self.K
-        P[0, 0] = P[1, 1] = self.focal if self.projection is None else self.projection
         roi = T["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         return INFO(
             header=header(stamp, "optical"), height=HEIGHT, width=WIDTH, distortion_model=self.model,
@@ -54,10 +52,6 @@ class Lens:
         """x / z of each pixel of the image's middle row."""
         pixels = np.stack([np.arange(WIDTH, dtype=np.float64), np.full(WIDTH, 23.5)], axis=1)[:, None]
         model, D = self.bends
-        P = self.K if self.projection is None else np.diag([self.projection, self.projection, 1.0]) + 0.0
-        if model == "rectified":
-            P[:2, 2] = 31.5, 23.5
-            return np.asarray((pixels[:, 0, 0] - P[0, 2]) / P[0, 0])
         if model == "equidistant":
             return np.tan((pixels[:, 0, 0] - 31.5) / self.focal)
         return np.asarray(cv2.undistortPoints(pixels, self.K, np.array([*D, 0, 0, 0, 0][:5]))[:, 0, 0])
@@ -233,7 +227,6 @@ def folder_refused(*words: str) -> Callable[[Path, Path, Run], None]:
 ANGLES = Lens(focal=30.0, model="equidistant", D=(0.0, 0.0, 0.0, 0.0), bends=("equidistant", ()))
 BENT = Lens(D=BARREL, bends=("plumb_bob", BARREL))
 FLAT = Lens()
-RECTIFIED = Lens(D=BARREL, bends=("rectified", ()), projection=40.0)
 
 CASES: tuple[Case, ...] = (
     Case(
