@@ -9,9 +9,10 @@ import numpy as np
 
 from benchmarks.measure import ROOT
 from benchmarks.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh
-from splatctrl_cli.formats.mesh import MeshDistance, TriangleMesh, load_mesh
+from splatctrl_cli.formats.mesh import TriangleMesh, load_mesh
 from splatctrl_cli.geometry import invert_transform, pose_at, transform_points
 from splatctrl_cli.records import Box, Float64
+from splatctrl_cli.robot.mesh_distance import MeshDistance
 from splatctrl_cli.simulate.primitives import Primitive, Texture, closest_point, normals
 from splatctrl_cli.simulate.truth import distance_to
 

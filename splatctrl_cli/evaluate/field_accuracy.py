@@ -12,9 +12,10 @@ from splatctrl_cli.config.fixed import BANDS, MAP_ALLOWANCE, PROBABILITY_NEAR
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS, LENGTH, Scale
 from splatctrl_cli.evaluate.views import seen_by
-from splatctrl_cli.formats.mesh import MeshDistance, load_mesh
+from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, Index, RgbdFrame
 from splatctrl_cli.report.reliability import Reliability, reliability
+from splatctrl_cli.robot.mesh_distance import MeshDistance
 
 
 @dataclass(frozen=True, kw_only=True)

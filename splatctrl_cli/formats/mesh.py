@@ -1,4 +1,4 @@
-"""The exact distance to a triangle mesh, in float64."""
+"""Triangle meshes out of files."""
 
 from dataclasses import dataclass
 from io import BytesIO
@@ -8,13 +8,10 @@ import numpy as np
 from defusedxml import ElementTree
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import face_normals
-from splatctrl_cli.kernels.triangles import TriangleTree
 from splatctrl_cli.libraries import trimesh
-from splatctrl_cli.records import Bool, Float64, Index
+from splatctrl_cli.records import Float64, Index
 
 STL_HEADER, STL_FACE = 84, 50  # bytes; the header ends with the number of faces
-NEXT, OPPOSITE = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,65 +95,3 @@ def _collada_unit(path: Path) -> float:
     """Metres in a unit of a COLLADA file."""
     unit = ElementTree.parse(path).find("{*}asset/{*}unit")
     return 1.0 if unit is None else float(unit.get("meter", "1"))
-
-
-class MeshDistance:
-    """Exact distance from points to a mesh."""
-
-    def __init__(self, mesh: TriangleMesh) -> None:
-        self.mesh = mesh
-        self._tree = TriangleTree(mesh.corners)
-        self._normals = _Normals(mesh)
-
-    def closest(self, points: Float64) -> tuple[Float64, Float64, Bool]:
-        """points (Q, 3) [m] -> distance (Q,) [m], the nearest surface point (Q, 3), is_inside (Q,).
-
-        Inside by the angle-weighted normal of the nearest face, edge or vertex (Baerentzen, Aanaes, Signed distance
-        computation using the angle weighted pseudonormal, 2005), exact for a closed mesh; all False for an open one.
-        """
-        distance, face, shares = self._tree.closest(points)
-        surface = np.einsum("qk,qka->qa", shares, self.mesh.corners[face])
-        is_inside = np.zeros(len(points), dtype=np.bool_)
-        if self.mesh.is_closed:
-            is_inside = np.einsum("qa,qa->q", points - surface, self._normals.at(face, shares)) < 0
-        return distance, surface, is_inside
-
-    def distance(self, points: Float64, within: float = np.inf) -> Float64:
-        """points (Q, 3) [m] -> distance (Q,) [m], infinite where it is more than `within` [m]."""
-        return self._tree.closest(points, within)[0]
-
-    def signed(self, points: Float64) -> Float64:
-        """points (Q, 3) [m] -> distance (Q,) [m], negative inside a closed mesh."""
-        distance, _, is_inside = self.closest(points)
-        return np.where(is_inside, -distance, distance)
-
-
-class _Normals:
-    """Normals of faces, edges and vertices, the last two weighted by angle."""
-
-    def __init__(self, mesh: TriangleMesh) -> None:
-        corners, faces = mesh.corners, mesh.faces
-        cross = face_normals(corners)
-        self.of_face = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
-        self._faces = faces
-        self._of_vertex = np.zeros_like(mesh.vertices)
-        for k in range(3):
-            u, v = corners[:, NEXT[k]] - corners[:, k], corners[:, OPPOSITE[k]] - corners[:, k]
-            angle = np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("pa,pa->p", u, v))
-            np.add.at(self._of_vertex, faces[:, k], angle[:, None] * self.of_face)
-        ends = np.sort(np.stack([faces, faces[:, NEXT]], axis=2).reshape(-1, 2), axis=1)
-        _, edge = np.unique(ends, axis=0, return_inverse=True)
-        self._edge = edge.reshape(-1, 3)  # (F, 3): edge k runs from corner k to the next
-        self._of_edge = np.zeros((int(edge.max()) + 1, 3))
-        np.add.at(self._of_edge, self._edge.reshape(-1), np.repeat(self.of_face, 3, axis=0))
-
-    def at(self, face: Index, shares: Float64) -> Float64:
-        """Outward directions (Q, 3), not normalised, where a point of a face has these barycentric coordinates."""
-        normal = np.asarray(self.of_face[face])
-        num_zero = np.count_nonzero(shares == 0, axis=1)
-        for k in range(3):
-            on_edge = np.flatnonzero((num_zero == 1) & (shares[:, OPPOSITE[k]] == 0))
-            normal[on_edge] = self._of_edge[self._edge[face[on_edge], k]]
-            at_vertex = np.flatnonzero((num_zero == 2) & (shares[:, k] != 0))
-            normal[at_vertex] = self._of_vertex[self._faces[face[at_vertex], k]]
-        return normal

@@ -11,9 +11,10 @@ from scipy.spatial import ConvexHull, QhullError
 
 from splatctrl_cli.config.fixed import CYLINDER_SIDES, SPHERE_ROUNDS
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.formats.mesh import MeshDistance, TriangleMesh, load_mesh
+from splatctrl_cli.formats.mesh import TriangleMesh, load_mesh
 from splatctrl_cli.geometry import face_normals, transform_points
 from splatctrl_cli.records import Float64, Index
+from splatctrl_cli.robot.mesh_distance import MeshDistance
 from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
 
 MESH_LENGTHS = (0.001, 10.0)  # [m] of a link's mesh: beyond them its unit is another

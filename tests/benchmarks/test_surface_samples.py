@@ -3,8 +3,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from benchmarks.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh, thin
-from splatctrl_cli.formats.mesh import MeshDistance
-from tests.formats.test_mesh import box_distance, box_mesh
+from splatctrl_cli.robot.mesh_distance import MeshDistance
+from tests.robot.test_mesh_distance import box_distance, box_mesh
 
 SIZE = (0.3, 0.2, 0.1)
 

@@ -14,12 +14,13 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import LEAST_OVERLAP
 from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
-from splatctrl_cli.formats.mesh import MeshDistance, TriangleMesh
+from splatctrl_cli.formats.mesh import TriangleMesh
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.solid_scene import Solids
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.link_meshes import Solid, read_solids
+from splatctrl_cli.robot.mesh_distance import MeshDistance
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import DisabledPair, random_postures
 from splatctrl_cli.robot.self_margins import (

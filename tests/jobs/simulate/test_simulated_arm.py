@@ -10,13 +10,14 @@ import pytest
 import trimesh
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.formats.mesh import MeshDistance, load_mesh
+from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.running.progress import Silent
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame
+from splatctrl_cli.robot.mesh_distance import MeshDistance
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
 from splatctrl_cli.simulate import tabletop
