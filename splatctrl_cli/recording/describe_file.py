@@ -15,6 +15,7 @@ from defusedxml import ElementTree
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.formats.arrays import DAMAGE, npy_head, read_arrays
+from splatctrl_cli.formats.grid.grid_format import json_value
 from splatctrl_cli.formats.grid.grid_formats import FORMATS as GRID_FORMATS
 from splatctrl_cli.formats.image_file import decode_file
 from splatctrl_cli.formats.splat.splats import FORMATS as SPLAT_FORMATS
@@ -70,7 +71,7 @@ def _npz(path: Path, _head: bytes) -> Summary:
             if (shape == () if dtype.kind in "US" else dtype.kind in "fiub" and prod(shape) <= _LIST_LIMIT)
         ]
         facts: dict[str, object] = {
-            name: _text_or_json(str(array)) if array.dtype.kind in "US" else array.tolist()
+            name: json_value(str(array)) if array.dtype.kind in "US" else array.tolist()
             for name, array in read_arrays(path, short, most=1 << 24).items()
         }
     except (*DAMAGE, OSError) as error:
@@ -183,13 +184,6 @@ def _find(content: Any, key: str) -> Any:
     if key in content:
         return content[key]
     return next((found for value in content.values() if (found := _find(value, key)) is not None), None)
-
-
-def _text_or_json(text: str) -> object:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
 
 
 def _short(value: object) -> object:

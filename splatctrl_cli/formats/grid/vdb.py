@@ -8,7 +8,6 @@ OpenVDB holds all channels in memory while it writes.
 
 import json
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -95,16 +94,7 @@ def _plain(value: object) -> object:
     return value if isinstance(value, str | bool) or is_number else json.dumps(value, allow_nan=False)
 
 
-@dataclass(frozen=True, kw_only=True)
-class VdbGrid:
-    """A grid as the head of a file has it."""
-
-    name: str
-    type: str
-    metadata: dict[str, object]
-
-
-def read_vdb_head(path: Path) -> tuple[VdbGrid, ...]:
+def read_vdb_head(path: Path) -> list[tuple[str, str, dict[str, object]]]:
     """Name, type and metadata of every grid of a ``.vdb``, without OpenVDB. Raises InputError for what is none.
 
     The layout is that of OpenVDB's io/Archive.cc, io/GridDescriptor.cc and MetaMap.cc, since file version 222.
@@ -123,11 +113,11 @@ def read_vdb_head(path: Path) -> tuple[VdbGrid, ...]:
                 name, kind, _parent = (_text(stream) for _ in range(3))
                 start, _, end = _unpack(stream, "<3q")
                 stream.seek(start + 4)  # behind the grid's kind of compression
-                grids.append(VdbGrid(name=name.split("\x1e")[0], type=kind, metadata=_metadata(stream)))
+                grids.append((name.split("\x1e")[0], kind, _metadata(stream)))
                 stream.seek(end)
         except (ValueError, struct.error) as error:
             raise InputError(f"{path}: not a readable OpenVDB file: {error}", remedy="the file is damaged") from None
-    return tuple(grids)
+    return grids
 
 
 def _unpack(stream: BinaryIO, layout: str) -> tuple[Any, ...]:
@@ -161,10 +151,10 @@ def describe_vdb(path: Path, head: bytes) -> Summary | None:
         return None
     grids = read_vdb_head(path)
     rows = [
-        [g.name, g.type, g.metadata.get("class", "-"), g.metadata.get("file_voxel_count", "-")]
-        for g in sorted(grids, key=lambda g: g.name)
+        [name, kind, metadata.get("class", "-"), metadata.get("file_voxel_count", "-")]
+        for name, kind, metadata in sorted(grids, key=lambda grid: grid[0])
     ]
-    header = {key: json_value(value) for key, value in grids[0].metadata.items()} if grids else {}
+    header = {key: json_value(value) for key, value in grids[0][2].items()} if grids else {}
     facts: dict[str, object] = {"grids": len(grids)}
     if header.get("format") == FORMAT:
         facts |= header_facts(header)

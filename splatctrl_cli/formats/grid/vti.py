@@ -5,7 +5,6 @@ Format: VTK's user guide and the XML file formats page of its documentation.
 """
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 from xml.etree.ElementTree import Element, ParseError
@@ -39,14 +38,6 @@ _DTYPES = {name: dtype for dtype, name in _TYPES.items()}
 _FILE = {"type": "ImageData", "version": "1.0", "byte_order": "LittleEndian", "header_type": "UInt64"}
 _APPENDED = b'<AppendedData encoding="raw">'
 _REMEDY = "give a .vti that sdf-bake wrote, or bake it again"
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Block:
-    name: str
-    dtype: str
-    components: int
-    start: int  # [bytes] in the file, of the length before it
 
 
 def write_vti(path: Path, grid: DistanceGrid) -> None:
@@ -93,8 +84,8 @@ def write_vti(path: Path, grid: DistanceGrid) -> None:
 def read_vti(path: Path) -> DistanceGrid:
     """The grid that `write_vti` wrote. Raises InputError for a file that is missing, damaged or not ours."""
     with _opened(path) as stream:
-        head, blocks = _head(path, stream)
-        channels = {block.name: _values(path, stream, head, block) for block in blocks}
+        head, starts = _head(path, stream)
+        channels = {name: _values(path, stream, head, name, start) for name, start in starts.items()}
     grid = DistanceGrid(origin=head.origin, voxel=head.voxel, channels=channels, header=head.header)
     check_finite(str(path), grid)
     return grid
@@ -115,7 +106,8 @@ def _opened(path: Path) -> BinaryIO:
         raise InputError(f"{path}: expected a file, got a folder", remedy="give the field.vti in it") from None
 
 
-def _head(path: Path, stream: BinaryIO) -> tuple[GridHead, list[_Block]]:
+def _head(path: Path, stream: BinaryIO) -> tuple[GridHead, dict[str, int]]:
+    """The head, and by channel where in the file [bytes] the length before its values stands."""
     text = stream.read(1 << 22)  # bytes in which the XML must end
     mark = text.find(_APPENDED)
     begin = text.find(b"_", mark) + 1
@@ -134,7 +126,7 @@ def _head(path: Path, stream: BinaryIO) -> tuple[GridHead, list[_Block]]:
         raise InputError(f"{path}: not a distance grid of ours: {error!r}", remedy=_REMEDY) from None
 
 
-def _parsed(path: Path, image: Element, piece: Element, begin: int) -> tuple[GridHead, list[_Block]]:
+def _parsed(path: Path, image: Element, piece: Element, begin: int) -> tuple[GridHead, dict[str, int]]:
     bounds = [int(number) for number in piece.attrib["Extent"].split()]
     if bounds[::2] != [0, 0, 0] or piece.attrib["Extent"] != image.attrib["WholeExtent"]:
         raise ValueError(f"expected one piece from 0 0 0, got {piece.attrib['Extent']}")
@@ -144,37 +136,34 @@ def _parsed(path: Path, image: Element, piece: Element, begin: int) -> tuple[Gri
         raise ValueError(f"expected cubic cells, got {image.attrib['Spacing']}")
     codes = [int(code) for code in (image.findtext("FieldData/Array") or "").split()]
     header = parse_header(str(path), bytes(codes[:-1]).decode("utf-8"))
-    blocks = [
-        _Block(
-            name=array.attrib["Name"],
-            dtype=_DTYPES[array.attrib["type"]],
-            components=int(array.attrib["NumberOfComponents"]),
-            start=begin + int(array.attrib["offset"]),
-        )
-        for array in piece.iterfind("PointData/DataArray")
-    ]
-    layout = {b.name: (b.dtype, shape if b.components == 1 else (*shape, b.components)) for b in blocks}
+    arrays = {array.attrib["Name"]: array.attrib for array in piece.iterfind("PointData/DataArray")}
+    widths = {name: int(its["NumberOfComponents"]) for name, its in arrays.items()}
+    layout = {
+        name: (_DTYPES[its["type"]], shape if widths[name] == 1 else (*shape, widths[name]))
+        for name, its in arrays.items()
+    }
+    starts = {name: begin + int(its["offset"]) for name, its in arrays.items()}
     check_layout(str(path), layout)
     origin = np.array([float(number) for number in image.attrib["Origin"].split()])
     voxel = spacing.pop()
     if origin.shape != (3,) or not np.isfinite(origin).all() or not 0.0 < voxel < np.inf:
         raise ValueError(f"expected a place and a size above 0, got {image.attrib['Origin']}, {voxel}")
-    return GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header), blocks
+    return GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header), starts
 
 
-def _values(path: Path, stream: BinaryIO, head: GridHead, block: _Block) -> NDArray[np.generic]:
-    stream.seek(block.start)
-    x, y, z = head.shape
-    count = x * y * z * block.components
-    size = count * np.dtype(block.dtype).itemsize
-    there = min(int.from_bytes(stream.read(8), "little"), path.stat().st_size - block.start - 8)
+def _values(path: Path, stream: BinaryIO, head: GridHead, name: str, start: int) -> NDArray[np.generic]:
+    stream.seek(start)
+    (x, y, z), channel = head.shape, CHANNELS[name]
+    count = x * y * z * channel.components
+    size = count * np.dtype(channel.dtype).itemsize
+    there = min(int.from_bytes(stream.read(8), "little"), path.stat().st_size - start - 8)
     if there != size:
         raise InputError(
-            f"{path}: {block.name}: expected {size} bytes, got {max(there, 0)}",
+            f"{path}: {name}: expected {size} bytes, got {max(there, 0)}",
             remedy="the file is cut; bake it again",
         )
-    flat: NDArray[np.generic] = np.fromfile(stream, block.dtype, count)
-    planes = flat.reshape((z, y, x) if block.components == 1 else (z, y, x, block.components))
+    flat: NDArray[np.generic] = np.fromfile(stream, channel.dtype, count)
+    planes = flat.reshape((z, y, x) if channel.components == 1 else (z, y, x, channel.components))
     return from_x_fastest(planes)
 
 

@@ -79,10 +79,10 @@ def test_openvdb_reads_every_value_at_its_place(tmp_path: Path) -> None:
             assert metadata["sign"] == "positive outside"
             assert metadata["labels"] == '["human", "object"]'
             assert metadata["length_scale"] == 0.02
-    heads = {head.name: head for head in read_vdb_head(tmp_path / "a.vdb")}
+    heads = {name: (kind, metadata) for name, kind, metadata in read_vdb_head(tmp_path / "a.vdb")}
     assert heads.keys() == grid.channels.keys()
-    assert heads["gradient"].type == "Tree_vec3s_5_4_3"
-    assert {key: heads["sdf"].metadata[key] for key in ("frame", "version", "note")} == {
+    assert heads["gradient"][0] == "Tree_vec3s_5_4_3"
+    assert {key: heads["sdf"][1][key] for key in ("frame", "version", "note")} == {
         key: grid.header[key] for key in ("frame", "version", "note")
     }
     assert (tmp_path / "a.vdb").read_bytes() == (tmp_path / "b.vdb").read_bytes()
