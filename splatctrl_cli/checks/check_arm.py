@@ -11,7 +11,7 @@ import numpy as np
 
 from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.check_views import rescaled
-from splatctrl_cli.checks.clock_offset import ClockOffset, ImageMotion, estimate_clock_offset, states_asked
+from splatctrl_cli.checks.clock_offset import ImageMotion, estimate_clock_offset, states_asked
 from splatctrl_cli.checks.finding import Finding, note, warning
 from splatctrl_cli.geometry import strided_lens
 from splatctrl_cli.recording.log.state_columns import StateColumns
@@ -43,17 +43,6 @@ class ArmAgreement:
         """Whether the arm is where the joints say."""
         is_there = self.seen_through <= limits.ARM_SEEN_THROUGH and abs(self.median) <= limits.ARM_OFFSET
         return is_there and self.misfit <= limits.ARM_MISFIT
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArmTiming:
-    """A camera's clock against that of the joint states, at which its depth images show the arm best: offset [s], and
-    the misfit [m] with it.
-    """
-
-    camera: str
-    offset_s: float
-    misfit: float
 
 
 def reduced(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
@@ -101,8 +90,10 @@ def arm_agreement(
     )
 
 
-def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> ArmTiming | None:
-    """Of one camera; None where no offset shows the arm much better than another, or the best is at the edge."""
+def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[float, float] | None:
+    """One camera's clock [s] against that of the joint states at which its depth images show the arm best, and the
+    misfit [m] with it; None where no offset shows the arm much better than another, or the best is at the edge.
+    """
 
     def misfit(offset: float) -> float:
         agreement = arm_agreement(model, frames, posture, offset_s=offset)
@@ -123,7 +114,7 @@ def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture)
     before, least, after = costs[low - 1 : low + 2]
     bend = before - 2 * least + after
     shift = float(np.clip(0.5 * fine * (before - after) / bend, -fine, fine)) if bend > 0 else 0.0
-    return ArmTiming(camera=frames[0].camera, offset_s=float(near[low]) + shift, misfit=float(least))
+    return float(near[low]) + shift, float(least)
 
 
 def swapped_joints(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[int, int] | None:
@@ -189,23 +180,28 @@ def motion_findings(
     frames: reduced, a few of each camera; motion: of the first images of each; units: of depth, as of `rescaled`.
     """
     found: list[Finding] = []
-    timings: list[ArmTiming] = []
+    offsets: dict[str, float] = {}
     if model is not None:
-        timings, found = _arm_findings(model, frames, states, units)
-    if timings:
-        return [*_timing_findings(timings), *found]
+        offsets, found = _arm_findings(model, frames, states, units)
+    if offsets:
+        return [*_timing_findings(offsets), *found]
     asked = states.select(states_asked(states.stamp_ns, motion))
     if not motion.cameras:
         return found
-    return [_clock_finding(estimate_clock_offset(list(asked), motion)), *found]
+    offset = estimate_clock_offset(list(asked), motion)
+    if offset.offset_s is None or offset.uncertainty_s is None:
+        return [note("robot-clock", "joint states", offset.sentence), *found]
+    least = limits.TIME_OFFSET + 2 * offset.uncertainty_s
+    return [_clock_finding("joint states", offset.sentence, offset.offset_s, least), *found]
 
 
 def _arm_findings(
     model: RobotModel, frames: Sequence[RgbdFrame], states: StateColumns, units: Iterable[float | None]
-) -> tuple[list[ArmTiming], list[Finding]]:
+) -> tuple[dict[str, float], list[Finding]]:
+    """The offsets [s] of the clocks of cameras that show the arm better with one, and what depth says of the arm."""
     posture = states.postures(limits.ARM_CLOSE_NS)
     found: list[Finding] = []
-    timings: list[ArmTiming] = []
+    timings: dict[str, tuple[float, float]] = {}
     bad: dict[str, ArmAgreement] = {}
     for camera in sorted({frame.camera for frame in frames}):
         its = reduced([frame for frame in frames if frame.camera == camera])
@@ -216,31 +212,31 @@ def _arm_findings(
             continue
         timing = arm_timing(model, its, posture)
         if timing is not None:
-            timings.append(timing)
-            agreement = arm_agreement(model, its, posture, offset_s=timing.offset_s) or agreement
+            timings[camera] = timing
+            agreement = arm_agreement(model, its, posture, offset_s=timing[0]) or agreement
         if agreement.is_good or agreement.scale is not None:
             found.append(arm_finding(where, agreement, units))
         else:
             bad[camera] = agreement
     if bad:
         found.insert(0, misplaced_finding(bad, _swap(model, frames, posture)))
-    return _own_timings(timings, model, frames, posture), found
+    return _own_offsets(timings, model, frames, posture), found
 
 
-def _own_timings(
-    timings: Sequence[ArmTiming], model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture
-) -> list[ArmTiming]:
+def _own_offsets(
+    timings: Mapping[str, tuple[float, float]], model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture
+) -> dict[str, float]:
     """Those of cameras that show the arm much better at their own offset than at that of most: another has other
     causes, as a camera that stands elsewhere.
     """
-    middle = float(np.median([timing.offset_s for timing in timings] or [0.0]))
-    kept = []
-    for timing in timings:
-        its = reduced([frame for frame in frames if frame.camera == timing.camera])
+    middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
+    kept = {}
+    for camera, (offset_s, misfit) in timings.items():
+        its = reduced([frame for frame in frames if frame.camera == camera])
         at_middle = arm_agreement(model, its, posture, offset_s=middle)
-        is_other = abs(timing.offset_s - middle) > limits.TIME_OFFSET + limits.TIME_ERROR
-        if not is_other or at_middle is None or timing.misfit < limits.TIME_OWN * at_middle.misfit:
-            kept.append(timing)
+        is_other = abs(offset_s - middle) > limits.TIME_OFFSET + limits.TIME_ERROR
+        if not is_other or at_middle is None or misfit < limits.TIME_OWN * at_middle.misfit:
+            kept[camera] = offset_s
     return kept
 
 
@@ -252,19 +248,17 @@ def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> s
     return f"exchange {a} and {b}: with their values swapped the arm is where the depth images show it"
 
 
-def _timing_findings(timings: Sequence[ArmTiming]) -> list[Finding]:
+def _timing_findings(offsets: Mapping[str, float]) -> list[Finding]:
     """One finding for all cameras of one clock, and one for each that has another."""
-    middle = float(np.median([timing.offset_s for timing in timings]))
+    middle = float(np.median(list(offsets.values())))
     apart = limits.TIME_OFFSET + limits.TIME_ERROR
-    others = [t for t in timings if abs(t.offset_s - middle) > apart] if len(timings) > 2 else []
-    found = [
-        _offset_finding(f"camera {t.camera}", t.offset_s, f"; those of most cameras {1e3 * middle:+.0f} ms")
-        for t in others
-    ]
-    same = [t for t in timings if t not in others]
-    if len(same) == 2 and abs(same[0].offset_s - same[1].offset_s) > apart:
-        return [*found, *(_offset_finding(f"camera {t.camera}", t.offset_s, "") for t in same)]
-    mean = float(np.mean([t.offset_s for t in same]))
+    others = {c: offset for c, offset in offsets.items() if abs(offset - middle) > apart and len(offsets) > 2}
+    most = f"; those of most cameras {1e3 * middle:+.0f} ms"
+    found = [_offset_finding(f"camera {c}", offset, most) for c, offset in others.items()]
+    same = {c: offset for c, offset in offsets.items() if c not in others}
+    if len(same) == 2 and np.ptp(list(same.values())) > apart:
+        return [*found, *(_offset_finding(f"camera {c}", offset, "") for c, offset in same.items())]
+    mean = float(np.mean(list(same.values())))
     return [*found, _offset_finding("joint states", mean, f" ({len(same)} cameras)")]
 
 
@@ -272,16 +266,13 @@ def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:
     error = limits.TIME_ERROR
     text = f"frames are stamped {1e3 * offset_s:+.0f} ms against the joint states (+-{1e3 * error:.0f} ms, by where"
     text = f"{text} depth shows the arm){rest}"
-    is_off = abs(offset_s) > limits.TIME_OFFSET + error
+    found = _clock_finding(where, text, offset_s, limits.TIME_OFFSET + error)
+    return replace(found, value=round(1e3 * offset_s, 1))
+
+
+def _clock_finding(where: str, text: str, offset_s: float, least_s: float) -> Finding:
+    """A warning where the offset [s] is more than `least_s`, else a note."""
+    is_off = abs(offset_s) > least_s
     make = warning if is_off else note
     remedy = LATE.format("late" if offset_s > 0 else "early") if is_off else ""
-    return make("robot-clock", where, text, remedy, value=round(1e3 * offset_s, 1), unit="ms")
-
-
-def _clock_finding(offset: ClockOffset) -> Finding:
-    if offset.offset_s is None or offset.uncertainty_s is None:
-        return note("robot-clock", "joint states", offset.sentence)
-    is_off = abs(offset.offset_s) > limits.TIME_OFFSET + 2 * offset.uncertainty_s
-    make = warning if is_off else note
-    remedy = LATE.format("late" if offset.offset_s > 0 else "early") if is_off else ""
-    return make("robot-clock", "joint states", offset.sentence, remedy, value=1e3 * offset.offset_s, unit="ms")
+    return make("robot-clock", where, text, remedy, value=1e3 * offset_s, unit="ms")

@@ -1,7 +1,7 @@
 """Whether colour and depth pair, intrinsics fit the images, distortion is known, and tf places every frame."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -16,10 +16,10 @@ from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey,
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics, SourceOptions
 from splatctrl_cli.records import Float64, Intrinsics
 
-_DONE = {
-    ImageLens.DISTORTED: "undistorts",
-    ImageLens.RECTIFIED: "takes P for the rectified",
-    ImageLens.CONTRADICTED: "refuses",
+_DONE: Mapping[ImageLens, str] = {
+    "distorted": "undistorts",
+    "rectified": "takes P for the rectified",
+    "contradicted": "refuses",
 }
 NUM_DISTORTION = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 
@@ -95,10 +95,10 @@ def _distortion(name: str, calibration: Calibration, topic: str, lens: ImageLens
         make = warning if is_read else error
         return [make("distortion", name, text, "calibrate again", value=len(d))]
     done = f"{model} ({', '.join(f'{v:.4g}' for v in d[:5])}): ingest {_DONE[lens]} {topic}"
-    if lens is ImageLens.DISTORTED and topic.endswith("rect_raw"):
+    if lens == "distorted" and topic.endswith("rect_raw"):
         remedy = "give --intrinsics NAME=FX,FY,CX,CY if the images are rectified"
         return [warning("distortion", name, f"{done}, whose name says rectified", remedy)]
-    if lens is ImageLens.CONTRADICTED:
+    if lens == "contradicted":
         remedy = "give --intrinsics NAME=FX,FY,CX,CY if the images are rectified, with D1,D2,... behind it if not"
         return [error("distortion", name, f"{done}, whose name says rectified", remedy)]
     return [note("distortion", name, done)]

@@ -77,13 +77,12 @@ def judged(
     findings = [*found, *alignment_findings(evidence.frames)]
     frames, is_still = usable_frames(evidence.frames, findings), evidence.start_ns is None
     is_sure = not is_still or not (evidence.is_guessed or are_far(frames))
-    views = check_views(frames, evidence.depth_units, is_sure=is_sure, only_errors=only_errors)
-    findings += views.findings
-    findings += () if only_errors else exposure_findings(views.corrected)
+    wrong, scaled, corrected = check_views(frames, evidence.depth_units, is_sure=is_sure, only_errors=only_errors)
+    findings += wrong if only_errors else [*wrong, *exposure_findings(corrected)]
     states = None if only_errors else evidence.states
     if states is not None and not any(finding.code == "joints-degrees" for finding in findings):
         units = evidence.depth_units.values()
-        findings += motion_findings(views.corrected, evidence.motion, states, model, units)
+        findings += motion_findings(corrected, evidence.motion, states, model, units)
     findings += [note("quick", evidence.path.name, evidence.cut)] if evidence.cut else []
     return CheckReport(
         path=str(evidence.path),
@@ -96,7 +95,7 @@ def judged(
         needs=needs(
             num_cameras=evidence.num_cameras, num_frames=evidence.num_frames, states_lack=evidence.states_lack
         ),
-        frames=views.scaled,
+        frames=scaled,
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from itertools import chain
 
 from splatctrl_cli.checks.check_cameras import calibration_findings, camera_findings, tf_findings
 from splatctrl_cli.checks.check_folder import Evidence, judged
@@ -17,7 +18,7 @@ from splatctrl_cli.checks.check_times import (
     time_findings,
 )
 from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, note, warning
-from splatctrl_cli.checks.log_pass import LogWatch, checked_camera, image_motion, ready
+from splatctrl_cli.checks.log_pass import LogWatch, image_motion, ready, reduced_frames
 from splatctrl_cli.recording.calibrated import correction_of
 from splatctrl_cli.recording.container.raw_log import RawLog
 from splatctrl_cli.recording.log.cameras import image_topics
@@ -67,10 +68,11 @@ def check_log(
     findings += [error("missing", log.path.name, *_parted(lack)) for lack in _lacks(log, found, options)]
     correction = correction_of(options, log.path.name)
     late_ns = {c.name: correction.late_ns(c.name) for _, c in rig if correction is not None and c is not None}
-    checked = [checked_camera(t, c, watch.images, found.tf, options, late_ns) for t, c in rig if c is not None]
+    whole = [(topics, camera) for topics, camera in rig if camera is not None]
+    frames = {c.name: reduced_frames(t, c, watch.images, found.tf, options, late_ns) for t, c in whole}
     of_states = log_states(found, options, model)
     if correction is not None:
-        checked = [replace(c, frames=tuple(map(correction.frame, c.frames))) for c in checked]
+        frames = {name: list(map(correction.frame, its)) for name, its in frames.items()}
         if of_states.states is not None:
             of_states = replace(of_states, states=correction.states(of_states.states))
     first, last = _span(found)
@@ -86,9 +88,9 @@ def check_log(
             t.rate(is_read=found.topics[name].topic.type_name in (*IMAGES, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS))
             for name, t in sorted(watch.times.items())
         ],
-        frames=[frame for camera in checked for frame in camera.frames],
-        depth_units={c.camera.name: watch.images[c.topics.depth].unit for c in checked if c.frames},
-        motion=image_motion(watch, checked),
+        frames=list(chain.from_iterable(frames.values())),
+        depth_units={c.name: watch.images[t.depth].unit for t, c in whole if frames[c.name]},
+        motion=image_motion(watch, whole, frames),
         states=of_states.states,
         states_lack=of_states.lack,
         cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",

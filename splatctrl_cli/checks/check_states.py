@@ -3,7 +3,7 @@ end-effector poses against its kinematics."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
+from typing import Literal
 
 import numpy as np
 
@@ -25,14 +25,7 @@ TURN = 2 * np.pi
 DEGREES = 3.0 * TURN  # that no joint of an arm turns to, in radians
 
 
-class PoseVerdict(StrEnum):
-    """What logged end-effector poses say about the robot model."""
-
-    AGREE = "agree"
-    TOOL = "tool"
-    BASE = "base"
-    DISAGREE = "disagree"
-    STILL = "still"
+PoseVerdict = Literal["agree", "tool", "base", "disagree", "still"]  # of logged end-effector poses on a robot model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,13 +72,13 @@ class PoseAgreement:
         start = f"{self.num_poses} logged end-effector poses"
         x, y, z = self.offset[:3, 3]
         by = f"({x:.4f}, {y:.4f}, {z:.4f}) m and {np.degrees(_angle(self.offset[:3, :3])):.1f} deg"
-        if self.verdict is PoseVerdict.AGREE:
+        if self.verdict == "agree":
             return f"{start} agree with {self.link}: {self.difference.words}"
-        if self.verdict is PoseVerdict.TOOL:
+        if self.verdict == "tool":
             return f"{start} stand at {by} in {self.link}: a flange or tool transform; beside it {self.rest.words}"
-        if self.verdict is PoseVerdict.BASE:
+        if self.verdict == "base":
             return f"{start} are moved by {by} in the world: is --base right? beside it {self.rest.words}"
-        if self.verdict is PoseVerdict.STILL:
+        if self.verdict == "still":
             return f"{start} cannot be judged: the robot hardly moves"
         return (
             f"{start} do not fit this robot, with any tool: {self.rest.words} from {self.link}; "
@@ -177,21 +170,21 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
     near = min(links, key=lambda link: _cost(_spread(links[link], logged)))
     difference = _spread(links[near], logged)
     if difference.is_small:
-        return _agreement(PoseVerdict.AGREE, near, len(chosen), difference, np.eye(4), difference)
+        return _agreement("agree", near, len(chosen), difference, np.eye(4), difference)
     tools = {link: _explained(poses, logged) for link, poses in links.items()}
     bases = {link: _explained(_inverse(poses), _inverse(logged)) for link, poses in links.items()}
     tool = min(tools, key=lambda link: (round(_cost(tools[link][1]), 6), _cost(_spread(links[link], logged))))
     base = min(bases, key=lambda link: _cost(bases[link][1]))
     travel = _spread(np.broadcast_to(logged[0], logged.shape), logged)
     if max(travel.max_position, travel.max_rotation) < limits.LINK_TRAVEL:
-        return _agreement(PoseVerdict.STILL, near, len(chosen), difference, np.eye(4), difference)
+        return _agreement("still", near, len(chosen), difference, np.eye(4), difference)
     if tools[tool][1].is_small:
-        return _agreement(PoseVerdict.TOOL, tool, len(chosen), _spread(links[tool], logged), *tools[tool])
+        return _agreement("tool", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
     if bases[base][1].is_small:
         offset, rest = bases[base]
         moved = invert_transform(offset)
-        return _agreement(PoseVerdict.BASE, base, len(chosen), _spread(links[base], logged), moved, rest)
-    return _agreement(PoseVerdict.DISAGREE, tool, len(chosen), _spread(links[tool], logged), *tools[tool])
+        return _agreement("base", base, len(chosen), _spread(links[base], logged), moved, rest)
+    return _agreement("disagree", tool, len(chosen), _spread(links[tool], logged), *tools[tool])
 
 
 def _positions(states: Sequence[JointState]) -> Iterator[Float64]:
@@ -363,8 +356,8 @@ def robot_findings(model: RobotModel, states: Sequence[JointState], where: str) 
         return [error("joints-degrees", where, wrong.message, wrong.remedy)]
     found = _limits(model, states, where)
     agreement = pose_agreement(model, states)
-    if agreement is not None and agreement.verdict is not PoseVerdict.STILL:
-        is_good = agreement.verdict in {PoseVerdict.AGREE, PoseVerdict.TOOL}
+    if agreement is not None and agreement.verdict != "still":
+        is_good = agreement.verdict in {"agree", "tool"}
         value = 1e3 * agreement.difference.median_position
         make = note if is_good else error
         remedy = "" if is_good else "give the URDF of this very robot, and its --base"

@@ -48,24 +48,15 @@ class Move:
     after: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewsCheck:
-    """What is wrong with depth scales and poses; the frames with the scale that fits, and with the poses, too."""
-
-    findings: list[Finding]
-    scaled: list[RgbdFrame]
-    corrected: list[RgbdFrame]
-
-
 def check_views(
     frames: Sequence[RgbdFrame],
     used: Mapping[str, float | None],
     *,
     is_sure: bool = True,
     only_errors: bool = False,
-) -> ViewsCheck:
+) -> tuple[list[Finding], list[RgbdFrame], list[RgbdFrame]]:
     """Compare views from different places, of one moment or a still scene; `only_errors` skips wrong poses, which are
-    warnings.
+    warnings. Returns what is wrong, the frames with the scale that fits, and with the poses that fit, too.
 
     used: metres per count of each camera's depth, None where it is stored as floats. is_sure: False where something
     speaks for another unit: then views must meet.
@@ -73,7 +64,7 @@ def check_views(
     views = [_view(frame) for frame in _chosen(frames)]
     pairs = _pairs(views)
     if not pairs:
-        return ViewsCheck(findings=[], scaled=list(frames), corrected=list(frames))
+        return [], list(frames), list(frames)
     scales = wrong_scales(views, pairs)
     moves = wrong_poses(views, pairs) if scales or not only_errors else []
     scaled = _scaled(frames, scales)
@@ -87,7 +78,7 @@ def check_views(
     findings += [_pose_finding(move, sorted(used)) for move in moves]
     by_camera = {move.camera: move.T_camera_corrected for move in moves}
     corrected = [replace(f, T_world_camera=f.T_world_camera @ by_camera.get(f.camera, np.eye(4))) for f in scaled]
-    return ViewsCheck(findings=findings, scaled=scaled, corrected=corrected)
+    return findings, scaled, corrected
 
 
 def are_far(frames: Sequence[RgbdFrame]) -> bool:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -142,17 +142,6 @@ class LogWatch:
             self.transforms[child].add(stamp, message.log_time_ns)
 
 
-@dataclass(frozen=True, kw_only=True)
-class CheckedCamera:
-    """A camera that is ready to be read, and reduced frames of it, spread over the log; color is black where none was
-    kept at the time of the depth.
-    """
-
-    topics: CameraTopics
-    camera: Camera
-    frames: tuple[RgbdFrame, ...]
-
-
 def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
     """The camera as `ingest` makes it ready; None where it lacks something (rig.missing says what)."""
     try:
@@ -161,16 +150,17 @@ def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptio
         return None
 
 
-def checked_camera(
+def reduced_frames(
     topics: CameraTopics,
     camera: Camera,
     images: Mapping[str, ImageWatch],
     tf: TfTree,
     options: SourceOptions,
     late_ns: Mapping[str, int],
-) -> CheckedCamera:
-    """With the frames whose depth was kept and whose pose is known. late_ns: how late frames are stamped against
-    transforms, by camera, 0 where nothing is said of it.
+) -> list[RgbdFrame]:
+    """Reduced frames of a camera, spread over the log: those whose depth was kept and whose pose is known; color is
+    black where none was kept at the time of the depth. late_ns: how late frames are stamped against transforms, by
+    camera, 0 where nothing is said of it.
     """
     depths, colors = images.get(topics.depth), images.get(topics.color)
     kept_colors = {kept.stamp_ns: kept for kept in (colors.kept if colors is not None else ())}
@@ -183,7 +173,7 @@ def checked_camera(
         T = camera.pose_at(tf, stamp_ns - late_ns.get(camera.name, 0), round(options.pose_tolerance_s * 1e9))
         if T is not None:
             frames.append(_frame(camera, kept, color, stamp_ns, T))
-    return CheckedCamera(topics=topics, camera=camera, frames=tuple(frames))
+    return frames
 
 
 def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Float64) -> RgbdFrame:
@@ -235,24 +225,26 @@ def nearest(stamps: Sequence[int], stamp_ns: int) -> int | None:
     return min(stamps[max(0, after - 1) : after + 1], key=lambda stamp: abs(stamp - stamp_ns))
 
 
-def image_motion(watch: LogWatch, cameras: Sequence[CheckedCamera]) -> ImageMotion:
-    """How the first images of each camera change."""
+def image_motion(
+    watch: LogWatch, cameras: Sequence[tuple[CameraTopics, Camera]], frames: Mapping[str, Sequence[RgbdFrame]]
+) -> ImageMotion:
+    """How the first images of each camera change; frames: `reduced_frames` by camera."""
     motion = ImageMotion()
-    for checked in cameras:
-        if checked.frames and checked.topics.color in watch.images:
-            for frame in _thumbnails(watch, checked.camera, checked):
+    for topics, camera in cameras:
+        if frames[camera.name] and topics.color in watch.images:
+            for frame in _thumbnails(watch, topics, camera, frames[camera.name]):
                 motion.add(frame)
     return motion
 
 
-def _thumbnails(watch: LogWatch, camera: Camera, checked: CheckedCamera) -> list[RgbdFrame]:
+def _thumbnails(watch: LogWatch, topics: CameraTopics, camera: Camera, posed: Sequence[RgbdFrame]) -> list[RgbdFrame]:
     """Colour beside depth only where both are of one view."""
-    colors = watch.images[checked.topics.color].thumbnails if camera.depth_to_color is None else []
+    colors = watch.images[topics.color].thumbnails if camera.depth_to_color is None else []
     gray = {thumbnail.stamp_ns: thumbnail.color for thumbnail in colors}
     at, frames = sorted(gray), []
-    poses = {frame.stamp_ns: frame.T_world_camera for frame in checked.frames}
+    poses = {frame.stamp_ns: frame.T_world_camera for frame in posed}
     stamps = sorted(poses)
-    for thumbnail in watch.images[checked.topics.depth].thumbnails:
+    for thumbnail in watch.images[topics.depth].thumbnails:
         near, depth = nearest(at, thumbnail.stamp_ns), thumbnail.depth
         assert depth is not None
         color = gray.get(near) if near is not None else None

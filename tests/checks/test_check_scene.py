@@ -14,7 +14,7 @@ from splatctrl_cli.checks.check_folder import exposure_findings, usable_frames
 from splatctrl_cli.checks.check_images import alignment_findings
 from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.checks.check_states import log_states
-from splatctrl_cli.checks.check_views import ViewsCheck, check_views
+from splatctrl_cli.checks.check_views import check_views
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import Finding, Severity
 from splatctrl_cli.geometry import pose_at
@@ -36,7 +36,7 @@ class Table:
     states: StateColumns
     model: RobotModel
 
-    def views(self, frames: Sequence[RgbdFrame]) -> ViewsCheck:
+    def views(self, frames: Sequence[RgbdFrame]) -> tuple[list[Finding], list[RgbdFrame], list[RgbdFrame]]:
         return check_views(frames, dict.fromkeys(sorted({frame.camera for frame in frames}), 1e-3))
 
     def motion(self, frames: Sequence[RgbdFrame], states: StateColumns) -> list[Finding]:
@@ -76,17 +76,16 @@ def moved(frames: Sequence[RgbdFrame], camera: str, position: tuple[float, ...],
 
 @pytest.mark.parametrize(("factor", "remedy"), [(10.0, "0.0001"), (0.8, "0.00125")])
 def test_depths_of_another_scale_are_named_with_the_right_one(table: Table, factor: float, remedy: str) -> None:
-    check = table.views([replace(f, depth=f.depth * np.float32(factor)) for f in table.frames])
-    (finding,) = check.findings
+    (finding,), scaled, _ = table.views([replace(f, depth=f.depth * np.float32(factor)) for f in table.frames])
     assert (finding.code, finding.severity) == ("views-scale", Severity.ERROR)
     assert finding.value == pytest.approx(1 / factor, rel=0.011)
     assert finding.remedy.startswith(f"give --depth-scale {remedy}")
-    assert np.median(check.scaled[0].depth) == pytest.approx(np.median(table.frames[0].depth), rel=0.011)
+    assert np.median(scaled[0].depth) == pytest.approx(np.median(table.frames[0].depth), rel=0.011)
 
 
 def test_one_camera_of_another_scale_is_named(table: Table) -> None:
     frames = [replace(f, depth=f.depth * np.float32(1.25)) if f.camera == "cam1" else f for f in table.frames]
-    (finding,) = table.views(frames).findings
+    (finding,) = table.views(frames)[0]
     assert (finding.code, finding.where) == ("views-scale", "camera cam1")
     assert finding.value == pytest.approx(0.8, rel=0.011)
 
@@ -95,13 +94,12 @@ def test_one_camera_of_another_scale_is_named(table: Table) -> None:
 def test_a_camera_that_stands_elsewhere_is_named_with_its_move(
     table: Table, position: tuple[float, ...], degrees: float
 ) -> None:
-    check = table.views(moved(table.frames, "cam1", position, degrees))
-    (finding,) = check.findings
+    (finding,), _, frames = table.views(moved(table.frames, "cam1", position, degrees))
     assert (finding.code, finding.where, finding.severity) == ("views-pose", "camera cam1", Severity.WARNING)
     assert finding.value == pytest.approx(1e3 * position[0], abs=5)
     assert abs(float(finding.what.split(" mm and ")[1].split(" deg")[0]) - degrees) < 0.3
     original = next(f for f in table.frames if f.camera == "cam1").T_world_camera
-    corrected = next(f for f in check.corrected if f.camera == "cam1").T_world_camera
+    corrected = next(f for f in frames if f.camera == "cam1").T_world_camera
     assert np.abs(corrected - original)[:3, 3].max() < 0.005
 
 
@@ -149,7 +147,7 @@ def test_a_flat_wall_says_nothing_of_its_scale(table: Table) -> None:
         T = pose_at([0.3 * index, 0.0, 0.0])
         frame = table.frames[index]
         walls.append(replace(frame, depth=np.full_like(frame.depth, 1.2), T_world_camera=T, camera=f"cam{index % 2}"))
-    assert table.views(walls).findings == []
+    assert table.views(walls)[0] == []
 
 
 def test_depth_that_is_not_registered_is_named_with_its_shift(table: Table) -> None:

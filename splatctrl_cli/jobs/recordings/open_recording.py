@@ -191,8 +191,8 @@ class CameraAgreement:
         cameras = sorted({frame.camera for frame in step.frames})
         if self._guess:
             console.log(f"warning: {self._name}: {self._guess}; the map is in metres")
-        found = check_views(step.frames, dict.fromkeys(cameras), is_sure=not self._guess and not are_far(step.frames))
-        for finding in found.findings:
+        is_sure = not self._guess and not are_far(step.frames)
+        for finding in check_views(step.frames, dict.fromkeys(cameras), is_sure=is_sure)[0]:
             if finding.code == "views-scale" and not self._is_allowed:
                 raise InputError(
                     f"{self._name}: {finding.what}",

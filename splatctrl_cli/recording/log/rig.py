@@ -4,8 +4,8 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -158,13 +158,7 @@ def _rectified(calibration: Calibration) -> Calibration:
     return pinhole
 
 
-class ImageLens(StrEnum):
-    """What images are like by their CameraInfo and the name of their topic."""
-
-    PINHOLE = "pinhole"
-    DISTORTED = "distorted"
-    RECTIFIED = "rectified"
-    CONTRADICTED = "contradicted"
+ImageLens = Literal["pinhole", "distorted", "rectified", "contradicted"]  # by CameraInfo and the topic's name
 
 
 def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> ImageLens:
@@ -176,14 +170,14 @@ def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> Im
     """
     says_rectified = not _RECTIFIED.isdisjoint(re.split("[/_]", image_topic.lower()))
     if not is_distorted(calibration.distortion_model, calibration.distortion):
-        return ImageLens.RECTIFIED if says_rectified else ImageLens.PINHOLE
+        return "rectified" if says_rectified else "pinhole"
     if not says_rectified or image_topic.endswith("rect_raw"):
-        return ImageLens.DISTORTED
+        return "distorted"
     folder, P = image_topic.rpartition("/")[0], calibration.projection
     has_raw = any(t.topic.name.startswith(f"{folder}/image_raw") for t in survey.of_type(IMAGE, COMPRESSED_IMAGE))
     is_depth = any(t.topic.name == image_topic for t in image_topics(survey, "depth"))
     is_own = P[0, 0] > 0 and not np.allclose(P, calibration.K, rtol=1e-3)
-    return ImageLens.RECTIFIED if has_raw or is_depth or is_own else ImageLens.CONTRADICTED
+    return "rectified" if has_raw or is_depth or is_own else "contradicted"
 
 
 class _Builder:
@@ -287,9 +281,9 @@ class _Builder:
             )
         sized = replace(calibration, width=size[0], height=size[1])
         lens = image_lens(self._survey, image_topic, sized)
-        if lens is ImageLens.CONTRADICTED:
+        if lens == "contradicted":
             raise self._contradicted(sized, info, image_topic)
-        return _rectified(sized) if lens is ImageLens.RECTIFIED else sized
+        return _rectified(sized) if lens == "rectified" else sized
 
     def _contradicted(self, calibration: Calibration, info: str, image_topic: str) -> InputError:
         k = intrinsics_of(calibration)
