@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -197,14 +197,6 @@ class HandEye:
     distance: float
 
 
-@dataclass(kw_only=True)
-class _Placed:
-    """T_world_camera (4, 4) of cameras by their corrections; T_world_board where the board stands still."""
-
-    corrections: dict[str, Float64] = field(default_factory=dict)
-    T_world_board: Float64 | None = None
-
-
 def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[str, Float64]:
     """T_recorded_camera (4, 4) by camera.
 
@@ -214,7 +206,8 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
     """
     by_camera = {camera: [s for s in sightings if s.camera == camera] for camera in rig.recorded}
     _check_seen(board, by_camera)
-    placed = _Placed(corrections={camera: np.eye(4) for camera in rig.held})
+    placed = {camera: np.eye(4) for camera in rig.held}
+    T_world_board: Float64 | None = None
     stands = _board_stands(by_camera, rig)
     reasons: list[str] = []
     for camera in [camera for camera in rig.recorded if camera not in rig.held]:
@@ -222,32 +215,32 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
             if camera in rig.moving and stands:
                 found = hand_eye([(rig.recorded[camera][s.stamp_ns], s.T_camera_board) for s in by_camera[camera]])
                 _check_fit(found, f"{camera}, which moves,")
-                placed.corrections[camera], placed.T_world_board = found.X, found.stays
+                placed[camera], T_world_board = found.X, found.stays
             elif camera not in rig.moving and not stands and rig.arm is not None and not rig.held:
                 found = _carried(rig.arm, by_camera[camera])
-                placed.corrections[camera] = invert_transform(_recorded(rig, by_camera[camera][0])) @ found.X
+                placed[camera] = invert_transform(_recorded(rig, by_camera[camera][0])) @ found.X
         except NotEvaluableError as error:
             reasons.append(error.message.removeprefix("calibrate: "))
-    if not placed.corrections:
+    if not placed:
         raise NotEvaluableError(
             "calibrate: the board is tied to no robot: "
             + ("; ".join(dict.fromkeys(reasons)) or "it stands still, and no camera that moves sees it"),
             remedy="let the gripper hold the board, or a camera on the wrist see it stand still, from ten sides; or"
             " leave --urdf out",
         )
-    while missing := [camera for camera in rig.recorded if camera not in placed.corrections]:
-        votes = {camera: _votes(camera, by_camera, placed, rig, stands=stands) for camera in missing}
+    while missing := [camera for camera in rig.recorded if camera not in placed]:
+        votes = {camera: _votes(camera, by_camera, placed, T_world_board, rig, stands) for camera in missing}
         best = max(missing, key=lambda camera: len(votes[camera]))
         if len(votes[best]) < fixed.CALIBRATION_BOARD_FEWEST:
-            groups = f"{', '.join(sorted(placed.corrections))} | {', '.join(missing)}"
+            groups = f"{', '.join(sorted(placed))} | {', '.join(missing)}"
             raise NotEvaluableError(
                 f"calibrate: cameras that the board does not tie together: {groups}: they never see it at the same"
                 f" moment (expected {fixed.CALIBRATION_BOARD_FEWEST} times)",
                 remedy=SHOW,
             )
         recorded = _recorded(rig, by_camera[best][0])
-        placed.corrections[best] = invert_transform(recorded) @ middle_pose(votes[best])
-    return placed.corrections
+        placed[best] = invert_transform(recorded) @ middle_pose(votes[best])
+    return placed
 
 
 def _check_seen(board: Board, by_camera: Mapping[str, Sequence[Sighting]]) -> None:
@@ -362,19 +355,27 @@ def _hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> Float64:
 
 
 def _votes(
-    camera: str, by_camera: Mapping[str, Sequence[Sighting]], placed: _Placed, rig: Rig, *, stands: bool
+    camera: str,
+    by_camera: Mapping[str, Sequence[Sighting]],
+    placed: Mapping[str, Float64],
+    T_world_board: Float64 | None,
+    rig: Rig,
+    stands: bool,
 ) -> list[Float64]:
-    """T_world_camera (4, 4) of a camera that stands still, by each sighting that a placed camera has, too."""
+    """T_world_camera (4, 4) of a camera that stands still, by each sighting that a placed camera has, too.
+
+    placed: T_recorded_camera by camera; T_world_board: where a board that stands still is known to be.
+    """
     votes = []
     if camera in rig.moving:
         return []
     for own in by_camera[camera]:
-        if stands and placed.T_world_board is not None:
-            votes.append(placed.T_world_board @ invert_transform(own.T_camera_board))
+        if T_world_board is not None:
+            votes.append(T_world_board @ invert_transform(own.T_camera_board))
             continue
-        for other in (s for name in placed.corrections for s in by_camera[name]):
+        for other in (s for name in placed for s in by_camera[name]):
             if stands or abs(other.stamp_ns - own.stamp_ns) <= fixed.CALIBRATION_BOARD_TOGETHER_NS:
-                T_world_other = _recorded(rig, other) @ placed.corrections[other.camera]
+                T_world_other = _recorded(rig, other) @ placed[other.camera]
                 votes.append(T_world_other @ other.T_camera_board @ invert_transform(own.T_camera_board))
     return votes
 
