@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import DistanceGrid, Float64
@@ -39,17 +38,11 @@ class Cut:
     coordinates: tuple[Float64, Float64]
     voxel: float
 
-    def of(self, grid: DistanceGrid, channel: str) -> NDArray[np.generic]:
+    def of(self, grid: DistanceGrid, channel: str) -> Float64:
         """The channel in the plane as a picture has it: rows upwards along the later axis."""
         where: list[Any] = [slice(None, None, self.step)] * 3
         where[self.axis] = self.index
-        return np.asarray(np.swapaxes(grid.channels[channel][tuple(where)], 0, 1))
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """Of the axis to the right and the axis upwards."""
-        first, second = (name for axis, name in enumerate("xyz") if axis != self.axis)
-        return first, second
+        return np.asarray(np.swapaxes(grid.channels[channel][tuple(where)], 0, 1), np.float64)
 
 
 def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
@@ -59,7 +52,7 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
     """
     with _panels(grid, point) as (figure, panels):
         for axes, cut in panels:
-            distance = _floats(cut, grid, "sdf")
+            distance = cut.of(grid, "sdf")
             image = draw_distance(axes, cut.coordinates, distance, cut.voxel, names_lines=False)
             if _knows_seen(grid):
                 never_seen = cut.of(grid, "observed") == VoxelState.NEVER_SEEN
@@ -77,7 +70,7 @@ def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) 
     with _panels(grid, point) as (figure, panels):
         for axes, cut in panels:
             image = axes.imshow(
-                _floats(cut, grid, "probability"),
+                cut.of(grid, "probability"),
                 origin="lower",
                 extent=extent_of(cut.coordinates, cut.voxel),
                 cmap="cividis",
@@ -104,7 +97,7 @@ def gradient_picture(
     height = float(np.clip(0.5 * (WIDTH - 2.5) * sides[1] / sides[0] + 1.2, 4.0, 8.0))
     with drawn_figure(height) as figure:
         left, right = figure.subplots(1, 2)
-        length = np.linalg.norm(_floats(cut, grid, "gradient"), axis=2)
+        length = np.linalg.norm(cut.of(grid, "gradient"), axis=2)
         image = left.imshow(
             length,
             origin="lower",
@@ -174,12 +167,8 @@ def _cuts(grid: DistanceGrid, point: Sequence[float], *, axes: Sequence[int]) ->
     return cuts
 
 
-def _floats(cut: Cut, grid: DistanceGrid, channel: str) -> Float64:
-    return cut.of(grid, channel).astype(np.float64)
-
-
 def _label(axes: Any, cut: Cut) -> None:
-    right, up = cut.names
+    right, up = (name for name in "xyz" if name != "xyz"[cut.axis])
     axes.set(xlabel=f"{right} [m]", ylabel=f"{up} [m]", aspect="equal")
     axes.set_title(f"{'xyz'[cut.axis]} = {round(cut.plane, 2) + 0.0:.2f} m", pad=8)
 
@@ -191,7 +180,7 @@ def _knows_seen(grid: DistanceGrid) -> bool:
 
 def _surface(axes: Any, cut: Cut, grid: DistanceGrid, color: str) -> None:
     """The line where sdf is 0."""
-    sdf = _floats(cut, grid, "sdf")
+    sdf = cut.of(grid, "sdf")
     known = sdf[np.isfinite(sdf)]
     if known.size and known.min() < 0 < known.max() and min(sdf.shape) > 1:
         axes.contour(*cut.coordinates, sdf, levels=[0.0], colors=color, linewidths=1.5)

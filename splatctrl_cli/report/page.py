@@ -39,14 +39,6 @@ class Surface:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SplatsAt:
-    """The splats that were known from `time_s` [s] of the motion on."""
-
-    time_s: float
-    splats: SplatSet
-
-
-@dataclass(frozen=True, kw_only=True)
 class Motion:
     """An arm over T states: seconds (T,) since the first; the bodies (L) of its links by name, each in its link's
     frame; poses (T, L, 4, 4), world; path (T, 3) [m], world, of the end effector; clearance (T,) [m], NaN where it
@@ -77,20 +69,19 @@ class Deciding:
 class Space:
     """What a three-dimensional page shows, in the world frame [m].
 
-    splats: by time, the first from the start on. unknown: centres (K, 3) of cubes of edge `voxel` never seen.
-    surface: where a baked distance is 0.
+    splats: by the time of the motion [s] from which they were known, the first from the start on. unknown: centres
+    (K, 3) of cubes never seen, and their edge. surface: where a baked distance is 0.
     """
 
-    splats: Sequence[SplatsAt] = ()
-    unknown: Float32 | None = None
-    voxel: float = 0.0
+    splats: Mapping[float, SplatSet] = field(default_factory=dict)
+    unknown: tuple[Float32, float] | None = None
     surface: Surface | None = None
     motion: Motion | None = None
     deciding: Deciding | None = None
 
     def box(self) -> tuple[Float64, Float64]:
         """The lower and upper corner (3,) of what there is to see: nine tenths of the splats, path and surface."""
-        parts = [np.asarray(at.splats.centers, np.float64) for at in self.splats]
+        parts = [np.asarray(splats.centers, np.float64) for splats in self.splats.values()]
         if self.motion is not None:
             parts += [self.motion.path, self.motion.poses[:, :, :3, 3].reshape(-1, 3)]
         if self.surface is not None:
@@ -179,15 +170,18 @@ def three_js() -> str:
 
 def packed(space: Space) -> str:
     """A scene as the viewer reads it, JSON."""
-    block = _Block()
+    block = bytearray()
     lower, upper = space.box()
     header: dict[str, Any] = {
         "middle": ((lower + upper) / 2).tolist(),
         "size": max(float(np.linalg.norm(upper - lower)), 0.2),
-        "splats": [_splats(block, at, without_robot=space.motion is not None) for at in space.splats],
+        "splats": [
+            _splats(block, time_s, splats, without_robot=space.motion is not None)
+            for time_s, splats in space.splats.items()
+        ],
     }
-    if space.unknown is not None and len(space.unknown):
-        header["unknown"] = {"points": block.points(space.unknown), "edge": space.voxel}
+    if space.unknown is not None and len(space.unknown[0]):
+        header["unknown"] = {"points": _points(block, space.unknown[0]), "edge": space.unknown[1]}
     if space.surface is not None:
         header["surface"] = _mesh(block, space.surface.vertices, space.surface.faces)
     if space.motion is not None:
@@ -201,70 +195,62 @@ def packed(space: Space) -> str:
         if deciding.sphere is not None:
             center, radius = deciding.sphere
             header["deciding"] |= {"center": np.asarray(center).tolist(), "radius": radius}
-    return json.dumps({"header": header, "bytes": _deflated(block.bytes())}, allow_nan=False)
+    return json.dumps({"header": header, "bytes": _deflated(block)}, allow_nan=False)
 
 
-class _Block:
-    """Arrays one after the other, each at a multiple of four bytes."""
+def _add(block: bytearray, values: ArrayLike, kind: type[np.generic]) -> list[Any]:
+    """[type, first byte, count] of the values, column by column: a column deflates better than a row.
 
-    def __init__(self) -> None:
-        self._parts: list[bytes] = []
-        self._size = 0
-
-    def add(self, values: ArrayLike, kind: type[np.generic]) -> list[Any]:
-        """[type, first byte, count] of the values, column by column: a column deflates better than a row."""
-        array = np.asarray(values, kind)
-        data = np.ascontiguousarray(array.T).tobytes()
-        start = self._size
-        self._parts.append(data + bytes(-len(data) % 4))
-        self._size += len(self._parts[-1])
-        return [np.dtype(kind).name, start, array.size]
-
-    def points(self, points: NDArray[np.floating]) -> dict[str, Any]:
-        """Points (K, 3) within their box, by column."""
-        values = np.asarray(points, np.float64).reshape(-1, 3)
-        lower, upper = (values.min(axis=0), values.max(axis=0)) if len(values) else (np.zeros(3), np.zeros(3))
-        step = np.where(upper > lower, (upper - lower) / STEPS, 1.0)
-        whole = np.rint((values - lower) / step)
-        return {"array": self.add(whole, np.uint16), "lower": lower.tolist(), "step": step.tolist()}
-
-    def bytes(self) -> bytes:
-        return b"".join(self._parts)
+    They go to the end of the block, each array to a multiple of four bytes.
+    """
+    array, start = np.asarray(values, kind), len(block)
+    block += np.ascontiguousarray(array.T).tobytes()
+    block += bytes(-len(block) % 4)
+    return [np.dtype(kind).name, start, array.size]
 
 
-def _splats(block: _Block, at: SplatsAt, *, without_robot: bool) -> dict[str, Any]:
-    chosen = at.splats.select(at.splats.labels != Label.ROBOT) if without_robot else at.splats
+def _points(block: bytearray, points: NDArray[np.floating]) -> dict[str, Any]:
+    """Points (K, 3) within their box, by column."""
+    values = np.asarray(points, np.float64).reshape(-1, 3)
+    lower, upper = (values.min(axis=0), values.max(axis=0)) if len(values) else (np.zeros(3), np.zeros(3))
+    step = np.where(upper > lower, (upper - lower) / STEPS, 1.0)
+    whole = np.rint((values - lower) / step)
+    return {"array": _add(block, whole, np.uint16), "lower": lower.tolist(), "step": step.tolist()}
+
+
+def _splats(block: bytearray, time_s: float, splats: SplatSet, *, without_robot: bool) -> dict[str, Any]:
+    chosen = splats.select(splats.labels != Label.ROBOT) if without_robot else splats
     largest = float(chosen.radii.max(initial=1e-6))
     colors = np.column_stack([np.clip(chosen.colors, 0.0, 1.0), np.clip(chosen.opacities, 0.0, 1.0)])
     return {
-        "time": at.time_s,
-        "centers": block.points(chosen.centers),
-        "radii": block.add(np.rint(chosen.radii / largest * STEPS), np.uint16),
+        "time": time_s,
+        "centers": _points(block, chosen.centers),
+        "radii": _add(block, np.rint(chosen.radii / largest * STEPS), np.uint16),
         "largest": largest,
-        "colors": block.add(np.rint(255 * colors), np.uint8),
-        "labels": block.add(chosen.labels, np.uint8),
+        "colors": _add(block, np.rint(255 * colors), np.uint8),
+        "labels": _add(block, chosen.labels, np.uint8),
     }
 
 
-def _motion(block: _Block, motion: Motion) -> dict[str, Any]:
+def _motion(block: bytearray, motion: Motion) -> dict[str, Any]:
     states, links = motion.poses.shape[:2]
     quats = Rotation.from_matrix(motion.poses[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(states, links * 4)
     return {
-        "seconds": block.add(motion.seconds, np.float32),
+        "seconds": _add(block, motion.seconds, np.float32),
         "clearance": [float(value) if np.isfinite(value) else None for value in motion.clearance.round(6)],
         "margin": motion.margin,
         "links": [_mesh(block, body.vertices, body.faces) for body in motion.bodies.values()],
-        "quats": block.add(np.rint(32767 * quats), np.int16),
-        "places": block.points(motion.poses[:, :, :3, 3]),
-        "path": block.points(motion.path),
+        "quats": _add(block, np.rint(32767 * quats), np.int16),
+        "places": _points(block, motion.poses[:, :, :3, 3]),
+        "path": _points(block, motion.path),
     }
 
 
-def _mesh(block: _Block, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> dict[str, Any]:
-    return {"vertices": block.points(vertices), "faces": block.add(faces, np.uint32)}
+def _mesh(block: bytearray, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> dict[str, Any]:
+    return {"vertices": _points(block, vertices), "faces": _add(block, faces, np.uint32)}
 
 
-def _deflated(data: bytes) -> str:
+def _deflated(data: bytes | bytearray) -> str:
     return base64.b64encode(zlib.compress(data)).decode("ascii")
 
 
@@ -281,12 +267,8 @@ class Cell:
     link: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """Values or `Cell`s of a table, marked where the state is a bad one."""
-
-    cells: Sequence[object]
-    state: str = ""
+Row = tuple[Sequence[object], str]
+"""Values or `Cell`s of a table, and a state: the row is marked where that is a bad one."""
 
 
 @dataclass(frozen=True, kw_only=True)

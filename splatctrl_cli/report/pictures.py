@@ -143,15 +143,20 @@ def _draw_comparison(figure: "mpl.figure.Figure", axes: Sequence[Any], row: Comp
     photo, render, error, bar = axes
     photo.imshow(row.photo, interpolation="nearest")
     render.imshow(np.clip(row.render, 0.0, 1.0), interpolation="nearest")
-    both = (row.photo_depth > 0) & (row.render_depth > 0)
-    centimetres = np.where(both, 100.0 * np.abs(row.render_depth - row.photo_depth), np.nan)
-    error.set_facecolor("#d9d9d9")
-    image = error.imshow(centimetres, cmap="cividis", vmin=0.0, vmax=100.0 * MAX_DEPTH_ERROR, interpolation="nearest")
+    image, median = _draw_depth_error(error, row)
     figure.colorbar(image, cax=bar, extend="max", label="cm")
-    median = f"median {np.nanmedian(centimetres):.2f} cm" if both.any() else "no pixel has both depths"
     titles = (f"photo   {row.title}", f"render   {row.figures}", f"depth error [cm]   {median}, grey: no depth")
     for panel, text in zip((photo, render, error), titles, strict=True):
         _finish(panel, text)
+
+
+def _draw_depth_error(panel: Any, row: ComparisonRow) -> tuple[Any, str]:
+    """The image of |render - recorded depth| [cm], for a colour bar, and its median in words."""
+    both = (row.photo_depth > 0) & (row.render_depth > 0)
+    error = np.where(both, 100.0 * np.abs(row.render_depth - row.photo_depth), np.nan)
+    panel.set_facecolor(UNRECORDED)
+    image = panel.imshow(error, cmap="cividis", vmin=0.0, vmax=100.0 * MAX_DEPTH_ERROR, interpolation="nearest")
+    return image, f"median {np.nanmedian(error):.2f} cm" if both.any() else "no pixel has both depths"
 
 
 def draw_distance(
@@ -239,20 +244,16 @@ def view_picture(path: Path, row: ComparisonRow) -> None:
     """Write photo | render over colour error | depth error, with the mask's outline where there is one."""
     height, width = row.photo.shape[:2]
     render = np.clip(row.render, 0.0, 1.0)
-    color_error = _color_error(render, row.photo)
-    both = (row.photo_depth > 0) & (row.render_depth > 0)
-    depth_error = np.where(both, 100.0 * np.abs(row.render_depth - row.photo_depth), np.nan)
-    hole = (row.photo_depth > 0) & ~both
-    median = f"median {np.nanmedian(depth_error):.2f} cm" if both.any() else "no pixel has both depths"
+    color_error = np.asarray(100.0 * np.abs(render - row.photo / 255.0).mean(axis=2))
+    hole = (row.photo_depth > 0) & ~(row.render_depth > 0)
     with drawn_figure(2 * ((WIDTH - 1.9) / 2 * height / width + 0.4) + 0.2) as figure:
         axes = figure.subplots(2, 2)
         axes[0, 0].imshow(row.photo, interpolation="nearest")
         axes[0, 1].imshow(render, interpolation="nearest")
-        color = _draw_color_error(axes[1, 0], color_error)
-        axes[1, 1].set_facecolor(UNRECORDED)
-        depth = axes[1, 1].imshow(
-            depth_error, cmap="cividis", vmin=0.0, vmax=100.0 * MAX_DEPTH_ERROR, interpolation="nearest"
+        color = axes[1, 0].imshow(
+            color_error, cmap="cividis", vmin=0.0, vmax=100.0 * MAX_COLOR_ERROR, interpolation="nearest"
         )
+        depth, median = _draw_depth_error(axes[1, 1], row)
         axes[1, 1].imshow(np.where(hole[:, :, None], mpl.colors.to_rgba(HOLE), 0.0), interpolation="nearest")
         labels = ("mean of |render - photo| over RGB, % of the range", "|render - recorded depth|, cm")
         for image, panel, label in zip((color, depth), axes[1], labels, strict=True):
@@ -268,14 +269,6 @@ def view_picture(path: Path, row: ComparisonRow) -> None:
         for panel, text in zip(axes.flat, titles, strict=True):
             _finish(panel, text)
         save_figure(figure, path)
-
-
-def _color_error(render: NDArray[np.floating], photo: UInt8) -> Float64:
-    return np.asarray(100.0 * np.abs(render - photo / 255.0).mean(axis=2))
-
-
-def _draw_color_error(panel: Any, error: Float64) -> Any:
-    return panel.imshow(error, cmap="cividis", vmin=0.0, vmax=100.0 * MAX_COLOR_ERROR, interpolation="nearest")
 
 
 def _outline(panels: Any, mask: NDArray[np.bool_]) -> None:

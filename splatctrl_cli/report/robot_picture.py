@@ -62,19 +62,19 @@ def _draw_shapes(view: Any, triangles: Float64, is_bare: Bool, plane: tuple[int,
 
 
 def _draw_spheres(view: Any, centers: Float64, radii: Float64) -> None:
-    size = 2 * radii
-    discs = mpl.collections.EllipseCollection(
-        size,
-        size,
-        np.zeros(len(radii)),
-        units="xy",
-        offsets=centers,
-        offset_transform=view.transData,
-        facecolors=SPHERE,
-        edgecolors=SPHERE_EDGE,
-        linewidths=0.7,
+    view.add_collection(
+        mpl.collections.EllipseCollection(
+            2 * radii,
+            2 * radii,
+            np.zeros(len(radii)),
+            units="xy",
+            offsets=centers,
+            offset_transform=view.transData,
+            facecolors=SPHERE,
+            edgecolors=SPHERE_EDGE,
+            linewidths=0.7,
+        )
     )
-    view.add_collection(discs)
 
 
 def _is_outside(points: Float64, centers: Float64, radii: Float64) -> Bool:

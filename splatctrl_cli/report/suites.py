@@ -247,8 +247,10 @@ def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> N
         return
     for line in annotations(suites, is_fatal=is_fatal, environment=os.environ):
         print(line, file=stream, flush=True)
-    if os.environ.get("GITHUB_STEP_SUMMARY"):
-        _append(Path(os.environ["GITHUB_STEP_SUMMARY"]), suites)
+    if file := os.environ.get("GITHUB_STEP_SUMMARY"):
+        with Path(file).open("a", encoding="utf-8", errors="backslashreplace") as step:
+            written = step.tell()  # by other commands of the step
+            step.write(summary(suites, SUMMARY_BYTES - written))
 
 
 def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping[str, str]) -> list[str]:
@@ -275,7 +277,10 @@ def summary(suites: Sequence[Suite], room: int) -> str:
     counts = [f"{_cell(of)}: {total - len(cases)} of {total} criteria passed"]
     counts += [f"{number} {kind}" for kind in Kind if (number := sum(case.kind is kind for _, case in cases))]
     head = "\n".join([f"### splatctrl: {', '.join(counts)}", "", *(TABLE_HEAD if cases else [])]) + "\n"
-    rows = [_row(suite, case) for suite, case in cases]
+    rows = [
+        f"| {' | '.join(map(_cell, (suite.name, case.name, str(case.kind), case.sentence)))} |\n"
+        for suite, case in cases
+    ]
     left = room - len(head.encode()) - 1
     if sum(len(row.encode()) for row in rows) <= left:
         return head + "".join(rows) + "\n" if left >= 0 else ""
@@ -289,18 +294,6 @@ def summary(suites: Sequence[Suite], room: int) -> str:
             break
         kept.append(row)
     return head + "".join(kept) + MORE.format(len(rows) - len(kept))
-
-
-def _append(path: Path, suites: Sequence[Suite]) -> None:
-    """The summary behind what other commands of the step wrote, as far as there is room."""
-    written = path.stat().st_size if path.exists() else 0
-    text = summary(suites, SUMMARY_BYTES - written)
-    with path.open("a", encoding="utf-8", errors="backslashreplace") as stream:
-        stream.write(text)
-
-
-def _row(suite: Suite, case: Case) -> str:
-    return f"| {' | '.join(map(_cell, (suite.name, case.name, str(case.kind), case.sentence)))} |\n"
 
 
 def _cell(text: str) -> str:

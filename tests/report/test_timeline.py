@@ -13,7 +13,7 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Label
-from splatctrl_cli.report.page import Space, SplatsAt, bodies_of, coarsened, packed, three_js
+from splatctrl_cli.report.page import Space, bodies_of, coarsened, packed, three_js
 from splatctrl_cli.report.timeline import HEIGHT, LEFT, RIGHT, TOP, WIDTH, legend, runs_of, timeline
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
@@ -113,7 +113,7 @@ def test_splats_are_packed_to_a_hundredth_of_a_per_cent_of_their_box() -> None:
     centers = generator.uniform(-1.5, 1.5, (200, 3))
     labels = np.where(np.arange(200) < 50, Label.ROBOT, Label.OBJECT)
     splats = plain_splats(centers, generator.uniform(0.002, 0.05, 200), labels=labels)
-    scene = json.loads(packed(Space(splats=[SplatsAt(time_s=0.0, splats=splats)])))
+    scene = json.loads(packed(Space(splats={0.0: splats})))
     block, (coded,) = zlib.decompress(base64.b64decode(scene["bytes"])), scene["header"]["splats"]
     kind, start, count = coded["centers"]["array"]
     whole = np.frombuffer(block, kind, count, start).reshape(3, -1).T
@@ -121,7 +121,7 @@ def test_splats_are_packed_to_a_hundredth_of_a_per_cent_of_their_box() -> None:
     kind, start, count = coded["radii"]
     radii = np.frombuffer(block, kind, count, start) * coded["largest"] / 65535
     np.testing.assert_allclose(radii, splats.radii, atol=1e-6)
-    assert len(packed(Space(splats=[SplatsAt(time_s=0.0, splats=splats)]))) < 6000
+    assert len(packed(Space(splats={0.0: splats}))) < 6000
 
 
 def test_without_the_three_js_of_trimesh_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,7 @@ from splatctrl_cli.jobs.runs.run_folder import (
     open_batch,
     open_run,
 )
-from splatctrl_cli.report.page import Cell, Page, Picture, Row, RunSection, Table, packed, picture, rendered
+from splatctrl_cli.report.page import Cell, Page, Picture, RunSection, Table, packed, picture, rendered
 
 MOST_SCENES = 6  # of a batch, without `all_scenes`
 PICTURES = {True: (3, 800), False: (1, 640)}  # of a batch's run with and without a scene: how many, how wide [px]
@@ -100,13 +100,9 @@ def beside(path: Path) -> Path:
 
 
 def _of_run(request: WriteReportRequest, run: RunFolder) -> Page:
-    section, scenes = section_of(run, anchor="run", title=run.path.absolute().name), {}
+    section, scenes = section_of(run, anchor="run", title=run.path.absolute().name), dict[str, str]()
     if run.command in WITH_SPACE:
-        try:
-            scenes["scene"] = packed(space_of_run(run, request.roots))
-            section = replace(section, space="scene")
-        except SplatCtrlError as error:
-            section = replace(section, no_space=f"not in 3-D: {error}")
+        section = _in_space(section, run, request.roots, scenes, "scene")
     return Page(
         title=f"{run.command} {run.path.absolute().name}",
         state=section.state,
@@ -116,6 +112,17 @@ def _of_run(request: WriteReportRequest, run: RunFolder) -> Page:
         scenes=scenes,
         opens=True,
     )
+
+
+def _in_space(
+    section: RunSection, run: RunFolder, roots: tuple[Path, ...], scenes: dict[str, str], name: str
+) -> RunSection:
+    """The section with its scene, which is added by its name, or with why there is none."""
+    try:
+        scenes[name] = packed(space_of_run(run, roots))
+        return replace(section, space=name)
+    except SplatCtrlError as error:
+        return replace(section, no_space=f"not in 3-D: {error}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,11 +162,13 @@ def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progres
         sections.append(_section(request, batch, job, scenes, has_space=job.ran.node in chosen))
     unexpected = [job for job in jobs if job.ran.state != DONE]
     linked = {job.ran.node for job in told}
+    versions = sorted({ran.version for ran in batch.runs if ran.version})
+    recordings = len({ran.recording for ran in batch.runs})
     return Page(
         title=f"batch {batch.suite}",
         state="failed" if unexpected else "passed",
         sentence=_sentence(jobs, unexpected),
-        lines=[_versions(batch)],
+        lines=[f"{recordings} recordings, {len(batch.runs)} jobs; splatctrl {', '.join(versions) or 'unknown'}"],
         tables=[
             *changes,
             *([_list("Not as expected", unexpected, linked)] if unexpected else []),
@@ -199,15 +208,15 @@ def _sentence(jobs: Sequence[_Job], unexpected: Sequence[_Job]) -> str:
 
 
 def _job(batch: BatchFolder, ran: Run, is_changed: bool) -> _Job:
-    if not ran.out or not ran.outcome:  # it only prints, or left nothing
-        return _Job(ran=ran, run=None, why="", is_changed=is_changed)
-    try:
-        place = batch.inside(ran.out)
-        run = open_run(place) if (place / "run.json").is_file() or ran.command == REPLAY else None
-        run = None if run is None else replace(run, words=tuple(map(str, json.loads(ran.words))))
-        return _Job(ran=ran, run=run, why="", is_changed=is_changed)
-    except InputError as error:
-        return _Job(ran=ran, run=None, why=str(error), is_changed=is_changed)
+    run, why = None, ""
+    if ran.out and ran.outcome:  # else it only prints, or left nothing
+        try:
+            place = batch.inside(ran.out)
+            if (place / "run.json").is_file() or ran.command == REPLAY:
+                run = replace(open_run(place), words=tuple(map(str, json.loads(ran.words))))
+        except InputError as error:
+            why = str(error)
+    return _Job(ran=ran, run=run, why=why, is_changed=is_changed)
 
 
 def _is_told(job: _Job, *, is_seen: bool) -> bool:
@@ -242,11 +251,7 @@ def _section(
     if not has_space:
         hint = "not in 3-D: --all-scenes has it" if run.command in WITH_SPACE else ""
         return replace(section, no_space=hint)
-    try:
-        scenes[f"scene-{len(scenes)}"] = packed(space_of_run(run, (batch.path, *request.roots)))
-        return replace(section, space=f"scene-{len(scenes) - 1}")
-    except SplatCtrlError as error:
-        return replace(section, no_space=f"not in 3-D: {error}")
+    return _in_space(section, run, (batch.path, *request.roots), scenes, f"scene-{len(scenes)}")
 
 
 def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> list[Table]:
@@ -255,7 +260,7 @@ def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> list[
     recordings = dict.fromkeys(job.ran.recording for job in jobs)
     names = columns_of(((ran.job, ran.column) for ran in batch.runs), batch.jobs)
     rows = [
-        Row(cells=[recording, *(_cell(nodes.get((recording, name)), linked) for name in names)])
+        ([recording, *(_cell(nodes.get((recording, name)), linked) for name in names)], "")
         for recording in recordings
     ]
     table = Table(title="Recordings", header=("recording", *(name.replace("+", " +") for name in names)))
@@ -282,14 +287,8 @@ def _list(title: str, jobs: Sequence[_Job], linked: set[str]) -> Table:
         words = ran.sentence or ran.cause
         cost = (ran.seconds or None, ran.peak_mb or None)
         cells = (name, f"{ran.label or ran.state}{ran.damage}", ran.expect, least, words, *cost)
-        rows.append(Row(cells=cells, state=ran.state))
+        rows.append((cells, ran.state))
     return Table(title=title, header=("job", "verdict", "expected", "least mm", "sentence", "s", "MB"), rows=rows)
-
-
-def _versions(batch: BatchFolder) -> str:
-    versions = sorted({ran.version for ran in batch.runs if ran.version})
-    recordings = len({ran.recording for ran in batch.runs})
-    return f"{recordings} recordings, {len(batch.runs)} jobs; splatctrl {', '.join(versions) or 'unknown'}"
 
 
 def _log(batch: BatchFolder, ran: Run) -> Table:
@@ -319,7 +318,7 @@ def view(request: ViewRequest) -> ViewResult:
     return ViewResult(
         file=file,
         bytes=file.stat().st_size,
-        num_splats=max((len(at.splats) for at in space.splats), default=0),
+        num_splats=max(map(len, space.splats.values()), default=0),
         num_states=0 if space.motion is None else len(space.motion.seconds),
-        num_unknown=0 if space.unknown is None else len(space.unknown),
+        num_unknown=0 if space.unknown is None else len(space.unknown[0]),
     )

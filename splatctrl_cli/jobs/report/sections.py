@@ -48,7 +48,7 @@ def section_of(
         replayed = {"timeline": drawn, "legend": legend(states.clearance)}
     found = (run.json_of("summary.json") or {}).get("when_and_why", []) if states is not None else []
     held = _reasons(verdict, holds=True)
-    figures = [Row(cells=(name, value)) for name, value in run.metrics.items() if not isinstance(value, dict | list)]
+    figures = [((name, value), "") for name, value in run.metrics.items() if not isinstance(value, dict | list)]
     return RunSection(
         anchor=anchor,
         title=title,
@@ -69,12 +69,12 @@ def section_of(
 
 def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
     """The criteria of a verdict that hold, or those that do not, first the one that decided it."""
-    rows = []
+    rows = list[Row]()
     for reason in verdict.get("reasons", []):
         when = "" if reason["time_s"] is None else f" at {reason['time_s']:.2f} s"
         words = "; ".join(part for part in (reason["sentence"] + when, reason["cause"], reason["remedy"]) if part)
         if (reason["outcome"] == PASSED) is holds:
-            rows.append(Row(cells=(reason["criterion"], reason["outcome"], words), state=reason["outcome"]))
+            rows.append(((reason["criterion"], reason["outcome"], words), reason["outcome"]))
     return Table(header=("criterion", "outcome", "found"), rows=rows)
 
 
@@ -101,7 +101,7 @@ def _settings(run: RunFolder) -> Table:
     """The command line, and each key of the configuration that is not the default."""
     used, default = run.run.get("config", {}), Config().as_dict()
     rows = [
-        Row(cells=(f"{section}.{key}", json.dumps(value), json.dumps(default[section].get(key))))
+        ((f"{section}.{key}", json.dumps(value), json.dumps(default[section].get(key))), "")
         for section, values in used.items()
         if isinstance(values, dict) and section in default
         for key, value in values.items()
@@ -122,7 +122,7 @@ def _provenance(run: RunFolder) -> Table:
         **{f"seconds: {name}": value for name, value in dict(run.run.get("seconds", {})).items()},
         **{f"sha256 of {name}": value for name, value in dict(run.run.get("inputs", {})).items()},
     }
-    rows = [Row(cells=item) for item in about.items()]
+    rows = [(item, "") for item in about.items()]
     return Table(title="Versions and provenance", header=("what", "value"), rows=rows)
 
 
@@ -148,8 +148,8 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
 
     def rows(figures: Sequence[FigureChange]) -> list[Row]:
         return [
-            Row(
-                cells=(
+            (
+                (
                     job(one.run),
                     one.metric,
                     one.before,
@@ -159,7 +159,7 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
                     one.unit,
                     None if one.where is None else f"{one.where.time_s:.2f} s, {one.where}",
                 ),
-                state=STATES.get(one.change, ""),
+                STATES.get(one.change, ""),
             )
             for one in figures
         ]
@@ -167,13 +167,13 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
     worse = [one for one in found.figures if one.change is Change.WORSE]
     better = rows([one for one in found.figures if one.change is Change.BETTER])
     first = [
-        Row(
-            cells=(job(one.run), "verdict", one.before, one.after, one.change, None, None, None),
-            state=STATES.get(one.change, ""),
+        (
+            (job(one.run), "verdict", one.before, one.after, one.change, None, None, None),
+            STATES.get(one.change, ""),
         )
         for one in found.verdicts
     ]
-    unlike = [Row(cells=("", name, *values, "not alike", "", "", "")) for name, values in found.differences.items()]
+    unlike = [(("", name, *values, "not alike", "", "", ""), "") for name, values in found.differences.items()]
     text = ". ".join([found.verdict.sentence, *map(str, found.verdict.said)])
     tables = [Table(title="What changed", header=HEADER, rows=[*first, *rows(worse), *unlike], text=text)]
     if better:

@@ -20,7 +20,7 @@ from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, States, open_run
 from splatctrl_cli.recording.capture.capture_header import ROBOT
 from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
-from splatctrl_cli.report.page import Deciding, Motion, Space, SplatsAt, Surface, bodies_of, coarsened
+from splatctrl_cli.report.page import Deciding, Motion, Space, Surface, bodies_of, coarsened
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
@@ -42,7 +42,7 @@ def space_of(path: Path, roots: tuple[Path, ...] = ()) -> Space:
         return space_of_grid(path)
     splats = read_splats(path)[0]
     chosen = splats if isinstance(splats, SplatSet) else nearest_splats(splats)
-    return Space(splats=[SplatsAt(time_s=0.0, splats=chosen)])
+    return Space(splats={0.0: chosen})
 
 
 def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
@@ -62,8 +62,8 @@ def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
 def space_of_scene(scene: SceneFolder) -> Space:
     """The splats at the end of a scene, and the space that was never seen."""
     if scene.is_anisotropic:
-        return Space(splats=[SplatsAt(time_s=0.0, splats=nearest_splats(scene.gaussians()))])
-    return _with_unknown(Space(splats=[SplatsAt(time_s=0.0, splats=scene.splats())]), scene.occupancy(), scene)
+        return Space(splats={0.0: nearest_splats(scene.gaussians())})
+    return _with_unknown(Space(splats={0.0: scene.splats()}), scene.occupancy(), scene)
 
 
 def space_of_grid(path: Path) -> Space:
@@ -83,8 +83,7 @@ def space_of_grid(path: Path) -> Space:
     if "observed" not in grid.channels:
         return space
     is_unknown = np.asarray(grid.channels["observed"]) == VoxelState.NEVER_SEEN
-    unknown, edge = coarsened(is_unknown, grid.origin, grid.voxel, MOST_UNKNOWN)
-    return replace(space, unknown=unknown, voxel=edge)
+    return replace(space, unknown=coarsened(is_unknown, grid.origin, grid.voxel, MOST_UNKNOWN))
 
 
 def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
@@ -159,7 +158,7 @@ def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding:
     times, used = [time for time, _ in known], [snapshot for _, snapshot in known]
     when = 0.0 if deciding is None else deciding.time_s
     chosen = spread(times, when)
-    sets = [SplatsAt(time_s=times[i] if n else 0.0, splats=used[i].splats()) for n, i in enumerate(chosen)]
+    sets = {times[i] if n else 0.0: used[i].splats() for n, i in enumerate(chosen)}
     at = max((i for i in chosen if times[i] <= when), default=None)
     return _with_unknown(Space(splats=sets), None if at is None else used[at].occupancy(), scene)
 
@@ -206,8 +205,7 @@ def _with_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) 
         return space
     used: Mapping[str, Any] = scene.run.get("config", {}).get("occupancy", {})
     states = grid.states(float(used.get("free_below", 0.3)), float(used.get("occupied_above", 0.7)))
-    unknown, edge = coarsened(states == VoxelState.NEVER_SEEN, grid.origin, grid.voxel, MOST_UNKNOWN)
-    return replace(space, unknown=unknown, voxel=edge)
+    return replace(space, unknown=coarsened(states == VoxelState.NEVER_SEEN, grid.origin, grid.voxel, MOST_UNKNOWN))
 
 
 def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
