@@ -17,8 +17,8 @@ from splatctrl_cli.evaluate.views import surface_points
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Intrinsics, RgbdFrame
 from tests.evaluate.test_views import wall_frame
-from tests.formats.test_mesh import box_distance
 from tests.plain import plain_frame
+from tests.robot.test_mesh_distance import box_distance
 
 HIDDEN, SEEN = -0.3, 0.3  # x of cells: a plate at 1 m hides the wall's left half
 
