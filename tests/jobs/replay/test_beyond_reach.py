@@ -78,7 +78,7 @@ def test_an_export_and_a_picture_of_spheres_leave_the_shell_out(stage: Stage) ->
     scene = with_shell(stage.scene(), in_the_way(stage))
     export(ExportRequest(scene=scene, out=scene.parent / "all.ply"))
     assert len(read_ply(scene.parent / "all.ply")[0]) == len(open_scene(scene).splats()) == 1
-    assert len(space_of_scene(open_scene(scene)).splats[0].splats) == 1
+    assert len(space_of_scene(open_scene(scene)).splats[0]) == 1
 
 
 @pytest.mark.parametrize(
