@@ -34,7 +34,7 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     first = next(r for r in open_source(tmp_path / "a.mcap").records() if isinstance(r, RgbdFrame))
     snapshots = (FakeSnapshot(stamp_ns=START_NS), FakeSnapshot(stamp_ns=START_NS + 2 * FRAME_NS))
     scene = FakeScene(snapshots=snapshots)
-    scene.run |= {"metrics": {"first_frames": [vars(first_frame(first))]}}
+    scene.run |= {"metrics": {"first_frames": [dict(first_frame(first))]}}
     (tmp_path / "scene").mkdir()
     write_ply(tmp_path / "scene" / "splats.ply", wall(), {})
     monkeypatch.setattr(score_job, "open_splats", lambda path: scene)

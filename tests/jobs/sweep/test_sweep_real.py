@@ -110,7 +110,7 @@ def test_the_options_of_a_run_are_taken_over_as_they_were_given(recorded: Record
     for name in ("audit", "scene"):
         given = open_run(recorded.folder / name).arguments
         options = PROGRAM.options_of(given)
-        assert PROGRAM.options_of(PROGRAM.parsed(given[0], options, Path()).words) == options
+        assert PROGRAM.options_of(PROGRAM.parsed(given[0], options, Path())[0]) == options
 
 
 def test_a_key_without_a_map_to_change_is_refused(recorded: Recorded) -> None:
