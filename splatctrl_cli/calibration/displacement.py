@@ -1,11 +1,13 @@
-"""How far from where its joints put it a camera sees the robot: its pose is off, or the robot's."""
+"""How far each camera sees the robot from where its joints put it.
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+That far the camera's pose is off; or the robot's, where all cameras say the same.
+"""
+
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from splatctrl_cli.calibration.evidence import Arm, ArmRows, transform_of
+from splatctrl_cli.calibration.evidence import POSE, Arm, ArmRows, transform_of
 from splatctrl_cli.calibration.views import depth_sigma, strided
 from splatctrl_cli.config.fixed import (
     DISPLACED_ALIKE,
@@ -15,28 +17,31 @@ from splatctrl_cli.config.fixed import (
     DISPLACED_ROUNDS,
     DISPLACED_ROWS,
     DISPLACED_WIDTH,
+    MISPLACED,
 )
 from splatctrl_cli.records import Float64, RgbdFrame, spread
 
-POSE = 6  # a turn and a move
+
+def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[str, float]]:
+    """`displacement_of` by camera, without cameras that show too little of the robot. frames: of all cameras."""
+    by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
+    found = {camera: displacement_of(arm, its) for camera, its in by_camera.items()}
+    return {camera: row for camera, row in found.items() if row is not None}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Displacement:
-    """Of one camera: distance [m], the root mean square over the robot's points that it shows of how far the camera
-    would have to move them to lay them on the robot's surface; sigma [m] of it; num_pixels that it rests on.
-    """
-
-    distance: float
-    sigma: float
-    num_pixels: int
+def is_displaced(row: Mapping[str, float]) -> bool:
+    """Whether one of `displaced_cameras` is off: by more than `MISPLACED` and one sigma."""
+    return row["distance_mm"] - row["sigma_mm"] > 1e3 * MISPLACED
 
 
-def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> Displacement | None:
-    """Of the camera of these frames; None where they show too little of the robot.
+def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, float] | None:
+    """How far off one camera's pose is, by its frames; None where they show too little of the robot.
 
-    Gauss-Newton steps of the camera's pose, from the distances of measured points to the rendered surface along its
-    normal, each weighed down beyond two sigma (Huber). Errors of neighbouring pixels are alike: so many count as one.
+    The pose is corrected until depth lies on the robot's rendered surface. `distance_mm`: how far that moves the
+    points that the camera shows of the robot (root mean square); `sigma_mm` of it; `num_pixels`: how many points.
+
+    Two Gauss-Newton steps by the distances along the surface's normal; a residual beyond two sigma counts less
+    (Huber). Neighbouring pixels err alike, so `DISPLACED_ALIKE` of them count as one.
     """
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
     T, prior = np.eye(4), np.eye(POSE) / DISPLACED_PRIOR**2
@@ -56,11 +61,12 @@ def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> Displacement | Non
     points = np.concatenate([rows.points for rows in found])
     moved = points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3]
     by_pose = np.hstack([np.cross(np.eye(POSE // 2), points.mean(axis=0)).T, np.eye(POSE // 2)])  # of their middle
-    return Displacement(
-        distance=float(np.sqrt(np.square(moved).sum(axis=1).mean())),
-        sigma=float(np.sqrt(np.trace(by_pose @ np.linalg.inv(information) @ by_pose.T))),
-        num_pixels=len(points),
-    )
+    variance = float(np.trace(by_pose @ np.linalg.inv(information) @ by_pose.T))
+    return {
+        "distance_mm": round(1e3 * float(np.sqrt(np.square(moved).sum(axis=1).mean())), 2),
+        "sigma_mm": round(1e3 * variance**0.5, 2),
+        "num_pixels": len(points),
+    }
 
 
 def _rows(arm: Arm, frame: RgbdFrame, T_recorded_camera: Float64) -> ArmRows | None:

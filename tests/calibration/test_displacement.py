@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.calibration.displacement import displacement_of
+from splatctrl_cli.calibration.displacement import displaced_cameras, displacement_of, is_displaced
 from splatctrl_cli.calibration.evidence import Arm, transform_of
 from splatctrl_cli.jobs.reconstruct.self_model import arm_of, frames_of
 from splatctrl_cli.recording.source import open_source
@@ -38,8 +38,8 @@ def test_a_camera_that_stands_where_the_log_says_sees_the_robot_in_its_place(
 ) -> None:
     found = displacement_of(*seen)
     assert found is not None
-    assert found.distance < 0.0005
-    assert found.sigma < 0.001
+    assert found["distance_mm"] < 0.5
+    assert found["sigma_mm"] < 1.0
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,17 @@ def test_a_camera_that_stands_elsewhere_moves_what_it_sees_by_as_much(
     true = np.sqrt(np.square(points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3]).sum(axis=1).mean())
     found = displacement_of(arm, moved(frames, twist))
     assert found is not None
-    assert found.distance == pytest.approx(true, abs=0.0005)
+    assert found["distance_mm"] == pytest.approx(1e3 * true, abs=0.5)
+
+
+def test_each_camera_is_measured_by_its_own_frames_and_one_that_is_off_is_told(
+    seen: tuple[Arm, list[RgbdFrame]],
+) -> None:
+    arm, frames = seen
+    off = [replace(frame, camera="off") for frame in moved(frames, np.array([0.0, 0.0, 0.0, 0.008, 0.0, 0.0]))]
+    blind = [replace(frame, camera="blind", depth=np.zeros_like(frame.depth)) for frame in frames]
+    found = displaced_cameras(arm, [*frames, *off, *blind])
+    assert {camera: is_displaced(row) for camera, row in found.items()} == {CAMERA: False, "off": True}
 
 
 def test_too_little_of_the_robot_says_nothing_of_a_camera(seen: tuple[Arm, list[RgbdFrame]]) -> None:

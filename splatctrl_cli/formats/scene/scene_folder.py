@@ -33,6 +33,10 @@ from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid, SeenVoxels
 FORMAT = "splatctrl-scene 1"
 SELF_MODEL = "self.npz"  # what `robot learn` finds in the recording
 SHELL_FILE = "shell.ply"
+MADE_FROM = (  # metrics of a reconstruction that go with a field
+    *("first_frames", "robot_joints", "robot_links"),
+    *("displaced_cameras", "self_mask", "self_mask_residual_mm"),
+)
 T = TypeVar("T")
 
 
@@ -176,11 +180,12 @@ class SceneFolder:
     @property
     def made_from(self) -> dict[str, Any]:
         """Digests of the files that were read (`inputs`), the first frame of each camera, the robot's joints and
-        links, and by how much depth was corrected, where it was: what tells whether it belongs to a log and a robot.
+        links, by how much depth was corrected, where it was, and how far off the cameras see the robot: what tells
+        whether it belongs to a log and a robot.
         """
         metrics = self.run.get("metrics", {})
         bend = {"depth_bend": metrics["depth_bend"]} if metrics.get("depth_bend") else {}
-        kept = {name: metrics[name] for name in ("first_frames", "robot_joints", "robot_links") if name in metrics}
+        kept = {name: metrics[name] for name in MADE_FROM if name in metrics}
         return {"inputs": self.run.get("inputs", {}), **kept, **bend}
 
     @property

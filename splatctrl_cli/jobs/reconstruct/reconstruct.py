@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.calibration.displacement import Displacement, displacement_of
+from splatctrl_cli.calibration.displacement import displaced_cameras
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.verdict import Verdict, brief
@@ -15,14 +15,13 @@ from splatctrl_cli.formats.arrays import savez
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.formats.scene.scene_writer import CHECKPOINT
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest, training_cameras
-from splatctrl_cli.jobs.reconstruct.self_model import arm_of, frames_of, learn_from
+from splatctrl_cli.jobs.reconstruct.self_model import arm_seen, learn_from
 from splatctrl_cli.jobs.reconstruct.verdict import GATED, Reconstructed, reconstruct_verdict
 from splatctrl_cli.jobs.recordings.open_recording import guessed_unit
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, other_frame, urdf_of, with_self_model
 from splatctrl_cli.jobs.running.device import FitDevice
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.running.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
-from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.declared_contact import Declarations, read_declarations
 from splatctrl_cli.robot.model import RobotModel
@@ -87,7 +86,11 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
                 )
         learned = [] if robot is None or robot.self_model is None else robot.self_model.parts
         made = Reconstructed(
-            metrics=fitted.metrics() | _displaced(off),
+            metrics=fitted.metrics()
+            | {
+                "camera_displacement_mm": max((row["distance_mm"] for row in off.values()), default=None),
+                "displaced_cameras": off,
+            },
             rows=fitted.rows,
             config=fitted.config,
             loss=request.source.loss,
@@ -121,25 +124,19 @@ def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[st
 
 def _learned(
     robot: RobotModel | None, request: ReconstructRequest, folder: Path, progress: Progress, *, is_new: bool
-) -> tuple[RobotModel | None, dict[str, Displacement]]:
-    """The robot with its self-model, and how far off each camera sees it, where its links have meshes.
+) -> tuple[RobotModel | None, dict[str, dict[str, float]]]:
+    """The robot with its self-model, and `displaced_cameras`.
 
     The self-model is kept in the scene's folder: the one given, or that of the run that goes on, or what the
     recording shows.
     """
-    source = request.source
-    off: dict[str, Displacement] = {}
     if robot is None:
-        return None, off
-    if isinstance(source, LOGGED) and source.joint_names and robot.surface.trees:
+        return None, {}
+    seen = arm_seen(robot, request.source, progress)
+    off = {} if seen is None else displaced_cameras(*seen)
+    if seen and is_new and request.self_model is None:
         try:
-            arm = arm_of(robot, source)
-            frames = frames_of(arm, source, progress)
-            for camera in sorted({frame.camera for frame in frames}):
-                found = displacement_of(arm, [frame for frame in frames if frame.camera == camera])
-                off |= {} if found is None else {camera: found}
-            if is_new and request.self_model is None:
-                robot = robot.with_self_model(learn_from(arm, frames, source.name))
+            robot = robot.with_self_model(learn_from(*seen, request.source.name))
         except InputError as error:
             progress.log(f"nothing is learned of the robot's own parts: {error.message}")
     if not is_new and request.self_model is None:
@@ -147,20 +144,6 @@ def _learned(
     elif is_new and robot.self_model is not None:
         savez(folder / SELF_MODEL, robot.self_model.arrays())
     return robot, off
-
-
-def _displaced(off: Mapping[str, Displacement]) -> dict[str, Any]:
-    """As metrics: by camera, and the largest."""
-    rows = {
-        camera: {
-            "distance_mm": round(1e3 * found.distance, 2),
-            "sigma_mm": round(1e3 * found.sigma, 2),
-            "num_pixels": found.num_pixels,
-        }
-        for camera, found in off.items()
-    }
-    largest = max((row["distance_mm"] for row in rows.values()), default=None)
-    return {"camera_displacement_mm": largest, "displaced_cameras": rows}
 
 
 def declarations_of(path: Path | None, robot: RobotModel | None) -> Declarations:

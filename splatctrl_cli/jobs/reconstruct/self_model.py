@@ -16,10 +16,11 @@ from splatctrl_cli.jobs.calibrate import depth_frame, frames_nearest, stamps_by_
 from splatctrl_cli.jobs.reconstruct.reconstruction import training_cameras
 from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import RgbdFrame, spread
+from splatctrl_cli.records import RecordSource, RgbdFrame, spread
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_fusion import REACH, choose_moments, learn
 from splatctrl_cli.robot.self_model import SelfModel
@@ -66,6 +67,20 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
 def arm_of(model: RobotModel, source: FrameSource) -> Arm:
     """The robot with the joint positions of a log that moves its joints."""
     return Arm(model, source.states.of_log(*model.joint_columns(source.joint_names)).postures(STATES_CLOSE_NS))
+
+
+def arm_seen(model: RobotModel, source: RecordSource, progress: Progress) -> tuple[Arm, list[RgbdFrame]] | None:
+    """`arm_of` a log and `frames_of` it; None where meshes do not draw the robot, no log moves it, or no frame shows
+    it posed, which is said.
+    """
+    if not isinstance(source, LOGGED) or not source.joint_names or not model.surface.trees:
+        return None
+    arm = arm_of(model, source)
+    try:
+        return arm, frames_of(arm, source, progress)
+    except InputError as error:
+        progress.log(f"the robot is not looked at: {error.message}")
+        return None
 
 
 def learn_from(arm: Arm, frames: Sequence[RgbdFrame], name: str, reach: float = REACH) -> SelfModel:

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from splatctrl_cli.calibration.displacement import is_displaced
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import MASK_PIXELS, MISPLACED
 from splatctrl_cli.evaluate.gates import gate_reasons
@@ -166,7 +167,7 @@ def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
 def _calibration(made: Reconstructed) -> Iterator[Reason]:
     """Measured against rendered depth of the robot, by camera and by link."""
     for camera, row in made.metrics["displaced_cameras"].items():
-        if row["distance_mm"] - row["sigma_mm"] > 1e3 * MISPLACED:
+        if is_displaced(row):
             yield note(
                 criterion="calibration",
                 sentence=f"{camera} sees the robot {row['distance_mm']:.1f} mm from where its joints put it",

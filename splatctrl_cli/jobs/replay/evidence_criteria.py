@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from splatctrl_cli.calibration.displacement import is_displaced
 from splatctrl_cli.config.fixed import (
     BEYOND,
     COARSE_VOXEL,
@@ -282,20 +283,14 @@ def belonging(judged: Judged) -> Iterator[Reason]:
 
 
 def displaced(judged: Judged) -> tuple[str, float] | None:
-    """The camera that sees the robot farthest from where its joints put it, beyond what is allowed and one sigma, and
-    how far [m]: what it shows of the robot may stand in the map as a thing.
-    """
+    """Of the cameras that see the robot elsewhere (`is_displaced`) the one that is farthest off, and how far [m]."""
     rows = judged.inputs.scene.figures().get("displaced_cameras") or {}
-    off = {
-        c: 1e-3 * row["distance_mm"]
-        for c, row in rows.items()
-        if row["distance_mm"] - row["sigma_mm"] > MISPLACED * 1e3
-    }
+    off = {camera: 1e-3 * row["distance_mm"] for camera, row in rows.items() if is_displaced(row)}
     return max(off.items(), key=lambda item: item[1], default=None)
 
 
 def calibration(judged: Judged) -> Iterator[Reason]:
-    """Each camera sees the robot, and all of them each link, within 5 mm of where its joints put it."""
+    """Each camera sees the robot, and all cameras together each link, within 5 mm of where its joints put it."""
     figures = judged.inputs.scene.figures()
     if (camera := displaced(judged)) is not None:
         yield lacking(

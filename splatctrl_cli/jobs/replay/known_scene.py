@@ -146,6 +146,7 @@ def from_grid(path: Path) -> KnownScene:
     states = grid.channels.get("observed")
     observed = None if states is None else partial(observed_at, states.astype("uint8"), grid.origin, grid.voxel)
     seen = None if observed is None else _seen_in_grid(observed, grid)
+    made_from = made if isinstance(made := grid.header.get("made_from"), dict) else {}
     fields = KnownFields(
         barrier=barrier,
         distances={
@@ -166,7 +167,8 @@ def from_grid(path: Path) -> KnownScene:
         digests={file.name: sha256(file)},
         moment_ns=moment if isinstance(moment := grid.header.get("stamp_ns"), int) else None,
         box=barrier.box,
-        made_from=made if isinstance(made := grid.header.get("made_from"), dict) else {},
+        figures=lambda: made_from,
+        made_from=made_from,
     )
 
 

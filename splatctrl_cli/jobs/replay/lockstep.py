@@ -2,12 +2,14 @@
 
 import time
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.calibration.displacement import displaced_cameras
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.control.audit import Observed
@@ -18,6 +20,7 @@ from splatctrl_cli.formats.scene.voxel_file import read_seen, read_unrepresented
 from splatctrl_cli.formats.splat.splats import read_ply
 from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest
+from splatctrl_cli.jobs.reconstruct.self_model import arm_seen
 from splatctrl_cli.jobs.recordings.open_recording import check_pose_jumps
 from splatctrl_cli.jobs.replay.evidence import EVERY, every_of, trained, training_options
 from splatctrl_cli.jobs.replay.known_scene import (
@@ -124,8 +127,10 @@ def from_log(
         observe=observe,
         device=FitDevice(request.device),
     )
+    seen = arm_seen(model, source, console)
     lockstep = Lockstep(
         fitted,
+        {} if seen is None else displaced_cameras(*seen),
         config,
         _latency_ns(request),
         console,
@@ -138,6 +143,7 @@ def from_log(
 class Lockstep:
     """Frame sets that wait, and the stamps and files of the maps after those that were taken in.
 
+    off: `displaced_cameras` of the whole log: evidence of its verdict, of which the map knows nothing.
     ends_with_log: known space is that of the whole log, else that of the frame sets that the replay passed.
     held_out_every: of so many frame sets one is not taken in, as it is evidence of the map's error.
     """
@@ -145,6 +151,7 @@ class Lockstep:
     def __init__(
         self,
         fitted: Reconstruction,
+        off: Mapping[str, Any],
         config: Config,
         latency_ns: int,
         console: Progress,
@@ -152,7 +159,7 @@ class Lockstep:
         ends_with_log: bool,
         held_out_every: int | None = None,
     ) -> None:
-        self._fitted, self._config, self._console = fitted, config, console
+        self._fitted, self._off, self._config, self._console = fitted, off, config, console
         self._latency_ns, self._ends_with_log = latency_ns, ends_with_log
         self._stopwatch = Stopwatch()
         self._taking: list[tuple[int, float]] = []  # of each frame set, its stamp [ns] and the time [s] that it took
@@ -189,7 +196,7 @@ class Lockstep:
         return KnownScene(
             at=at,
             seen_at=seen_at,
-            figures=self._fitted.metrics,
+            figures=lambda: self._fitted.metrics() | {"displaced_cameras": self._off},
             observed=self._observed,
             first_ns=self._stamps_ns[0] + self._latency_ns,
             cameras=tuple(self._fitted.cameras),

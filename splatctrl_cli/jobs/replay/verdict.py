@@ -23,7 +23,8 @@ SMALLER_IS_LAXER = (
     *("config.verdict.confidence", "config.verdict.evidence_reach"),
     *("config.control.margin", "config.control.self_margin"),
 )
-BY_MAP = ("clearance", "clearance of people", "static clearance", "scene hits", "map age", "controller", "goal")
+BY_MAP = ("clearance", "certified clearance", "clearance of people", "static clearance", "scene hits", "map age")
+BY_OUR_CONTROLLER = ("controller", "goal")  # which the map guides
 CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
 
 
@@ -32,7 +33,8 @@ def replay_verdict(judged: Judged) -> Verdict:
     replay, request = judged.replay, judged.request
     reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
     if displaced(judged) is not None:
-        reasons = [_doubted(reason) for reason in reasons]
+        by_map = (*BY_MAP, *(() if replay.outside else BY_OUR_CONTROLLER))
+        reasons = [_doubted(reason) if reason.criterion in by_map else reason for reason in reasons]
         reasons.sort(key=lambda reason: reason.criterion != "calibration")
     reasons.sort(key=lambda reason: reason.label != CONTACT)  # by any measure, before what only broke a margin
     counts = counts_of(replay, judged.logged, judged.metrics)
@@ -59,9 +61,9 @@ def replay_verdict(judged: Judged) -> Verdict:
 
 
 def _doubted(reason: Reason) -> Reason:
-    """A failure by the map, which a camera that is off may have made of the robot itself, is no failure."""
-    is_doubted = reason.outcome is Outcome.FAILED and reason.criterion in BY_MAP
-    return replace(reason, outcome=Outcome.NOT_EVALUABLE, label="") if is_doubted else reason
+    """A reason that rests on a map in which the robot itself may stand as a thing: it fails nothing."""
+    is_failure = reason.outcome is Outcome.FAILED
+    return replace(reason, outcome=Outcome.NOT_EVALUABLE, label="") if is_failure else reason
 
 
 def _how(judged: Judged) -> str:

@@ -44,7 +44,7 @@ def learned(request: ReconstructRequest, *, is_new: bool = True) -> tuple[RobotM
     request.out.mkdir(exist_ok=True)
     found, off = reconstruct._learned(robot, request, request.out, heard, is_new=is_new)
     assert found is not None
-    assert not robot.surface.trees or max(each.distance for each in off.values()) < 0.001
+    assert not robot.surface.trees or max(row["distance_mm"] for row in off.values()) < 1.0
     return found, heard.lines
 
 

@@ -89,6 +89,14 @@ def test_a_closed_loop_in_lockstep_drives_as_in_the_reconstruction(
     assert {float(row["map_age_s"]) >= 0.3 - 1e-9 for row in rows} == {True}
 
 
+def test_a_lockstep_measures_how_far_off_the_cameras_see_the_robot(sample_data: Path, tmp_path: Path) -> None:
+    tabletop = sample_data / "tabletop"
+    robot = RobotModel.from_urdf(tabletop / "robot.urdf", tabletop / "robot_spheres.yaml")
+    robot = robot.moved_by([f"panda_joint{number}" for number in range(1, 8)])
+    rows = opened(tabletop, tmp_path, robot, latency=0.0).figures()["displaced_cameras"]
+    assert rows and max(row["distance_mm"] for row in rows.values()) < 1.0
+
+
 def test_frame_sets_are_taken_in_only_when_the_clock_has_passed_them(
     recording: Path, tmp_path: Path, arm: RobotModel
 ) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.checks.clock_offset import ClockOffset
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.config.fixed import UNSEEN
 from splatctrl_cli.jobs.replay import replay as job
 from splatctrl_cli.jobs.replay.verdict import ASKED, CRITERIA
@@ -109,6 +110,24 @@ def test_what_a_displaced_camera_shows_beside_the_arm_may_be_the_arm_itself_and_
     truth = stage.truth(FAR, stage.ball_at_the_end(-0.01))
     code, verdict = stage.judged("--truth", str(truth), scene=stage.desk.folder / "scene")
     assert (code, verdict["label"], verdict["reasons"][0]["criterion"]) == (1, "contact", "true clearance")
+
+
+def test_a_field_knows_that_a_camera_of_its_scene_was_displaced(stage: Stage) -> None:
+    displaced_camera(stage)
+    stage.balls = [FAR, ball_beside(stage.arm, START, -0.01)]
+    field = stage.desk.folder / "field"
+    assert main(["sdf-bake", str(stage.scene()), "-o", str(field), "-q"]) == 0
+    code, verdict = stage.replayed("--field", str(field))
+    assert (code, verdict["label"], verdict["reasons"][0]["criterion"]) == (5, "not evaluable", "calibration")
+    assert decisive(verdict)["certified clearance"] == "not evaluable"
+
+
+def test_a_users_controller_that_fails_is_not_doubted_for_a_displaced_camera(stage: Stage) -> None:
+    displaced_camera(stage)
+    dead = ("--controller-command", "sh -c 'read a; echo {\\\"protocol\\\":1}'")
+    code, verdict = stage.judged(*dead, mode="closed-loop")
+    assert (code, verdict["label"]) == (1, "controller failed")
+    assert decisive(verdict)["controller"] == "failed"
 
 
 @pytest.mark.parametrize(("gap", "code"), [(0.0185, 1), (0.0195, 0), (0.0205, 0)])
