@@ -228,7 +228,7 @@ def nearest(stamps: Sequence[int], stamp_ns: int) -> int | None:
 def image_motion(
     watch: LogWatch, cameras: Sequence[tuple[CameraTopics, Camera]], frames: Mapping[str, Sequence[RgbdFrame]]
 ) -> ImageMotion:
-    """How the first images of each camera change; frames: `reduced_frames` by camera."""
+    """The motion that the first images of each camera show. frames: of each camera, from `reduced_frames`."""
     motion = ImageMotion()
     for topics, camera in cameras:
         if frames[camera.name] and topics.color in watch.images:

@@ -21,7 +21,7 @@ from tests.recording.log.make_log import messages_of, write_raw
 
 @pytest.fixture(scope="session", autouse=True)
 def coverage_once() -> Iterator[None]:
-    """What spheres leave uncovered of a robot is measured once for all replays: it takes longer than most of them."""
+    """Measure the coverage of each robot's spheres once for all replays: it takes longer than most of them."""
     measure, measured = inputs.coverage_of_solids, dict[object, CoverageReport]()
 
     def known(
