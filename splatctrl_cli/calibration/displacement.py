@@ -1,47 +1,90 @@
-"""How far each camera sees the robot from where its joints put it.
+"""How far each camera sees the robot from where its joints put it, and the pose at which it sees it there.
 
 That far the camera's pose is off; or the robot's, where all cameras say the same.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.calibration.evidence import POSE, Arm, ArmRows, transform_of
+from splatctrl_cli.calibration.evidence import POSE, Arm, ArmRows, moving_cameras, transform_of
 from splatctrl_cli.calibration.views import depth_sigma, strided
 from splatctrl_cli.config.fixed import (
+    CALIBRATION_TRAVEL,
     DISPLACED_ALIKE,
     DISPLACED_FRAMES,
     DISPLACED_PIXELS,
     DISPLACED_PRIOR,
     DISPLACED_ROUNDS,
     DISPLACED_ROWS,
+    DISPLACED_SHARE,
     DISPLACED_WIDTH,
     MISPLACED,
 )
 from splatctrl_cli.records import Float64, RgbdFrame, spread
 
 
-def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[str, float]]:
-    """`displacement_of` by camera, without cameras that show too little of the robot. frames: of all cameras."""
+def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[str, Any]]:
+    """How far each camera's pose is off (`displacement_of`), without cameras that show too little of the robot.
+
+    frames: of all cameras. A camera that is off, and stands still while the arm moves, also has `T_recorded_camera`,
+    16 numbers by row: the correction with which it sees the robot in its place; `left_mm`: how far it is off then.
+    """
     by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
-    found = {camera: displacement_of(arm, its) for camera, its in by_camera.items()}
+    found = {camera: _corrected(arm, its) for camera, its in by_camera.items()}
     return {camera: row for camera, row in found.items() if row is not None}
 
 
-def is_displaced(row: Mapping[str, float]) -> bool:
-    """Whether one of `displaced_cameras` is off: by more than `MISPLACED` and one sigma."""
-    return row["distance_mm"] - row["sigma_mm"] > 1e3 * MISPLACED
+def is_displaced(row: Mapping[str, Any]) -> bool:
+    """Whether one of `displaced_cameras` is off as recorded: by more than `MISPLACED` and one sigma."""
+    return bool(row["distance_mm"] - row["sigma_mm"] > 1e3 * MISPLACED)
 
 
-def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, float] | None:
-    """How far off one camera's pose is, by its frames; None where they show too little of the robot.
+def is_corrected(row: Mapping[str, Any]) -> bool:
+    """Whether one of `displaced_cameras` is placed at a corrected pose."""
+    return "T_recorded_camera" in row
+
+
+def placed(frame: RgbdFrame, cameras: Mapping[str, Mapping[str, Any]]) -> RgbdFrame:
+    """The frame at the corrected pose of its camera, where `displaced_cameras` has one."""
+    row = cameras.get(frame.camera, {})
+    if not is_corrected(row):
+        return frame
+    return replace(frame, T_world_camera=frame.T_world_camera @ np.array(row["T_recorded_camera"]).reshape(4, 4))
+
+
+def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
+    """A row of `displaced_cameras`. What a correction leaves is measured and corrected, too, twice."""
+    found = displacement_of(arm, frames)
+    if found is None:
+        return None
+    row, T = found
+    is_observed = arm.travel([f.stamp_ns for f in frames]) >= CALIBRATION_TRAVEL and not moving_cameras(frames)
+    if not is_displaced(row) or not is_observed:
+        return row
+    left = row
+    for _ in range(2):
+        moved = displacement_of(arm, [replace(frame, T_world_camera=frame.T_world_camera @ T) for frame in frames])
+        if moved is None:
+            return row
+        left, T = moved[0], T @ moved[1]
+    if is_displaced(left):
+        return row
+    return row | {"left_mm": left["distance_mm"], "T_recorded_camera": T.ravel().tolist()}
+
+
+def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, Any], Float64] | None:
+    """How far off one camera's pose is, by its frames, and T_recorded_camera (4, 4) that corrects it; None where they
+    show too little of the robot.
 
     The pose is corrected until depth lies on the robot's rendered surface. `distance_mm`: how far that moves the
     points that the camera shows of the robot (root mean square); `sigma_mm` of it; `num_pixels`: how many points.
 
     Two Gauss-Newton steps by the distances along the surface's normal; a residual beyond two sigma counts less
-    (Huber). Neighbouring pixels err alike, so `DISPLACED_ALIKE` of them count as one.
+    (Huber). Neighbouring pixels err alike, so `DISPLACED_ALIKE` of them count as one. The distance is
+    `DISPLACED_WIDTH` where fewer than `DISPLACED_SHARE` of the pixels that should show the robot do so within it.
     """
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
     T, prior = np.eye(4), np.eye(POSE) / DISPLACED_PRIOR**2
@@ -49,7 +92,8 @@ def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, float] |
     information = prior
     for _ in range(DISPLACED_ROUNDS):
         found = [rows for frame in shown if (rows := _rows(arm, frame, T)) is not None]
-        if sum(len(rows.residual) for rows in found) < DISPLACED_PIXELS:
+        visible = sum(rows.num_seen - rows.num_hidden for rows in found)
+        if visible < DISPLACED_PIXELS:
             return None
         information, pull = prior.copy(), np.zeros(POSE)
         for rows in found:
@@ -59,14 +103,17 @@ def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, float] |
             pull += rows.jacobian.T @ (weight * rows.residual)
         T = T @ transform_of(np.asarray(np.linalg.solve(information, -pull)))
     points = np.concatenate([rows.points for rows in found])
+    if len(points) < DISPLACED_SHARE * visible:
+        return {"distance_mm": 1e3 * DISPLACED_WIDTH, "sigma_mm": 0.0, "num_pixels": len(points)}, T
     moved = points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3]
     by_pose = np.hstack([np.cross(np.eye(POSE // 2), points.mean(axis=0)).T, np.eye(POSE // 2)])  # of their middle
     variance = float(np.trace(by_pose @ np.linalg.inv(information) @ by_pose.T))
-    return {
+    row = {
         "distance_mm": round(1e3 * float(np.sqrt(np.square(moved).sum(axis=1).mean())), 2),
         "sigma_mm": round(1e3 * variance**0.5, 2),
         "num_pixels": len(points),
     }
+    return row, T
 
 
 def _rows(arm: Arm, frame: RgbdFrame, T_recorded_camera: Float64) -> ArmRows | None:

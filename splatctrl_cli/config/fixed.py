@@ -257,6 +257,7 @@ DISPLACED_FRAMES = 12  # of a camera
 DISPLACED_ROWS = 160  # of an image, to which it is thinned
 DISPLACED_PIXELS = 1000  # of the robot in all frames of a camera, fewer of which say nothing of its pose
 DISPLACED_WIDTH = 0.03  # [m] from the robot's surface, beyond which a pixel shows something else
+DISPLACED_SHARE = 0.5  # of its pixels: a camera up to 40 mm off, corrected, has 0.99, one taken for another 0.23
 DISPLACED_ROUNDS = 2  # the first finds three quarters of 18 mm, the second all but 0.5 mm
 DISPLACED_PRIOR = 0.02  # [m], [rad] that a camera's pose may well be off by
 DISPLACED_ALIKE = 100  # pixels of a thinned image whose depths err alike

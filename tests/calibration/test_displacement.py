@@ -6,7 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.calibration.displacement import displaced_cameras, displacement_of, is_displaced
+from splatctrl_cli.calibration.displacement import (
+    displaced_cameras,
+    displacement_of,
+    is_corrected,
+    is_displaced,
+    placed,
+)
 from splatctrl_cli.calibration.evidence import Arm, transform_of
 from splatctrl_cli.jobs.reconstruct.self_model import arm_of, frames_of
 from splatctrl_cli.recording.source import open_source
@@ -38,8 +44,8 @@ def test_a_camera_that_stands_where_the_log_says_sees_the_robot_in_its_place(
 ) -> None:
     found = displacement_of(*seen)
     assert found is not None
-    assert found["distance_mm"] < 0.5
-    assert found["sigma_mm"] < 1.0
+    assert found[0]["distance_mm"] < 0.5
+    assert found[0]["sigma_mm"] < 1.0
 
 
 @pytest.mark.parametrize(
@@ -64,7 +70,7 @@ def test_a_camera_that_stands_elsewhere_moves_what_it_sees_by_as_much(
     true = np.sqrt(np.square(points @ (T[:3, :3] - np.eye(3)).T + T[:3, 3]).sum(axis=1).mean())
     found = displacement_of(arm, moved(frames, twist))
     assert found is not None
-    assert found["distance_mm"] == pytest.approx(1e3 * true, abs=0.5)
+    assert found[0]["distance_mm"] == pytest.approx(1e3 * true, abs=0.5)
 
 
 def test_each_camera_is_measured_by_its_own_frames_and_one_that_is_off_is_told(
@@ -75,6 +81,43 @@ def test_each_camera_is_measured_by_its_own_frames_and_one_that_is_off_is_told(
     blind = [replace(frame, camera="blind", depth=np.zeros_like(frame.depth)) for frame in frames]
     found = displaced_cameras(arm, [*frames, *off, *blind])
     assert {camera: is_displaced(row) for camera, row in found.items()} == {CAMERA: False, "off": True}
+
+
+@pytest.mark.parametrize("size", [0.008, 0.02, 0.03])
+def test_a_camera_that_is_off_is_placed_where_it_truly_stands(seen: tuple[Arm, list[RgbdFrame]], size: float) -> None:
+    arm, frames = seen
+    off = moved(frames, np.array([0.3 * size, -0.2 * size, 0.2 * size, size, 0.0, 0.5 * size]))
+    rows = displaced_cameras(arm, off)
+    assert rows[CAMERA]["left_mm"] < 0.5
+    for true, frame in zip(frames, off, strict=True):
+        assert placed(frame, rows).T_world_camera == pytest.approx(true.T_world_camera, abs=1e-3)
+    assert placed(frames[0], {}) is frames[0]
+
+
+@pytest.mark.parametrize("move", [0.06, 0.1, 0.15, 0.2])
+@pytest.mark.parametrize("axis", range(3))
+def test_a_camera_that_is_too_far_off_is_placed_rightly_or_stays_displaced(
+    seen: tuple[Arm, list[RgbdFrame]], axis: int, move: float
+) -> None:
+    """Where another surface lies at the robot's, its few pixels would tell of a small displacement."""
+    arm, frames = seen
+    off = moved(frames, np.concatenate([np.full(3, 0.3 * move), move * np.eye(3)[axis]]))
+    row = displaced_cameras(arm, off).get(CAMERA)
+    assert row is None or is_displaced(row)
+    if row is not None and is_corrected(row):
+        frame = placed(off[0], {CAMERA: row})
+        assert frame.T_world_camera == pytest.approx(frames[0].T_world_camera, abs=2e-3)
+
+
+def test_no_camera_is_corrected_by_one_posture_or_while_it_moves(seen: tuple[Arm, list[RgbdFrame]]) -> None:
+    arm, frames = seen
+    off = moved(frames, np.array([0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))
+    still = [replace(off[0]) for _ in off]
+    shaken = [*off[:-1], *moved(off[-1:], np.array([0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))]
+    for some in (still, shaken):
+        row = displaced_cameras(arm, some)[CAMERA]
+        assert is_displaced(row)
+        assert not is_corrected(row)
 
 
 def test_too_little_of_the_robot_says_nothing_of_a_camera(seen: tuple[Arm, list[RgbdFrame]]) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.calibration.displacement import displaced_cameras
+from splatctrl_cli.calibration.displacement import displaced_cameras, placed
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.verdict import Verdict, brief
@@ -69,7 +69,14 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         with stopwatch.stage("learn"):
             robot, off = _learned(robot, request, partial, progress, is_new=not goes_on)
         fitted = Reconstruction(
-            request, robot, partial, identity=run, declared=declared, checkpoint=checkpoint, device=device
+            request,
+            robot,
+            partial,
+            identity=run,
+            declared=declared,
+            checkpoint=checkpoint,
+            device=device,
+            cameras_off=off,
         )
         if goes_on:
             progress.log(f"{partial}: continues after {fitted.num_read} time steps")
@@ -86,11 +93,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
                 )
         learned = [] if robot is None or robot.self_model is None else robot.self_model.parts
         made = Reconstructed(
-            metrics=fitted.metrics()
-            | {
-                "camera_displacement_mm": max((row["distance_mm"] for row in off.values()), default=None),
-                "displaced_cameras": off,
-            },
+            metrics=fitted.metrics(),
             rows=fitted.rows,
             config=fitted.config,
             loss=request.source.loss,
@@ -124,7 +127,7 @@ def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[st
 
 def _learned(
     robot: RobotModel | None, request: ReconstructRequest, folder: Path, progress: Progress, *, is_new: bool
-) -> tuple[RobotModel | None, dict[str, dict[str, float]]]:
+) -> tuple[RobotModel | None, dict[str, dict[str, Any]]]:
     """The robot with its self-model, and `displaced_cameras`.
 
     The self-model is kept in the scene's folder: the one given, or that of the run that goes on, or what the
@@ -135,8 +138,9 @@ def _learned(
     seen = arm_seen(robot, request.source, progress)
     off = {} if seen is None else displaced_cameras(*seen)
     if seen and is_new and request.self_model is None:
+        arm, frames = seen
         try:
-            robot = robot.with_self_model(learn_from(*seen, request.source.name))
+            robot = robot.with_self_model(learn_from(arm, [placed(f, off) for f in frames], request.source.name))
         except InputError as error:
             progress.log(f"nothing is learned of the robot's own parts: {error.message}")
     if not is_new and request.self_model is None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.config.fixed import MOST_GROWTH
 from splatctrl_cli.errors import InputError, UsageError
@@ -81,6 +82,7 @@ class Reconstruction:
 
     declared: what the robot carries. identity: plain values that a run which goes on must have in common with this
     one. device: the processor unless given. observe: is shown every frame of the source on its way into time steps.
+    cameras_off: `displaced_cameras`, which are placed as they are corrected.
     """
 
     def __init__(
@@ -94,7 +96,9 @@ class Reconstruction:
         checkpoint: Checkpoint | None = None,
         device: FitDevice | None = None,
         observe: Callable[[RgbdFrame], None] | None = None,
+        cameras_off: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
+        self._cameras_off = cameras_off or {}
         self.observe, self.device, self.robot = observe, device or FitDevice(), robot
         self.request, self.source, self.config = request, request.source, request.config
         self.cloud = None if request.points is None else read_points(request.points)  # instead of depth
@@ -177,6 +181,7 @@ class Reconstruction:
         for frame in step.frames:
             if frame.camera not in self.first_frames:
                 self.first_frames[frame.camera] = first_frame(frame)
+        step = replace(step, frames=tuple(placed(frame, self._cameras_off) for frame in step.frames))
         if self.fitter is None:
             self._fit_to(RecordedDepth.of(step.frames), console)
             frames, self.corrected = self.request.corrections.of(
@@ -281,6 +286,8 @@ class Reconstruction:
             "disagreement": self.agreement.disagreement,
             **dict.fromkeys(("pose_residual", "depth_bend", "exposure_spread")),
             **self.corrected,
+            "camera_displacement_mm": max((row["distance_mm"] for row in self._cameras_off.values()), default=None),
+            "displaced_cameras": dict(self._cameras_off),
             **self_mask_metrics(self.rows),
             "carried": self.declared.carried_uses(),
             "first_frames": list(self.first_frames.values()),

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from splatctrl_cli.calibration.displacement import is_displaced
+from splatctrl_cli.calibration.displacement import is_corrected, is_displaced
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import MASK_PIXELS, MISPLACED
 from splatctrl_cli.evaluate.gates import gate_reasons
@@ -164,20 +164,28 @@ def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
     return longest
 
 
+def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
+    """The note on one of `displaced_cameras` that is off as recorded, corrected or not."""
+    sentence = f"{camera} sees the robot {row['distance_mm']:.1f} mm from where its joints put it"
+    if is_corrected(row):
+        sentence += f"; its pose is corrected to within {row['left_mm']:.1f} mm"
+    return note(
+        criterion="calibration",
+        sentence=sentence,
+        value=row["distance_mm"],
+        threshold=1e3 * MISPLACED,
+        unit="mm",
+        who=camera,
+        remedy="find the cameras' poses ('splatctrl calibrate'), and give --calibration",
+        count=int(row["num_pixels"]),
+    )
+
+
 def _calibration(made: Reconstructed) -> Iterator[Reason]:
     """Measured against rendered depth of the robot, by camera and by link."""
     for camera, row in made.metrics["displaced_cameras"].items():
         if is_displaced(row):
-            yield note(
-                criterion="calibration",
-                sentence=f"{camera} sees the robot {row['distance_mm']:.1f} mm from where its joints put it",
-                value=row["distance_mm"],
-                threshold=1e3 * MISPLACED,
-                unit="mm",
-                who=camera,
-                remedy="find the cameras' poses ('splatctrl calibrate'), and give --calibration",
-                count=row["num_pixels"],
-            )
+            yield displaced_camera(camera, row)
     told = {
         link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["num_pixels"] >= MASK_PIXELS
     }

@@ -76,7 +76,8 @@ def open_to_train(
     check_pose_jumps(source, max_pose_jump)
     if needs_depth:
         jumps = () if max_pose_jump == POSE_JUMP else ("pose-jump",)
-        refuse_errors(recording.path, recording.options, "reconstruct", (*allowed, *jumps))
+        later = ("agreement",)  # `CameraAgreement` asks it of the poses that the map is made with
+        refuse_errors(recording.path, recording.options, "reconstruct", (*allowed, *jumps, *later))
     return source
 
 

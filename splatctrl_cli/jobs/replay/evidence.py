@@ -15,6 +15,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
 from splatctrl_cli.config.motion import VerdictConfig
 from splatctrl_cli.control.arm import sphere_names
@@ -185,7 +186,7 @@ def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: Store
     The map is the one that states just before the set were judged by: it is oldest then. One that has taken in what
     other cameras saw at the same moment is better than any that a state is judged by until the next.
     """
-    swept = Swept.of(inputs.model, audit, reach)
+    swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras", {})
     motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
     stamps: list[int] = []
     worst: list[Float64] = []
@@ -195,7 +196,9 @@ def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: Store
             continue
         points = np.concatenate(
             [
-                apart_from_robot(inputs.model, motion.at(frame.stamp_ns)[0], swept.near(surface_points(frame)))
+                apart_from_robot(
+                    inputs.model, motion.at(frame.stamp_ns)[0], swept.near(surface_points(placed(frame, cameras)))
+                )
                 for frame in step.frames
             ]
         )

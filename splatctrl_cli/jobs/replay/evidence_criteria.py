@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from splatctrl_cli.calibration.displacement import is_displaced
+from splatctrl_cli.calibration.displacement import is_corrected, is_displaced
 from splatctrl_cli.config.fixed import (
     BEYOND,
     COARSE_VOXEL,
@@ -16,6 +16,7 @@ from splatctrl_cli.config.fixed import (
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
+from splatctrl_cli.jobs.reconstruct.verdict import displaced_camera
 from splatctrl_cli.jobs.replay.criteria import (
     MARGIN,
     UNKNOWN,
@@ -283,9 +284,13 @@ def belonging(judged: Judged) -> Iterator[Reason]:
 
 
 def displaced(judged: Judged) -> tuple[str, float] | None:
-    """Of the cameras that see the robot elsewhere (`is_displaced`) the one that is farthest off, and how far [m]."""
+    """Of the cameras that see the robot elsewhere, uncorrected, the one that is farthest off, and how far [m]."""
     rows = judged.inputs.scene.figures().get("displaced_cameras") or {}
-    off = {camera: 1e-3 * row["distance_mm"] for camera, row in rows.items() if is_displaced(row)}
+    off = {
+        camera: 1e-3 * row["distance_mm"]
+        for camera, row in rows.items()
+        if is_displaced(row) and not is_corrected(row)
+    }
     return max(off.items(), key=lambda item: item[1], default=None)
 
 
@@ -303,6 +308,9 @@ def calibration(judged: Judged) -> Iterator[Reason]:
             remedy="find the cameras' poses ('splatctrl calibrate'), and give --calibration to reconstruct",
             count=int(figures["displaced_cameras"][camera[0]]["num_pixels"]),
         )
+    for name, row in (figures.get("displaced_cameras") or {}).items():
+        if is_corrected(row):
+            yield displaced_camera(name, row)
     residual, by_link = figures.get("self_mask_residual_mm"), figures.get("self_mask")
     if residual is None or not isinstance(by_link, dict):
         return

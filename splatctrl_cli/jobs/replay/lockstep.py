@@ -2,10 +2,9 @@
 
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -105,7 +104,7 @@ def from_log(
     config = request.config
     source = _training_source(request, model, source)
     check_pose_jumps(source, request.max_pose_jump)
-    allowed = ("agreement", "views-scale", "alignment") if request.allow_disagreement else ()
+    allowed = ("agreement", *(("views-scale", "alignment") if request.allow_disagreement else ()))
     jumps = () if request.max_pose_jump == POSE_JUMP else ("pose-jump",)
     refuse_errors(request.log, request.options, "reconstruct", (*allowed, *jumps))
     place = folder / FOLDER
@@ -118,6 +117,7 @@ def from_log(
         threads=request.threads,
         allow_disagreement=request.allow_disagreement,
     )
+    seen = arm_seen(model, source, console)
     fitted = Reconstruction(
         asked,
         model,
@@ -126,11 +126,10 @@ def from_log(
         declared=declared,
         observe=observe,
         device=FitDevice(request.device),
+        cameras_off={} if seen is None else displaced_cameras(*seen),
     )
-    seen = arm_seen(model, source, console)
     lockstep = Lockstep(
         fitted,
-        {} if seen is None else displaced_cameras(*seen),
         config,
         _latency_ns(request),
         console,
@@ -143,7 +142,6 @@ def from_log(
 class Lockstep:
     """Frame sets that wait, and the stamps and files of the maps after those that were taken in.
 
-    off: `displaced_cameras` of the whole log: evidence of its verdict, of which the map knows nothing.
     ends_with_log: known space is that of the whole log, else that of the frame sets that the replay passed.
     held_out_every: of so many frame sets one is not taken in, as it is evidence of the map's error.
     """
@@ -151,7 +149,6 @@ class Lockstep:
     def __init__(
         self,
         fitted: Reconstruction,
-        off: Mapping[str, Any],
         config: Config,
         latency_ns: int,
         console: Progress,
@@ -159,7 +156,7 @@ class Lockstep:
         ends_with_log: bool,
         held_out_every: int | None = None,
     ) -> None:
-        self._fitted, self._off, self._config, self._console = fitted, off, config, console
+        self._fitted, self._config, self._console = fitted, config, console
         self._latency_ns, self._ends_with_log = latency_ns, ends_with_log
         self._stopwatch = Stopwatch()
         self._taking: list[tuple[int, float]] = []  # of each frame set, its stamp [ns] and the time [s] that it took
@@ -196,7 +193,7 @@ class Lockstep:
         return KnownScene(
             at=at,
             seen_at=seen_at,
-            figures=lambda: self._fitted.metrics() | {"displaced_cameras": self._off},
+            figures=self._fitted.metrics,
             observed=self._observed,
             first_ns=self._stamps_ns[0] + self._latency_ns,
             cameras=tuple(self._fitted.cameras),
