@@ -197,12 +197,12 @@ def _learn_link(
         is_solid = solid < 0
         normals = _normals(spread_cells(mask, distance, np.nan))[mask][is_solid]
         its = (cells[is_solid], seen[:, is_solid])
-        stays, is_other = np.zeros((2, len(cells)), bool)
-        stays[is_solid] = _stays_in_world(*its, normals, poses[run, number])
+        stays, moves, is_other = np.zeros((3, len(cells)), bool)
+        stays[is_solid], moves[is_solid] = _stays_in_world(*its, normals, poses[run, number])
         is_other[is_solid] = _is_on_other_link(surface, number, *its, gap[is_solid], poses[run], reach)
         grid = _without_scene(spread_cells(mask, solid, TRUNCATION), spread_cells(mask, stays, 0) > 0)
-        grid = np.where(spread_cells(mask, is_other, 0) > 0, np.float32(TRUNCATION), grid)
-        grid = _without_scene(grid, np.zeros_like(mask))
+        is_elsewhere = spread_cells(mask, is_other | (stays & moves), 0) > 0
+        grid = _without_scene(np.where(is_elsewhere, np.float32(TRUNCATION), grid), np.zeros_like(mask))
         is_part = (grid < 0)[mask]
         if not is_part.any() and (index or len(np.unique(at[num_own >= LEAST_CELLS])) < NUM_CONFIGURATIONS):
             continue
@@ -254,15 +254,18 @@ def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: i
     return Fused(total=total, weight=weight, seen=seen, free=free)
 
 
-def _stays_in_world(cells: Float64, seen: Bool, normals: Float64, poses: Float64) -> Bool:
+def _stays_in_world(cells: Float64, seen: Bool, normals: Float64, poses: Float64) -> tuple[Bool, Bool]:
     """Cells (N,) whose surface a plane that stays in the world explains in the configurations (K, N) that see it: its
-    normal does not turn, and it does not move along it by `STEP`. normals (N, 3), link frame; T_world_link (K, 4, 4).
+    normal does not turn, and it does not move along it by `STEP`. And cells (N,) that move by `STEP` at all: beside a
+    joint's axis nothing does. normals (N, 3), link frame; T_world_link (K, 4, 4).
     """
     turned = np.einsum("kij,nj->kni", poses[:, :3, :3], normals)
     normal = np.einsum("kn,kni->ni", seen / np.maximum(seen.sum(axis=0), 1), turned)
     length = np.linalg.norm(normal, axis=1)
-    along = np.einsum("kni,ni->kn", _moved(poses, cells), normal) / np.maximum(length, 1e-6)
-    return np.asarray((length >= TURN) & (_span(along[..., None], seen) < STEP))
+    places = _moved(poses, cells)
+    along = np.einsum("kni,ni->kn", places, normal) / np.maximum(length, 1e-6)
+    stays = (length >= TURN) & (_span(along[..., None], seen) < STEP)
+    return np.asarray(stays), _span(places, seen) >= STEP
 
 
 def _is_on_other_link(
@@ -319,17 +322,12 @@ def _normals(distance: Float32) -> Float64:
 
 
 def _without_scene(distance: Float32, stays: Bool) -> Float32:
-    """The grid without cells that stay in the world, without pieces of which they are the most, and without pieces of
-    fewer than `LEAST_CELLS`.
-    """
-    for left_out in (stays, np.zeros_like(stays)):
-        pieces, num = ndimage.label(distance < 0)
-        sizes = np.bincount(pieces.ravel(), minlength=num + 1)
-        lost = np.bincount(pieces.ravel(), left_out.ravel(), num + 1)
-        is_out = (sizes < LEAST_CELLS) | (lost > MOST_LOST * sizes)
-        is_out[0] = False
-        distance = np.where(is_out[pieces] | left_out, np.float32(TRUNCATION), distance)
-    return distance
+    """The grid without pieces most of which stays in the world, and without those of fewer than `LEAST_CELLS`."""
+    pieces, num = ndimage.label(distance < 0)
+    sizes = np.bincount(pieces.ravel(), minlength=num + 1)
+    is_out = (sizes < LEAST_CELLS) | (np.bincount(pieces.ravel(), stays.ravel(), num + 1) > MOST_LOST * sizes)
+    is_out[0] = False
+    return np.where(is_out[pieces], np.float32(TRUNCATION), distance)
 
 
 def _triangles(distance: Float32, origin: Float64) -> Float64:

@@ -151,6 +151,16 @@ def test_a_plate_that_the_arm_moves_along_stays_in_the_world() -> None:
     assert learn(ROBOT, LINKS, frames, at).pieces() == []
 
 
+def test_a_rib_goes_on_beside_the_joint_where_it_hardly_moves() -> None:
+    rib = Shape(link="arm", kind="box", size=(0.34, 0.02, 0.02), T_link_shape=pose_at((0.17, 0.0, 0.06)))
+    truth = RobotSurface.from_parts([*shapes(has_bracket=False), rib])
+    frames, at = recorded([(0.25 * np.sin(0.5 * k), 0.12 * np.sin(0.9 * k + 1.0)) for k in range(15)], truth)
+    ((link, triangles),) = learn(ROBOT, LINKS, frames, at).pieces()
+    assert link == "arm"
+    assert triangles[..., 0].min() == pytest.approx(0.0, abs=2 * VOXEL)
+    assert triangles[..., 0].max() == pytest.approx(0.34, abs=2 * VOXEL)
+
+
 def test_the_pieces_belong_to_the_surface_that_is_rendered_and_measured() -> None:
     surface = ROBOT.joined(learned().pieces())
     T = surface.poses(poses(0.0, 0.0))
