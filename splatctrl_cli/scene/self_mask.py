@@ -1,6 +1,6 @@
 """Which pixels of a depth image show the robot: those whose depth its own rendered surface explains (III-C)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import lru_cache
@@ -337,11 +337,12 @@ def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
     return {"self_mask": rows, "inside_robot": {link: r.num_inside for link, r in found.items() if r.num_inside}}
 
 
-def self_mask_metrics(rows: Sequence[AuditRow]) -> dict[str, Any]:
+def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -> dict[str, Any]:
     """For ``run.json``, over the time steps: by link the median of its steps' residuals [mm] and of their reach [mm],
-    and its pixels (`self_mask`); the largest of them by size where it rests on `MASK_PIXELS`
-    (`self_mask_residual_mm`, None without any); points inside the robot (`inside_robot_points`), and the first step
-    and link that had one.
+    and its pixels (`self_mask`); the largest of them by size where it is judged (`self_mask_residual_mm`, None
+    without any); points inside the robot (`inside_robot_points`), and the first step and link that had one.
+
+    A link is judged by `MASK_PIXELS`, unless it is one of `holding`: the surface of what it holds was learned.
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
     found = {}
@@ -356,8 +357,9 @@ def self_mask_metrics(rows: Sequence[AuditRow]) -> dict[str, Any]:
             "sign": int(np.sign(median)),
             "num_pixels": int(sum(counts)),
             "reach_mm": float(np.median([r.get("reach_mm", 0.0) for r in of_link])),
+            "is_judged": sum(counts) >= MASK_PIXELS and link not in holding,
         }
-    enough = [row["median_mm"] for row in found.values() if row["num_pixels"] >= MASK_PIXELS]
+    enough = [row["median_mm"] for row in found.values() if row["is_judged"]]
     first = next(((row.stamp_ns, link) for row in rows for link in row.inside_robot), (None, None))
     return {
         "self_mask": found,

@@ -255,6 +255,8 @@ class Reconstruction:
         """For ``run.json`` and gates."""
         assert self.fitter is not None
         last = self.rows[-1]
+        learned = None if self.robot is None else self.robot.self_model
+        holding = {part.link for part in learned.held} if learned is not None else set[str]()
         return {
             "cameras": self.cameras,
             "devices": self.device.history,
@@ -288,7 +290,7 @@ class Reconstruction:
             **self.corrected,
             "camera_displacement_mm": max((row["distance_mm"] for row in self._cameras_off.values()), default=None),
             "displaced_cameras": dict(self._cameras_off),
-            **self_mask_metrics(self.rows),
+            **self_mask_metrics(self.rows, holding),
             "carried": self.declared.carried_uses(),
             "first_frames": list(self.first_frames.values()),
             "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],

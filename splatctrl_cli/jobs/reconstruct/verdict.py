@@ -6,7 +6,7 @@ from typing import Any
 
 from splatctrl_cli.calibration.displacement import is_corrected, is_displaced
 from splatctrl_cli.config import Config
-from splatctrl_cli.config.fixed import MASK_PIXELS, MISPLACED
+from splatctrl_cli.config.fixed import MISPLACED
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, FAULTS, Better, Scale
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, note, noted, verdict_of
@@ -71,11 +71,12 @@ def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
 
 def counts_of(made: Reconstructed) -> dict[str, int]:
     """What each of `GATED` rests on: time steps, or pixels of the robot."""
-    seen = [row["num_pixels"] for row in made.metrics["self_mask"].values()]
+    links = made.metrics["self_mask"].values()
+    seen = [row["num_pixels"] for row in links]
     return dict.fromkeys(GATED, len(made.rows)) | {
         "robot_splats": sum(seen),
         "inside_robot_points": sum(seen),
-        "self_mask_residual_mm": sum(num for num in seen if num >= MASK_PIXELS),
+        "self_mask_residual_mm": sum(row["num_pixels"] for row in links if row["is_judged"]),
         "camera_displacement_mm": sum(row["num_pixels"] for row in made.metrics["displaced_cameras"].values()),
         "loss": sum(row.loss is not None for row in made.rows),
         "psnr": sum(row.psnr is not None for row in made.rows),
@@ -186,9 +187,7 @@ def _calibration(made: Reconstructed) -> Iterator[Reason]:
     for camera, row in made.metrics["displaced_cameras"].items():
         if is_displaced(row):
             yield displaced_camera(camera, row)
-    told = {
-        link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["num_pixels"] >= MASK_PIXELS
-    }
+    told = {link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["is_judged"]}
     if not told:
         return
     link = max(told, key=lambda name: abs(told[name]))

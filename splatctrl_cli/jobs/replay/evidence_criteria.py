@@ -318,7 +318,8 @@ def calibration(judged: Judged) -> Iterator[Reason]:
     if value <= MISPLACED:
         yield held(f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
         return
-    link, worst = max(by_link.items(), key=lambda item: abs(float(item[1]["median_mm"])))
+    judged_links = {link: row for link, row in by_link.items() if row.get("is_judged", True)}
+    link, worst = max(judged_links.items(), key=lambda item: abs(float(item[1]["median_mm"])))
     yield lacking(
         sentence=f"the cameras see {link} {mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its "
         f"joints put it, allowed {mm(MISPLACED)}",

@@ -45,7 +45,7 @@ def made(*rows: AuditRow, loss: LossReport | None = None, is_seeded: bool = Fals
         "robot_splats": 40,
         "camera_displacement_mm": None,
         "displaced_cameras": {},
-        "self_mask": {"hand": {"median_mm": -1.0, "sign": -1, "num_pixels": 5000}},
+        "self_mask": {"hand": {"median_mm": -1.0, "sign": -1, "num_pixels": 5000, "is_judged": True}},
         "self_mask_residual_mm": 1.0,
         "psnr": 20.0,
         "inside_robot_first_ns": None,
@@ -114,9 +114,9 @@ def test_a_stretch_without_depth_ends_where_the_camera_sees_again() -> None:
 @pytest.mark.parametrize(("median", "side"), [(6.0, "behind"), (-6.0, "before")])
 def test_a_robot_that_is_not_where_its_joints_put_it_is_noted_with_link_and_sign(median: float, side: str) -> None:
     links = {
-        "hand": {"median_mm": median, "sign": 1, "num_pixels": 5000},
-        "link1": {"median_mm": 3.9, "sign": 1, "num_pixels": 5000},
-        "link2": {"median_mm": 50.0, "sign": 1, "num_pixels": 99},  # too few to say anything
+        "hand": {"median_mm": median, "sign": 1, "num_pixels": 5000, "is_judged": True},
+        "link1": {"median_mm": 3.9, "sign": 1, "num_pixels": 5000, "is_judged": True},
+        "link2": {"median_mm": 50.0, "sign": 1, "num_pixels": 99, "is_judged": False},
     }
     (said,) = notes(made(*STEPS, self_mask=links))
     assert (said.who, said.value, said.threshold) == ("hand", median, 4.0)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,6 +16,8 @@ from splatctrl_cli.jobs.replay import evidence_criteria as evidence
 from splatctrl_cli.jobs.replay.criteria import controller
 from splatctrl_cli.jobs.replay.motion_criteria import surface_clearance
 from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
+from splatctrl_cli.scene.self_mask import self_mask_metrics
+from splatctrl_cli.scene.time_steps import AuditRow
 from splatctrl_cli.voxels import EvidenceClass
 
 NUM = 11
@@ -78,6 +80,19 @@ def test_a_robot_seen_off_where_its_joints_put_it_is_no_evidence(residual: float
     (reason,) = evidence.calibration(run)
     assert reason.outcome is outcome
     assert outcome is Outcome.PASSED or (reason.who, reason.count) == ("hand", 500)
+
+
+def test_a_link_that_holds_a_thing_is_not_judged_by_the_things_surface() -> None:
+    seen = {"median_mm": 2.0, "sign": 1, "num_pixels": 5000, "reach_mm": 12.0}
+    finger, few = seen | {"median_mm": -9.0, "sign": -1}, seen | {"median_mm": 30.0, "num_pixels": 99}
+    rows = [SimpleNamespace(self_mask={"arm": seen, "finger": finger, "tip": few}, inside_robot={}, stamp_ns=0)]
+    figures = self_mask_metrics(cast("list[AuditRow]", rows), {"finger"})
+    assert figures["self_mask_residual_mm"] == 2.0
+    assert self_mask_metrics(cast("list[AuditRow]", rows))["self_mask_residual_mm"] == 9.0
+    run = judged()
+    run.inputs.scene = SimpleNamespace(figures=lambda: figures | {"self_mask_residual_mm": 6.0})
+    (reason,) = evidence.calibration(run)
+    assert reason.who == "arm"
 
 
 @pytest.mark.parametrize(("sigma", "is_off"), [(0.9, True), (1.1, False)])
