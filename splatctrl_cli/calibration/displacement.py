@@ -21,6 +21,7 @@ from splatctrl_cli.config.fixed import (
     DISPLACED_ROWS,
     DISPLACED_SHARE,
     DISPLACED_WIDTH,
+    MASK_PIXELS,
     MISPLACED,
 )
 from splatctrl_cli.records import Float64, RgbdFrame, spread
@@ -30,7 +31,7 @@ def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[s
     """How far each camera's pose is off (`displacement_of`), without cameras that show too little of the robot.
 
     frames: of all cameras. A camera that is off, and stands still while the arm moves, also has `T_recorded_camera`,
-    16 numbers by row: the correction with which it sees the robot in its place; `left_mm`: how far it is off then.
+    16 numbers by row: the correction with which it sees each link in its place; `left_mm`: its last step.
     """
     by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
     found = {camera: _corrected(arm, its) for camera, its in by_camera.items()}
@@ -70,9 +71,18 @@ def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
         if moved is None:
             return row
         left, T = moved[0], T @ moved[1]
-    if is_displaced(left):
+    if left["distance_mm"] + left["sigma_mm"] > 1e3 * MISPLACED or not _fits(arm, frames, T):
         return row
     return row | {"left_mm": left["distance_mm"], "T_recorded_camera": T.ravel().tolist()}
+
+
+def _fits(arm: Arm, frames: Sequence[RgbdFrame], T_recorded_camera: Float64) -> bool:
+    """Whether a camera that is corrected sees each link in its place: a joint whose zero is off moves some alone."""
+    shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
+    found = [rows for frame in shown if (rows := _rows(arm, frame, T_recorded_camera)) is not None]
+    links, residual = (np.concatenate([getattr(rows, name) for rows in found]) for name in ("links", "residual"))
+    by_link = [residual[links == link] for link in np.unique(links)]
+    return all(abs(np.median(each)) <= MISPLACED for each in by_link if len(each) >= MASK_PIXELS)
 
 
 def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, Any], Float64] | None:

@@ -21,6 +21,7 @@ from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
 
 NEVER = "never"
+OF_PAIRS = "agreement of two cameras"  # among the errors that a command allows
 _ALLOWING = {  # the options that take an error on
     **dict.fromkeys(("agreement", "views-scale", "alignment"), "--allow-disagreement"),
     "pose-jump": "--max-pose-jump",
@@ -76,7 +77,10 @@ def refuse_errors(path: Path, options: SourceOptions, command: str, allowed: Col
     accepts.
     """
     report = _report(CheckRequest(paths=(path,), options=options), None, only_errors=True)
-    errors = [f for f in report.refusing(Need(command=command, lacks=())) if f.code not in allowed]
+    errors = report.refusing(Need(command=command, lacks=()))
+    if OF_PAIRS in allowed:
+        errors = [f for f in errors if f.code != "agreement" or not f.where.startswith("cameras")]
+    errors = [f for f in errors if f.code not in allowed]
     if errors:
         first, more = errors[0], f"; {len(errors) - 1} more: splatctrl check {path}" if len(errors) > 1 else ""
         remedy = first.remedy or CHECKS[first.code].remedy

@@ -342,9 +342,13 @@ def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -
     and its pixels (`self_mask`); the largest of them by size where it is judged (`self_mask_residual_mm`, None
     without any); points inside the robot (`inside_robot_points`), and the first step and link that had one.
 
-    A link is judged by `MASK_PIXELS`, unless it is one of `holding`: the surface of what it holds was learned.
+    A link is judged by `MASK_PIXELS`, unless it is one of `holding`, and others are: the surface of what it holds was
+    learned.
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
+    pixels = {link: sum(row.self_mask[link]["num_pixels"] for row in rows if link in row.self_mask) for link in links}
+    seen = {link for link in links if pixels[link] >= MASK_PIXELS}
+    judged = seen.difference(holding) or seen
     found = {}
     for link in links:
         of_link = [row.self_mask[link] for row in rows if link in row.self_mask]
@@ -355,9 +359,9 @@ def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -
         found[link] = {
             "median_mm": median,
             "sign": int(np.sign(median)),
-            "num_pixels": int(sum(counts)),
+            "num_pixels": int(pixels[link]),
             "reach_mm": float(np.median([r.get("reach_mm", 0.0) for r in of_link])),
-            "is_judged": sum(counts) >= MASK_PIXELS and link not in holding,
+            "is_judged": link in judged,
         }
     enough = [row["median_mm"] for row in found.values() if row["is_judged"]]
     first = next(((row.stamp_ns, link) for row in rows for link in row.inside_robot), (None, None))

@@ -120,6 +120,21 @@ def test_no_camera_is_corrected_by_one_posture_or_while_it_moves(seen: tuple[Arm
         assert not is_corrected(row)
 
 
+@pytest.mark.parametrize("degrees", [3.0, 4.0])
+def test_a_joint_whose_zero_is_off_is_no_camera_that_is(
+    sample_data: Path, seen: tuple[Arm, list[RgbdFrame]], degrees: float
+) -> None:
+    posture, frames = seen[0]._posture, seen[1]
+
+    def bent(stamp_ns: int) -> Float64 | None:
+        q = posture(stamp_ns)
+        return None if q is None else q + np.deg2rad(degrees) * np.eye(len(q))[3]
+
+    row = displaced_cameras(Arm(seen[0].model, bent), frames)[CAMERA]
+    assert is_displaced(row)
+    assert not is_corrected(row)
+
+
 def test_too_little_of_the_robot_says_nothing_of_a_camera(seen: tuple[Arm, list[RgbdFrame]]) -> None:
     arm, frames = seen
     away = [replace(frame, depth=np.zeros_like(frame.depth)) for frame in frames]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from splatctrl_cli.calibration.displacement import displaced_cameras, placed
 from splatctrl_cli.calibration.evidence import Arm
 from splatctrl_cli.config.fixed import STATES_CLOSE_NS
 from splatctrl_cli.errors import InputError
@@ -59,7 +60,9 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
         if not source.joint_names:
             raise InputError(f"{source.name}: expected joint states, got none", remedy="record /joint_states")
         arm = arm_of(model.moved_by(source.joint_names), source)
-        found = learn_from(arm, frames_of(arm, source, progress), source.name, request.reach)
+        frames = frames_of(arm, source, progress)
+        off = displaced_cameras(arm, frames)
+        found = learn_from(arm, [placed(frame, off) for frame in frames], source.name, request.reach)
         savez(partial, found.arrays())
     return found
 
