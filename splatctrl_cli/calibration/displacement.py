@@ -26,16 +26,22 @@ from splatctrl_cli.config.fixed import (
 )
 from splatctrl_cli.records import Float64, RgbdFrame, spread
 
+MEASURED = ("distance_mm", "sigma_mm", "num_pixels")
+
 
 def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[str, Any]]:
     """How far each camera's pose is off (`displacement_of`), without cameras that show too little of the robot.
 
     frames: of all cameras. A camera that is off, and stands still while the arm moves, also has `T_recorded_camera`,
     16 numbers by row: the correction with which it sees each link in its place; `left_mm`: its last step.
+    Where one cannot be corrected, none is.
     """
     by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
     found = {camera: _corrected(arm, its) for camera, its in by_camera.items()}
-    return {camera: row for camera, row in found.items() if row is not None}
+    rows = {camera: row for camera, row in found.items() if row is not None}
+    if any(is_displaced(row) and not is_corrected(row) for row in rows.values()):  # it may be the robot that is off
+        return {camera: {name: row[name] for name in MEASURED} for camera, row in rows.items()}
+    return rows
 
 
 def is_displaced(row: Mapping[str, Any]) -> bool:
@@ -82,7 +88,7 @@ def _fits(arm: Arm, frames: Sequence[RgbdFrame], T_recorded_camera: Float64) -> 
     found = [rows for frame in shown if (rows := _rows(arm, frame, T_recorded_camera)) is not None]
     links, residual = (np.concatenate([getattr(rows, name) for rows in found]) for name in ("links", "residual"))
     by_link = [residual[links == link] for link in np.unique(links)]
-    return all(abs(np.median(each)) <= MISPLACED for each in by_link if len(each) >= MASK_PIXELS)
+    return all(abs(np.median(each)) <= 0.5 * MISPLACED for each in by_link if len(each) >= MASK_PIXELS)
 
 
 def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, Any], Float64] | None:
