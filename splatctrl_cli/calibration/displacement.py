@@ -1,6 +1,6 @@
-"""How far each camera sees the robot from where its joints put it, and the pose at which it sees it there.
+"""How far each camera's pose is off, by the robot that it sees, and the pose that puts it right.
 
-That far the camera's pose is off; or the robot's, where all cameras say the same.
+Where all cameras say the same, it may be the robot that is off.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,6 @@ from splatctrl_cli.config.fixed import (
     DISPLACED_ROWS,
     DISPLACED_SHARE,
     DISPLACED_WIDTH,
-    MASK_PIXELS,
     MISPLACED,
 )
 from splatctrl_cli.records import Float64, RgbdFrame, spread
@@ -30,40 +29,42 @@ MEASURED = ("distance_mm", "sigma_mm", "num_pixels")
 
 
 def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[str, Any]]:
-    """How far each camera's pose is off (`displacement_of`), without cameras that show too little of the robot.
+    """How far each camera's pose is off, as `displacement_of`; without cameras that show too little of the robot.
 
-    frames: of all cameras. A camera that is off, and stands still while the arm moves, also has `T_recorded_camera`,
-    16 numbers by row: the correction with which it sees each link in its place; `left_mm`: its last step.
-    Where one cannot be corrected, none is.
+    frames: of all cameras. A camera is corrected if it stands still while the arm moves, and then sees each link in
+    its place. Its row has `T_recorded_camera`, the 16 numbers of the correction by row, and `left_mm`, the last step
+    of that. If one displaced camera cannot be corrected, none is: the robot itself may be off.
     """
     by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
     found = {camera: _corrected(arm, its) for camera, its in by_camera.items()}
     rows = {camera: row for camera, row in found.items() if row is not None}
-    if any(is_displaced(row) and not is_corrected(row) for row in rows.values()):  # it may be the robot that is off
+    if any(is_displaced(row) and not is_corrected(row) for row in rows.values()):
         return {camera: {name: row[name] for name in MEASURED} for camera, row in rows.items()}
     return rows
 
 
 def is_displaced(row: Mapping[str, Any]) -> bool:
-    """Whether one of `displaced_cameras` is off as recorded: by more than `MISPLACED` and one sigma."""
+    """Whether a row of `displaced_cameras` says that a recorded pose is off: by `MISPLACED` and one sigma."""
     return bool(row["distance_mm"] - row["sigma_mm"] > 1e3 * MISPLACED)
 
 
 def is_corrected(row: Mapping[str, Any]) -> bool:
-    """Whether one of `displaced_cameras` is placed at a corrected pose."""
+    """Whether a row of `displaced_cameras` has a corrected pose."""
     return "T_recorded_camera" in row
 
 
 def placed(frame: RgbdFrame, cameras: Mapping[str, Mapping[str, Any]]) -> RgbdFrame:
-    """The frame at the corrected pose of its camera, where `displaced_cameras` has one."""
+    """The frame at the corrected pose of its camera; as it is where `cameras`, as `displaced_cameras`, has none."""
     row = cameras.get(frame.camera, {})
-    if not is_corrected(row):
-        return frame
-    return replace(frame, T_world_camera=frame.T_world_camera @ np.array(row["T_recorded_camera"]).reshape(4, 4))
+    return _moved(frame, np.reshape(row["T_recorded_camera"], (4, 4))) if is_corrected(row) else frame
+
+
+def _moved(frame: RgbdFrame, T_recorded_camera: Float64) -> RgbdFrame:
+    return replace(frame, T_world_camera=frame.T_world_camera @ T_recorded_camera)
 
 
 def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
-    """A row of `displaced_cameras`. What a correction leaves is measured and corrected, too, twice."""
+    """A row of `displaced_cameras`, by one camera's frames. Each correction is measured, and corrected in turn."""
     found = displacement_of(arm, frames)
     if found is None:
         return None
@@ -73,27 +74,33 @@ def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
         return row
     left = row
     for _ in range(2):
-        moved = displacement_of(arm, [replace(frame, T_world_camera=frame.T_world_camera @ T) for frame in frames])
-        if moved is None:
+        found = displacement_of(arm, [_moved(frame, T) for frame in frames])
+        if found is None:
             return row
-        left, T = moved[0], T @ moved[1]
-    if left["distance_mm"] + left["sigma_mm"] > 1e3 * MISPLACED or not _fits(arm, frames, T):
+        left, T = found[0], T @ found[1]
+    if left["distance_mm"] + left["sigma_mm"] > 1e3 * MISPLACED:
+        return row
+    if not _sees_links_in_place(arm, [_moved(frame, T) for frame in frames]):
         return row
     return row | {"left_mm": left["distance_mm"], "T_recorded_camera": T.ravel().tolist()}
 
 
-def _fits(arm: Arm, frames: Sequence[RgbdFrame], T_recorded_camera: Float64) -> bool:
-    """Whether a camera that is corrected sees each link in its place: a joint whose zero is off moves some alone."""
+def _sees_links_in_place(arm: Arm, frames: Sequence[RgbdFrame]) -> bool:
+    """Whether two links or more are seen well by one camera's frames, and each within half of `MISPLACED`.
+
+    Where a joint's zero is off, no pose of the camera puts the links before and behind the joint right.
+    """
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
-    found = [rows for frame in shown if (rows := _rows(arm, frame, T_recorded_camera)) is not None]
+    found = [rows for frame in shown if (rows := _rows(arm, frame, np.eye(4))) is not None]
     links, residual = (np.concatenate([getattr(rows, name) for rows in found]) for name in ("links", "residual"))
     by_link = [residual[links == link] for link in np.unique(links)]
-    return all(abs(np.median(each)) <= 0.5 * MISPLACED for each in by_link if len(each) >= MASK_PIXELS)
+    medians = [abs(np.median(each)) for each in by_link if len(each) >= DISPLACED_PIXELS]
+    return len(medians) > 1 and max(medians) <= 0.5 * MISPLACED
 
 
 def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, Any], Float64] | None:
-    """How far off one camera's pose is, by its frames, and T_recorded_camera (4, 4) that corrects it; None where they
-    show too little of the robot.
+    """How far off one camera's pose is, and T_recorded_camera (4, 4), its correction; None if its frames show too
+    little of the robot.
 
     The pose is corrected until depth lies on the robot's rendered surface. `distance_mm`: how far that moves the
     points that the camera shows of the robot (root mean square); `sigma_mm` of it; `num_pixels`: how many points.

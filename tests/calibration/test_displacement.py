@@ -120,17 +120,46 @@ def test_no_camera_is_corrected_by_one_posture_or_while_it_moves(seen: tuple[Arm
         assert not is_corrected(row)
 
 
-@pytest.mark.parametrize("degrees", [3.0, 4.0])
-def test_a_joint_whose_zero_is_off_is_no_camera_that_is(
-    sample_data: Path, seen: tuple[Arm, list[RgbdFrame]], degrees: float
+def test_where_one_camera_cannot_be_corrected_none_is(seen: tuple[Arm, list[RgbdFrame]]) -> None:
+    arm, frames = seen
+    off = moved(frames, np.array([0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))
+    other = [replace(frame, camera="other") for frame in moved(off[:-1], np.array([0.0, 0.0, 0.0, 0.0, 0.01, 0.0]))]
+    assert is_corrected(displaced_cameras(arm, [*off, *other])[CAMERA])
+    shaken = [*other, replace(off[-1], camera="other")]
+    rows = displaced_cameras(arm, [*off, *shaken])
+    assert {camera: (is_displaced(row), is_corrected(row)) for camera, row in rows.items()} == dict.fromkeys(
+        (CAMERA, "other"), (True, False)
+    )
+
+
+@pytest.mark.parametrize("joint", [1, 3])
+@pytest.mark.parametrize("degrees", [1.0, 2.0, 4.0])
+def test_a_joint_whose_zero_is_off_does_not_move_a_camera(
+    seen: tuple[Arm, list[RgbdFrame]], joint: int, degrees: float
 ) -> None:
     posture, frames = seen[0]._posture, seen[1]
 
     def bent(stamp_ns: int) -> Float64 | None:
         q = posture(stamp_ns)
-        return None if q is None else q + np.deg2rad(degrees) * np.eye(len(q))[3]
+        return None if q is None else q + np.deg2rad(degrees) * np.eye(len(q))[joint]
 
     row = displaced_cameras(Arm(seen[0].model, bent), frames)[CAMERA]
+    assert is_displaced(row)
+    assert not is_corrected(row)
+
+
+def test_one_link_alone_does_not_place_a_camera(seen: tuple[Arm, list[RgbdFrame]]) -> None:
+    """What puts one link right may turn the camera about it."""
+    arm, frames = seen
+    off = moved(frames, np.array([0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))
+    kept = []
+    for true, frame in zip(frames, off, strict=True):
+        poses = arm.surface_poses(true.stamp_ns)
+        assert poses is not None
+        shown = arm.surface.render(poses, true.intrinsics, true.T_world_camera, true.depth)
+        of_link = shown.link == arm.surface.links.index("panda_link1")
+        kept.append(replace(frame, depth=np.where(of_link, frame.depth, np.float32(0.0))))
+    row = displaced_cameras(arm, kept)[CAMERA]
     assert is_displaced(row)
     assert not is_corrected(row)
 
