@@ -122,6 +122,7 @@ views-pose | warning |  | how far a camera must be moved and turned for its view
     0.8 deg, where depths then differ by at most 4 %)
 agreement | note, error | later | how far apart views place a surface that both see [mm]; an error beyond 30 mm (3 %
     of depth above 1 m), which `reconstruct` refuses
+views-agreement | error | later | the same of views of one camera: is a pose that of another frame?
 exposure | note |  | one surface is over 5 % brighter or more coloured in one image of a camera than in another
 exposure-rows | note |  | rows of one image are over 20 % brighter than others, unlike in the camera's other images
 joints | note, error | replay | which topics and velocities are used; an error where the robot's joints are missing

@@ -25,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
         config = replace(config, scene=replace(config.scene, max_splats=args.max_splats))
     if (args.source is None) == (args.dtu is None):
         raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
-    allowed = {"agreement", "views-scale"} if args.allow_disagreement or args.refine_poses else set()
+    allowed = {"views-agreement", "views-scale"} if args.allow_disagreement or args.refine_poses else set()
     source = open_to_train(
         recording_of(args, args.source),
         max_pose_jump=args.max_pose_jump,

@@ -38,8 +38,8 @@ def views_to_score(
     """The frames of the `scoring` cameras in time order.
 
     With a clock, what counts is the newest frame of each training camera not later than the view (a frame of the same
-    stamp counts); without one, every training frame of the recording, which is then read twice, each as
-    `corrected` has it.
+    stamp counts); without one, every training frame of the recording, which is then read twice. corrected: a frame at
+    the pose, exposure and depth that the scene was trained with.
     """
     if not has_clock:
         known = tuple(corrected(frame) for frame in frames_of(source) if frame.camera in training)
@@ -50,7 +50,8 @@ def views_to_score(
         return
     counts: Counter[str] = Counter()
     newest: dict[str, RgbdFrame] = {}
-    for moment in _moments(source):
+    for recorded in _moments(source):
+        moment = [corrected(frame) for frame in recorded]
         newest |= {frame.camera: frame for frame in moment if frame.camera in training}
         for frame in moment:
             if frame.camera in scoring:

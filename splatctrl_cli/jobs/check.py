@@ -21,9 +21,8 @@ from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
 
 NEVER = "never"
-OF_PAIRS = "agreement of two cameras"  # among the errors that a command allows
 _ALLOWING = {  # the options that take an error on
-    **dict.fromkeys(("agreement", "views-scale", "alignment"), "--allow-disagreement"),
+    **dict.fromkeys(("agreement", "views-agreement", "views-scale", "alignment"), "--allow-disagreement"),
     "pose-jump": "--max-pose-jump",
 }
 
@@ -77,10 +76,7 @@ def refuse_errors(path: Path, options: SourceOptions, command: str, allowed: Col
     accepts.
     """
     report = _report(CheckRequest(paths=(path,), options=options), None, only_errors=True)
-    errors = report.refusing(Need(command=command, lacks=()))
-    if OF_PAIRS in allowed:
-        errors = [f for f in errors if f.code != "agreement" or not f.where.startswith("cameras")]
-    errors = [f for f in errors if f.code not in allowed]
+    errors = [f for f in report.refusing(Need(command=command, lacks=())) if f.code not in allowed]
     if errors:
         first, more = errors[0], f"; {len(errors) - 1} more: splatctrl check {path}" if len(errors) > 1 else ""
         remedy = first.remedy or CHECKS[first.code].remedy
@@ -132,12 +128,16 @@ def _agreement(report: CheckReport) -> Iterator[Finding]:
         if pair.holds:
             good.append(pair.median)
             continue
-        where = f"camera {both[0]}" if len(both) == 1 else f"cameras {both[0]} and {both[1]}"
         text = f"depths differ by {1e3 * pair.median:.1f} mm (median of {pair.num_pixels} pixels that two views see)"
         text = f"{text}; expected at most {1e3 * pair.limit:.0f} mm"
         remedy = f"{CAUSES}: calibrate the cameras' poses again (splatctrl calibrate), or widen the range of depth"
-        remedy += f", or keep one with --cameras {both[0]}" if len(both) > 1 else ": is it the pose of another frame?"
-        yield error("agreement", where, text, remedy, value=round(1e3 * pair.median, 2), unit="mm")
+        value = round(1e3 * pair.median, 2)
+        if len(both) > 1:
+            remedy += f", or keep one with --cameras {both[0]}"
+            yield error("agreement", f"cameras {both[0]} and {both[1]}", text, remedy, value=value, unit="mm")
+        else:
+            remedy += ": is it the pose of another frame?"
+            yield error("views-agreement", f"camera {both[0]}", text, remedy, value=value, unit="mm")
     if good:
         text = f"where views see one surface their depths differ by {1e3 * max(good):.1f} mm (median of its pixels)"
         if len(good) > 1:

@@ -10,7 +10,7 @@ from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
-from splatctrl_cli.jobs.check import OF_PAIRS, refuse_errors
+from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.capture.capture_header import is_capture
@@ -76,8 +76,8 @@ def open_to_train(
     check_pose_jumps(source, max_pose_jump)
     if needs_depth:
         jumps = () if max_pose_jump == POSE_JUMP else ("pose-jump",)
-        later = (OF_PAIRS,)  # `CameraAgreement` asks it of the poses that the map is made with
-        refuse_errors(recording.path, recording.options, "reconstruct", (*allowed, *jumps, *later))
+        later = "agreement"  # asked by `CameraAgreement`, of the poses that the map is made with
+        refuse_errors(recording.path, recording.options, "reconstruct", (*allowed, *jumps, later))
     return source
 
 

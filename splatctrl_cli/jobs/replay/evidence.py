@@ -186,7 +186,7 @@ def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: Store
     The map is the one that states just before the set were judged by: it is oldest then. One that has taken in what
     other cameras saw at the same moment is better than any that a state is judged by until the next.
     """
-    swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras", {})
+    swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
     stamps: list[int] = []
     worst: list[Float64] = []

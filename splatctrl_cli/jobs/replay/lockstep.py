@@ -17,7 +17,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import Stopwatch, write_run
 from splatctrl_cli.formats.scene.voxel_file import read_seen, read_unrepresented
 from splatctrl_cli.formats.splat.splats import read_ply
-from splatctrl_cli.jobs.check import OF_PAIRS, refuse_errors
+from splatctrl_cli.jobs.check import refuse_errors
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest
 from splatctrl_cli.jobs.reconstruct.self_model import arm_seen
 from splatctrl_cli.jobs.recordings.open_recording import check_pose_jumps
@@ -104,7 +104,7 @@ def from_log(
     config = request.config
     source = _training_source(request, model, source)
     check_pose_jumps(source, request.max_pose_jump)
-    allowed = ("agreement", "views-scale", "alignment") if request.allow_disagreement else (OF_PAIRS,)
+    allowed = ("agreement", *(("views-agreement", "views-scale", "alignment") if request.allow_disagreement else ()))
     jumps = () if request.max_pose_jump == POSE_JUMP else ("pose-jump",)
     refuse_errors(request.log, request.options, "reconstruct", (*allowed, *jumps))
     place = folder / FOLDER

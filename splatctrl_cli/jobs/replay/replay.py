@@ -1,9 +1,9 @@
 """A replay from its request to its result: read, replay, measure, write."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names
@@ -46,7 +46,6 @@ from splatctrl_cli.jobs.replay.verdict import ASKED, replay_verdict
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.capture.capture_header import ROBOT
-from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
 
@@ -138,10 +137,11 @@ def _seen_by_cameras(
     request: ReplayRequest, inputs: ReplayInputs, replay: Replay
 ) -> tuple[Replay, list[Sight | None]]:
     """With the truth, and images of the worst moments: one pass over the frames for both."""
-    frames: Iterator[RgbdFrame] = frames_of(inputs.source) if inputs.source.cameras else iter(())
+    off = inputs.scene.figures().get("displaced_cameras") or {}
+    recorded = frames_of(inputs.source) if inputs.source.cameras else iter(())
     replay, surfaces = with_truth(inputs, replay)
-    if surfaces is not None:
-        frames = surfaces.watching(frames)
+    seen = (placed(frame, off) for frame in recorded)
+    frames = seen if surfaces is None else surfaces.watching(seen)
     sights = worst_sights(inputs, replay, request.worst_frames, frames)
     if surfaces is not None:
         for _ in frames:  # those that no moment needs

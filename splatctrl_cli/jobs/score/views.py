@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, spaced, thinned
@@ -70,6 +71,7 @@ class Scorer:
         """Score every view. Raises NotEvaluableError where there is none, or not one pixel of any was seen."""
         scene, source = self.scene, self.reference.source
         has_clock = scene.has_clock and source.has_clock
+        off = scene.run.get("metrics", {}).get("displaced_cameras") or {}
         stamps = sorted(snapshot.stamp_ns for snapshot in scene.snapshots) if has_clock else []
 
         @lru_cache(maxsize=1)  # a snapshot is read once for all the views it serves
@@ -84,7 +86,7 @@ class Scorer:
             training=scene.cameras,
             has_clock=has_clock,
             numbered_by_stamp=self.reference.numbered_by_stamp,
-            corrected=lambda frame: corrected(frame, scene.corrections),
+            corrected=lambda frame: corrected(placed(frame, off), scene.corrections),
         )
         may_train = self.allow_training or self.reference.scores_training
         wait = Wait(progress, f"scores {', '.join(self.cameras)}", "views").announce()
