@@ -257,7 +257,7 @@ def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: i
 def _stays_in_world(cells: Float64, seen: Bool, normals: Float64, poses: Float64) -> tuple[Bool, Bool]:
     """Cells (N,) whose surface a plane that stays in the world explains in the configurations (K, N) that see it: its
     normal does not turn, and it does not move along it by `STEP`. And cells (N,) that move by `STEP` at all: beside a
-    joint's axis nothing does. normals (N, 3), link frame; T_world_link (K, 4, 4).
+    joint's axis no cell does. normals (N, 3), link frame; T_world_link (K, 4, 4).
     """
     turned = np.einsum("kij,nj->kni", poses[:, :3, :3], normals)
     normal = np.einsum("kn,kni->ni", seen / np.maximum(seen.sum(axis=0), 1), turned)

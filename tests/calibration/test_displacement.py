@@ -99,7 +99,7 @@ def test_a_camera_that_is_off_is_placed_where_it_truly_stands(seen: tuple[Arm, l
 def test_a_camera_that_is_too_far_off_is_placed_rightly_or_stays_displaced(
     seen: tuple[Arm, list[RgbdFrame]], axis: int, move: float
 ) -> None:
-    """Where another surface lies at the robot's, its few pixels would tell of a small displacement."""
+    """A few pixels of another surface may agree with the robot's: they are no small displacement."""
     arm, frames = seen
     off = moved(frames, np.concatenate([np.full(3, 0.3 * move), move * np.eye(3)[axis]]))
     row = displaced_cameras(arm, off).get(CAMERA)

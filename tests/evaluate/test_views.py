@@ -1,6 +1,7 @@
 """Which views are scored, what counts as known at their time, and which points cameras saw."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -66,6 +67,17 @@ def test_only_training_cameras_count() -> None:
 
 def test_nothing_is_scored_where_no_frame_is() -> None:
     assert list(views_to_score(FakeSource([]), scoring=["a"], training=["b"], has_clock=True)) == []
+
+
+def test_a_log_is_scored_at_the_poses_that_its_scene_was_trained_at() -> None:
+    def corrected(frame: RgbdFrame) -> RgbdFrame:
+        return replace(frame, T_world_camera=2.0 * np.eye(4))
+
+    source = FakeSource(RECORDS)
+    views = [*views_to_score(source, scoring=["held/out"], training=["a"], has_clock=True, corrected=corrected)]
+    frames = [frame for view in views for frame in (view.frame, *view.training)]
+    assert len(frames) > len(views) > 0
+    assert all(np.array_equal(frame.T_world_camera, 2.0 * np.eye(4)) for frame in frames)
 
 
 def test_stamps_that_number_the_views_name_them() -> None:

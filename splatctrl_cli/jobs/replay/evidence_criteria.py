@@ -284,7 +284,7 @@ def belonging(judged: Judged) -> Iterator[Reason]:
 
 
 def displaced(judged: Judged) -> tuple[str, float] | None:
-    """Of the cameras that see the robot elsewhere, uncorrected, the one that is farthest off, and how far [m]."""
+    """The displaced camera that is farthest off, and how far [m]; None where all of them are corrected."""
     rows = judged.inputs.scene.figures().get("displaced_cameras") or {}
     off = {
         camera: 1e-3 * row["distance_mm"]

@@ -26,7 +26,7 @@ PERTURB = {"pose-error": 0.012, "pose-turn": 0.6, "seed": 5}
 
 @pytest.fixture(scope="module")
 def metrics(short_sample: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Of a reconstruction whose cameras are each 12 mm and 0.6 degrees off."""
+    """The metrics of a reconstruction of a log whose cameras are each 12 mm and 0.6 degrees off."""
     tabletop, out = short_sample / "tabletop", tmp_path_factory.mktemp("corrected") / "scene"
     words = [word for name, value in PERTURB.items() for word in ("--perturb", f"{name}={value}")]
     robot = ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
