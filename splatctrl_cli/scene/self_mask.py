@@ -342,8 +342,8 @@ def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -
     and its pixels (`self_mask`); the largest of them by size where it is judged (`self_mask_residual_mm`, None
     without any); points inside the robot (`inside_robot_points`), and the first step and link that had one.
 
-    A link is judged if `MASK_PIXELS` or more show it. Those of `holding` are left out if others remain: what they hold
-    has a surface that was itself learned.
+    A link is judged if `MASK_PIXELS` or more show it. Those of `holding` are left out if others remain, because the
+    surface of what they hold was itself learned.
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
     pixels = {link: sum(row.self_mask[link]["num_pixels"] for row in rows if link in row.self_mask) for link in links}
