@@ -9,8 +9,10 @@ which is exact where one ball is nearest to all of it. Triangles are halved unti
 at a corner agree to a tolerance. Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
 """
 
+import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -111,8 +113,8 @@ def coverage_of_solids(
 ) -> CoverageReport:
     """How `spheres` (links by the URDF's names) cover the collision surface of each link of `urdf`, its `solids`.
 
-    A link's surface may lie in spheres of any link that fixed joints join to it. Raises InputError for a sphere on a
-    link that is not there.
+    A link's surface may lie in spheres of any link that fixed joints join to it. A process measures the same robot
+    once. Raises InputError for a sphere on a link that is not there.
     """
     bodies = urdf.rigid_bodies()
     unknown = [link for link in spheres.links if link not in bodies]
@@ -120,6 +122,13 @@ def coverage_of_solids(
         raise InputError(
             f"sphere set: link '{unknown[0]}' is not in {urdf.path}", remedy=f"links there: {', '.join(urdf.links)}"
         )
+    return _measured(pickle.dumps((bodies, dict(solids), spheres, resolution)))
+
+
+@lru_cache(maxsize=8)
+def _measured(packed: bytes) -> CoverageReport:
+    """The coverage of rigid bodies, solids and spheres to a resolution, which only bytes make hashable."""
+    bodies, solids, spheres, resolution = pickle.loads(packed)
     leaders = {link: leader for link, (leader, _) in bodies.items()}
     measured = {leaders[link] for link in solids}
     links = []

@@ -1,12 +1,9 @@
 """One run: drawn from its seed, recorded, reconstructed, replayed, and its verdict put beside the truth."""
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from unittest.mock import patch
 
 import numpy as np
 
@@ -15,16 +12,12 @@ from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.replay import files, inputs
 from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import Box, Float64, Intrinsics, SphereSet
-from splatctrl_cli.robot.coverage import CoverageReport, coverage_of_solids
-from splatctrl_cli.robot.link_meshes import Solid
+from splatctrl_cli.records import Box, Float64, Intrinsics
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.urdf import UrdfFile
 from splatctrl_cli.simulate.arm import Motion, arm_spheres_yaml, arm_urdf
 from splatctrl_cli.simulate.primitives import Primitive, Track
 from splatctrl_cli.simulate.render import Camera
@@ -48,8 +41,6 @@ from tools.hunt.world import (
     placed,
     wrist_camera,
 )
-
-_COVERAGES: dict[object, CoverageReport] = {}  # of the robot used last
 
 FIRST_OF_ALL = 100  # the first seed whose campaigns have all families
 FIRST_OF_NEWEST = 500  # the same of those that came last
@@ -234,35 +225,34 @@ def _judged(trial: Trial, folder: Path, device: str = "cpu") -> tuple[Word, Repl
     """The chain's own word; None beside a refusal."""
     config, log, robot = config_of(trial), folder / "log.mcap", (folder / "robot.urdf", folder / "robot.yaml")
     try:
-        with _quick():
-            reconstruct(
-                ReconstructRequest(
-                    source=open_source(log),
-                    out=folder / "scene",
-                    config=config,
-                    urdf=robot[0],
-                    spheres=robot[1],
-                    box=box_of(trial),
-                    threads=1,
-                    device=device,
-                )
-            )
-            request = ReplayRequest(
-                log=log,
+        reconstruct(
+            ReconstructRequest(
+                source=open_source(log),
+                out=folder / "scene",
+                config=config,
                 urdf=robot[0],
                 spheres=robot[1],
-                out=folder / "replay",
-                config=config,
-                options=SourceOptions(),
-                scene=folder / "scene",
-                latency=trial.draft.fault.latency,
-                mode=trial.mode,
-                worst_frames=0,
+                box=box_of(trial),
                 threads=1,
+                device=device,
             )
-            if trial.draft.max_map_age is not None:
-                request = replace(request, max_map_age=trial.draft.max_map_age)
-            result = replay(request)
+        )
+        request = ReplayRequest(
+            log=log,
+            urdf=robot[0],
+            spheres=robot[1],
+            out=folder / "replay",
+            config=config,
+            options=SourceOptions(),
+            scene=folder / "scene",
+            latency=trial.draft.fault.latency,
+            mode=trial.mode,
+            worst_frames=0,
+            threads=1,
+        )
+        if trial.draft.max_map_age is not None:
+            request = replace(request, max_map_age=trial.draft.max_map_age)
+        result = replay(request)
         return word_of(result.verdict, result.replay.near, result.replay.margin), result
     except SplatCtrlError as error:
         return refused(error, folder), None
@@ -333,24 +323,3 @@ def _seen_from(camera: Camera, draft: Draft) -> Camera:
     zoom = draft.zoom
     lens = Intrinsics(fx=zoom * k.fx, fy=zoom * k.fy, cx=k.cx, cy=k.cy, width=k.width, height=k.height)
     return replace(camera, intrinsics=lens, T_world_camera=T)
-
-
-@contextmanager
-def _quick() -> Iterator[None]:
-    """Replays without their plots, which nobody looks at, and with the coverage of a robot measured once."""
-    with (
-        patch.object(files, "draw_replay", lambda *args, **kwargs: None),
-        patch.object(inputs, "coverage_of_solids", _coverage),
-    ):
-        yield
-
-
-def _coverage(
-    urdf: UrdfFile, solids: Mapping[str, Sequence[Solid]], spheres: SphereSet, **options: float
-) -> CoverageReport:
-    collides = re.sub("<visual>.*?</visual>", "", urdf.text, flags=re.DOTALL)
-    key = (collides, spheres.links, spheres.centers.tobytes(), spheres.radii.tobytes())
-    if key not in _COVERAGES:
-        _COVERAGES.clear()
-        _COVERAGES[key] = coverage_of_solids(urdf, solids, spheres, **options)
-    return _COVERAGES[key]
