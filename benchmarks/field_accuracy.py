@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.field_plots import write_plots
+from benchmarks.field_plots import PlanarBias, write_plots
 from benchmarks.measure import Limit, Options, Result, rms
 from benchmarks.surfaces import (
     LONE_SPLATS,
@@ -68,18 +68,6 @@ class Row:
     def is_kept(self) -> bool:
         """True where the RMSE is within the bar."""
         return self.whole.rmse is not None and self.whole.rmse <= self.bar
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlanarBias:
-    """What gpdf reads over a dense plane of centres: at heights (40,), beside ``z - l log(1 + z / l)`` [m]."""
-
-    length: float
-    heights: list[float]
-    measured: list[float]
-    closed_form: list[float]
-    largest_difference: float
-    at_10_cm: float
 
 
 def run(options: Options) -> Result:

@@ -1,9 +1,10 @@
 """The plots of docs/results.md, each of what the code reads now."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +16,24 @@ from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceField, Float64
 from tests.field.scenes import splat_set
 
-if TYPE_CHECKING:
-    from benchmarks.field_accuracy import PlanarBias
-
 COLORS = {"hard": "#4477aa", "gpdf": "#ccbb44", "se": "#ee6677", "safe": "#228833", "truth": "#000000"}
 DPI, WIDTH, HEIGHT = 90, 7.0, 3.6  # [px per inch], [inch]
 SPACING = 0.01  # [m]
 
 
-def write_plots(folder: Path, bias: Sequence["PlanarBias"]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class PlanarBias:
+    """What gpdf reads over a dense plane of centres: at heights (40,), beside ``z - l log(1 + z / l)`` [m]."""
+
+    length: float
+    heights: list[float]
+    measured: list[float]
+    closed_form: list[float]
+    largest_difference: float
+    at_10_cm: float
+
+
+def write_plots(folder: Path, bias: Sequence[PlanarBias]) -> None:
     """Write all of them."""
     folder.mkdir(parents=True, exist_ok=True)
     table = next(shape for shape in shapes(with_meshes=False) if shape.name == "tabletop")
@@ -38,7 +48,7 @@ def write_plots(folder: Path, bias: Sequence["PlanarBias"]) -> None:
         figure.savefig(folder / f"{name}.png", dpi=DPI, metadata={"Software": None})
 
 
-def draw_planar_bias(bias: Sequence["PlanarBias"]) -> Any:
+def draw_planar_bias(bias: Sequence[PlanarBias]) -> Any:
     """Measured readings over a plane on the curves of the closed form."""
     figure, axes = new_figure()
     axes.plot([0, 20], [0, 20], color=COLORS["truth"], linewidth=1, label="the true distance z")
