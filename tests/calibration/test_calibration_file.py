@@ -65,6 +65,7 @@ def test_a_calibration_reads_back_as_it_was_written(written: Path) -> None:
         ("version = 1", "version = 2", "expected version 1, got 2"),
         ("depth_scale = 1.02", "depth_scale = -1.02", "damaged"),
         ("depth_scale = 1.02", "depth_scale = nan", "damaged"),
+        ("depth_scale = 1.02", "depth_scale = 1000.0", "damaged"),
         ("depth_scale", "depth_scalf", "damaged"),
         ("[clock]", "[clock", "not TOML"),
     ],

@@ -103,11 +103,12 @@ def test_a_camera_that_stands_elsewhere_is_named_with_its_move(
     assert np.abs(corrected - original)[:3, 3].max() < 0.005
 
 
-def test_a_camera_of_automatic_exposure_is_named_with_its_ratio(table: Table) -> None:
+@pytest.mark.parametrize("darkened", [(1, 1, 1), (0, 0, 1)], ids=["exposure", "white balance"])
+def test_a_camera_of_automatic_exposure_is_named_with_its_ratio(table: Table, darkened: Sequence[int]) -> None:
     assert exposure_findings(table.few) == []
     stamps = sorted({frame.stamp_ns for frame in table.few})
-    brighter = {stamp: 1.0 - 0.2 * k / (len(stamps) - 1) for k, stamp in enumerate(stamps)}
-    off = [exposed(f, np.full(3, brighter[f.stamp_ns])) if f.camera == "cam1" else f for f in table.few]
+    gains = {stamp: 1.0 - 0.2 * np.array(darkened) * k / (len(stamps) - 1) for k, stamp in enumerate(stamps)}
+    off = [exposed(f, gains[f.stamp_ns]) if f.camera == "cam1" else f for f in table.few]
     (finding,) = exposure_findings(off)
     assert (finding.code, finding.where, finding.severity) == ("exposure", "camera cam1", Severity.NOTE)
     assert finding.value == pytest.approx(25.0, abs=4.0)

@@ -94,6 +94,15 @@ def test_a_bag_that_is_still_written_says_that_it_has_no_index(tmp_path: Path) -
     assert damage.notes == ["x.bag: has no index: cut, or still being written"]
 
 
+def test_a_bag_that_ends_between_two_entries_of_its_index_is_not_whole(tmp_path: Path) -> None:
+    bag = make_bag(tmp_path / "x.bag")
+    infos = [record for record in BagFile(bag).records(Damage()) if record.kind == 6]
+    bag.write_bytes(bag.read_bytes()[: infos[-1].offset])
+    found, damage = read(bag)
+    assert len(found) == 60
+    assert damage.notes == ["x.bag: its index is not whole"]
+
+
 @pytest.mark.parametrize("compression", COMPRESSIONS[1:])
 def test_a_damaged_chunk_costs_itself_alone(tmp_path: Path, compression: Bag1Writer.CompressionFormat) -> None:
     bag = make_bag(tmp_path / "x.bag", compression)
