@@ -4,56 +4,18 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.barriers import (
-    barrier_bound,
     can_bind,
-    external_gradient,
     fastest_approach,
-    is_immovable,
-    pair_gradient,
 )
 from splatctrl_cli.control.goals import pose_error, reference_velocity, rotation_vector
-from splatctrl_cli.control.limits import box_rows, velocity_box
+from splatctrl_cli.control.limits import velocity_box
 from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.control.terms import Barrier, BarrierTerm, Cost, CostTerm, State, reach_cost, stray_cost
 from splatctrl_cli.geometry import rotation_from_quat, transform_from
-from splatctrl_cli.kernels.chain import pair_gaps
-from tests.control.fakes import Balls, PlanarArm, Plane, far_away
+from tests.control.fakes import PlanarArm, far_away
 
 STEP = 1e-6
-
-
-@pytest.mark.parametrize("field", [Balls([[0.7, 0.5, 0.1]], [0.1]), Plane([0.6, 0.8, 0.0], -0.3, scale=0.7)])
-def test_external_gradient_is_the_derivative_of_the_sphere_clearance(field: Balls | Plane) -> None:
-    arm, q = PlanarArm(), np.array([0.4, -0.9])
-    gradient = external_gradient(field.query(arm.sphere_centers(q))[1], arm.sphere_jacobians(q))
-    for joint in range(2):
-        step = STEP * np.eye(2)[joint]
-        ahead, behind = (field.query(arm.sphere_centers(q + sign * step))[0] for sign in (1, -1))
-        np.testing.assert_allclose(gradient[:, joint], (ahead - behind) / (2 * STEP), atol=1e-8)
-
-
-def test_pair_gradient_is_the_derivative_of_the_pair_distance() -> None:
-    arm, q = PlanarArm(), np.array([0.4, 2.1])
-    radii = arm.sphere_set.radii
-    direction = pair_gaps(arm.sphere_centers(q), radii, arm.pairs)[1]
-    gradient = pair_gradient(direction, arm.sphere_jacobians(q), arm.pairs)
-    for joint in range(2):
-        step = STEP * np.eye(2)[joint]
-        ahead, behind = (pair_gaps(arm.sphere_centers(q + s * step), radii, arm.pairs)[0] for s in (1, -1))
-        np.testing.assert_allclose(gradient[:, joint], (ahead - behind) / (2 * STEP), atol=1e-8)
-
-
-def test_pair_distance_counts_both_radii() -> None:
-    distance, direction = pair_gaps(np.array([[0.0, 0, 0], [0, 3, 4]]), np.array([1.0, 0.5]), np.array([[0, 1]]))
-    assert distance[0] == pytest.approx(3.5)
-    np.testing.assert_allclose(direction[0], [0, -0.6, -0.8])
-
-
-def test_a_bound_is_zero_at_the_margin_and_grows_with_the_gain_and_the_rate() -> None:
-    np.testing.assert_allclose(barrier_bound(np.array([0.02, 0.12]), margin=0.02, gain=10.0), [0.0, 1.0])
-    np.testing.assert_allclose(barrier_bound(np.array([0.02]), margin=0.02, gain=10.0, rate=-0.3), [-0.3])
 
 
 def test_a_row_that_no_velocity_of_the_box_violates_cannot_bind() -> None:
@@ -61,10 +23,6 @@ def test_a_row_that_no_velocity_of_the_box_violates_cannot_bind() -> None:
     assert fastest_approach(G, lowest, highest)[0] == pytest.approx(1.5)
     assert can_bind(G, np.array([1.49]), lowest, highest)[0]
     assert not can_bind(G, np.array([1.5]), lowest, highest)[0]
-
-
-def test_rows_without_a_gradient_are_immovable() -> None:
-    assert is_immovable(np.array([[0.0, 0.0], [0.1, 0.0]]), np.ones(2)).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("outside", [-5.0, -0.05, 0.0, 0.05, 5.0])
@@ -83,13 +41,6 @@ def test_the_velocity_box_is_never_empty_and_points_back_inside(outside: float) 
 def test_an_unlimited_joint_keeps_its_velocity_limit() -> None:
     lowest, highest = velocity_box(np.zeros(1), np.array([-np.inf]), np.array([np.inf]), np.array([2.0]), 10.0)
     assert (lowest[0], highest[0]) == (-2.0, 2.0)
-
-
-def test_box_rows_say_the_same_as_the_box() -> None:
-    G, h = box_rows(np.array([-1.0, -2.0]), np.array([3.0, 4.0]))
-    assert np.all(G @ np.array([3.0, -2.0]) <= h)
-    assert not np.all(G @ np.array([3.1, 0.0]) <= h)
-    assert not np.all(G @ np.array([0.0, -2.1]) <= h)
 
 
 def test_task_costs_are_the_printed_squares_up_to_a_constant() -> None:
@@ -127,10 +78,6 @@ def test_the_reference_is_capped_in_norm_and_keeps_its_direction() -> None:
     error = np.array([3.0, 4, 0, 0.01, 0, 0])
     velocity = reference_velocity(error, gain=2.0, max_linear=0.25, max_angular=1.0)
     np.testing.assert_allclose(velocity, [0.15, 0.2, 0, 0.02, 0, 0])
-
-
-def test_spheres_are_named_by_link_and_place() -> None:
-    assert sphere_names(PlanarArm().sphere_set) == ("base[0]", "upper[0]", "upper[1]", "fore[0]", "fore[1]")
 
 
 class HoldElbow:
