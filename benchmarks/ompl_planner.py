@@ -17,8 +17,7 @@ from experiments.drawn_task import solids_of
 from experiments.paths import joint_length
 from experiments.problems import Problem
 from splatctrl_cli.config import PlannerConfig
-from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.edges import check_edges
+from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
 from splatctrl_cli.planner.path import resampled
 from splatctrl_cli.records import Float64
 

@@ -15,8 +15,7 @@ from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.goals import Detour, PlanDetour, pose_error
 from splatctrl_cli.control.replay import ReplayTask
 from splatctrl_cli.planner.birrt import Plan, PlanOutcome, plan
-from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance
-from splatctrl_cli.planner.edges import check_edges
+from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, check_edges
 from splatctrl_cli.planner.path import TimedPath, effector_rates, timed
 from splatctrl_cli.records import Float64
 

@@ -1,4 +1,4 @@
-"""The completion scripts: each shell takes its own, and it completes."""
+"""The completion scripts: each shell takes its own, and it completes; and words that are gone."""
 
 import shutil
 import subprocess
@@ -8,6 +8,8 @@ import pytest
 import shtab
 
 from splatctrl_cli.cli.commands import COMMANDS, SHELLS
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.cli.parser import GONE
 from tests.cli import here
 
 
@@ -58,3 +60,9 @@ def test_the_other_shells_accept_theirs_where_they_are_installed(shell: str, tmp
     if shutil.which(shell) is not None:
         (tmp_path / "script").write_text(script)
         assert subprocess.run([shell, "-n", tmp_path / "script"], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("words", GONE)
+def test_what_left_names_its_successor(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*words.removeprefix("splatctrl ").split(), "x"]) == 2
+    assert f"run {GONE[words]} instead" in capsys.readouterr().err

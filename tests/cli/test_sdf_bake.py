@@ -13,7 +13,7 @@ from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_names
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.grid_field import exact_channel
+from splatctrl_cli.field.grid_cells import exact_channel
 from splatctrl_cli.formats.grid import grid_formats
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
@@ -23,7 +23,7 @@ from splatctrl_cli.simulate.truth import load_truth
 from tests.cli import here
 from tests.cli.test_command_line import splatctrl
 from tests.field.scenes import cloud, splat_set
-from tests.jobs.stopped import interrupt
+from tests.jobs.stage import interrupt
 from tests.plain import known, plain_grid
 
 pytestmark = pytest.mark.usefixtures("unpainted")

@@ -15,11 +15,13 @@ from splatctrl_cli.control.events import (
     EventKind,
     Obstacle,
     Signal,
+    audit_signals,
     events_of,
     first_intervention,
+    stale_signal,
+    step_signals,
 )
-from splatctrl_cli.control.fallbacks import Rung
-from splatctrl_cli.control.signals import audit_signals, stale_signal, step_signals
+from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.step import ControlStep, Intervention, QpIkController, RowSlack
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import DistanceField, Float64

@@ -8,10 +8,9 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import MULTIPLIER
 from splatctrl_cli.control import barriers
-from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.open_loop import is_shaped
 from splatctrl_cli.control.preconditions import static_violations
-from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals
+from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, Rung
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError

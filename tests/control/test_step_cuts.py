@@ -9,7 +9,7 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import BallDistance
-from splatctrl_cli.control.fallbacks import Rung, descend
+from splatctrl_cli.control.qp import Rung, descend
 from splatctrl_cli.control.qp_rows import RowBuilder
 from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.control.step import QpIkController

@@ -4,12 +4,11 @@ import pytest
 from splatctrl_cli.config.fixed import VOXELS_PER_LENGTH
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.field import full_gp, voxel_density
-from splatctrl_cli.field.clustered_splats import Spheres
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField
 from splatctrl_cli.field.full_gp import conjugate_gradients, solve_process
-from splatctrl_cli.field.kernel import Matern12, SquaredExponential
 from splatctrl_cli.field.voxel_density import voxel_row_sums
-from splatctrl_cli.field.weights import weights_named
+from splatctrl_cli.field.weights import Matern12, SquaredExponential, weights_named
 from splatctrl_cli.geometry import rotation_from_quat
 from tests.field.scenes import cloud, queries
 from tests.reference import field as reference

@@ -12,8 +12,7 @@ from tqdm import tqdm
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
-from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.verdict import Verdict, brief
+from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
 from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker
 from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
 from splatctrl_cli.field.header import field_header
@@ -48,8 +47,12 @@ from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
 from splatctrl_cli.jobs.running.resume import deciding_versions, told_how_to_go_on
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
-from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
-from splatctrl_cli.report.reliability import reliability_picture
+from splatctrl_cli.report.field_pictures import (
+    gradient_picture,
+    probability_picture,
+    reliability_picture,
+    slices_picture,
+)
 
 FOLDER = "channels"
 CHECKPOINT = f"{FOLDER}/progress.json"

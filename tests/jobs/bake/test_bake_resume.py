@@ -26,7 +26,7 @@ from splatctrl_cli.jobs.bake.bake import BakeResult
 from splatctrl_cli.records import Label
 from tests.field.scenes import cloud, splat_set
 from tests.jobs.bake.baked import Said, baked
-from tests.jobs.stopped import contents, failing
+from tests.jobs.stage import contents, failing
 
 ROOT = Path(__file__).parents[3]
 CHANNELS = ("gradient", "bound", "observed", "label", "se")

@@ -19,7 +19,7 @@ from splatctrl_cli.jobs.compare import judged_runs
 from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, CompareResult, compare
 from splatctrl_cli.jobs.replay.metrics import metric_names
 from splatctrl_cli.jobs.report.report import WriteReportRequest, write_report
-from tests.jobs.runs import Runs
+from tests.jobs.stage import Runs
 
 OLDER = Path(__file__).parents[2] / "data" / "older.zip"
 NEAR = {"criterion": "clearance", "outcome": "failed", "sentence": "hand[9] is 4 mm away", "time_s": 1.5}
