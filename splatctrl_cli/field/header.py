@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from splatctrl_cli.config.fixed import MAX_RADIUS_SPREAD, ROUGH_LENGTH
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.obstacles import label_counts
+from splatctrl_cli.field.unknown import label_counts
 from splatctrl_cli.records import Label, SplatSet
 
 

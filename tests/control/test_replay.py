@@ -17,7 +17,7 @@ from splatctrl_cli.control.replay import Outcome, ReplayTask, Waypoint, _Course,
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.planner.path import timed
+from splatctrl_cli.planner.planned import timed
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 from tests.control.fakes import Balls, PlanarArm, far_away, num_on_rung

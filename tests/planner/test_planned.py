@@ -14,20 +14,18 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.birrt import plan
 from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.path import (
-    effector_rates,
-    resampled,
-    timed,
-)
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     NO_POSTURE,
     START_BLOCKED,
     approach_to,
+    effector_rates,
     goal_postures,
     path_to_nearest,
     planned_detours,
     planned_path,
+    resampled,
+    timed,
 )
 from splatctrl_cli.planner.solid_scene import Ball, Solids
 from splatctrl_cli.records import Float64

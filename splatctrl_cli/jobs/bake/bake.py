@@ -17,9 +17,9 @@ from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker
 from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
 from splatctrl_cli.field.header import field_header
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
-from splatctrl_cli.field.obstacles import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.field.report import grid_statistics
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
+from splatctrl_cli.field.unknown import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_json, write_run
 from splatctrl_cli.formats.grid.grid_format import GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.formats.grid.grid_formats import FORMATS, check_formats, write_grid

@@ -18,7 +18,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.jobs.export.export_run import ExportRunRequest, export_run
+from splatctrl_cli.jobs.export.export import ExportRunRequest, export_run
 from splatctrl_cli.recording.container.foxglove import read_foxglove
 from splatctrl_cli.records import SplatSet
 from splatctrl_cli.robot.model import RobotModel
