@@ -15,7 +15,7 @@ from splatctrl_cli.control.goals import Detour
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, Waypoint, _Course, closed_loop
 from splatctrl_cli.control.step import ControlStep
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.planned import timed
 from splatctrl_cli.records import Float64
@@ -92,12 +92,6 @@ def test_a_goal_out_of_reach_is_refused() -> None:
         closed_loop(PlanarArm(), CONFIG, task(T_world_goal=far), lambda _: NOTHING_NEAR)
     with pytest.raises(InputError, match="finite pose"):
         closed_loop(PlanarArm(), CONFIG, task(T_world_goal=np.full((4, 4), np.nan)), lambda _: NOTHING_NEAR)
-
-
-def test_a_start_in_collision_names_the_sphere_and_the_depth() -> None:
-    tip = PlanarArm().sphere_centers(START)[4]
-    with pytest.raises(NotEvaluableError, match=r"sphere fore\[1\] 0.0700 m deep"):
-        closed_loop(PlanarArm(), CONFIG, task(), lambda _: Balls([tip], [0.03]))
 
 
 def test_a_start_outside_the_limits_names_the_joint() -> None:

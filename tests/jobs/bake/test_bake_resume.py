@@ -58,13 +58,6 @@ def bake(splats: Path, out: Path, **more: Any) -> BakeResult:
     return baked(splats, out, **(options | more))
 
 
-@pytest.mark.usefixtures("small_slabs")
-def test_slabs_do_not_change_a_bit(splats: Path, whole: dict[str, Any], tmp_path: Path) -> None:
-    bake(splats, tmp_path / "field")
-    assert contents(tmp_path / "field") == whole
-    assert [path.name for path in tmp_path.iterdir()] == ["field"]
-
-
 def interrupted(splats: Path, out: Path, after: int) -> str:
     """What a person is told whose bake was stopped at that slab."""
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt) as stop:

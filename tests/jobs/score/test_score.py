@@ -16,6 +16,7 @@ from splatctrl_cli.evaluate.views import psnr
 from splatctrl_cli.formats.splat.gaussian_ply import write_gaussian_ply
 from splatctrl_cli.formats.splat.splats import FORMATS, as_gaussians, write_ply
 from splatctrl_cli.jobs.bake.request import read_bake_source
+from splatctrl_cli.jobs.compare.compare import CompareRequest, compare
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
 from splatctrl_cli.jobs.recordings.provenance import first_frame
 from splatctrl_cli.jobs.score import reference as score_reference
@@ -121,6 +122,7 @@ def test_the_output_folder_holds_scores_rows_pictures_and_the_run(scored: Path) 
     assert rows[2]["psnr_seen"] == ""
     run_json = json.loads((result.out / "run.json").read_text())
     assert run_json["metrics"] == report["metrics"]
+    assert compare(CompareRequest(runs=(result.out, result.out))).metrics["num_figures"] > 5
     assert set(run_json["inputs"]) == {"fake", "scene/splats.ply"}
 
 
