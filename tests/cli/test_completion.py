@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import shtab
 
-from splatctrl_cli.cli import main_module
+from splatctrl_cli.cli import main as main_module
 from splatctrl_cli.cli.commands import COMMANDS, SHELLS, Command, build_parser
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.parser import GONE, Parser
