@@ -58,16 +58,6 @@ def test_bakes_both_formats_a_header_and_a_run(tmp_path: Path, splats: Path) -> 
     assert json.loads((out / "run.json").read_text())["config"]["field"]["voxel"] == 0.05
 
 
-def test_box_voxel_and_formats_are_as_asked(tmp_path: Path, splats: Path) -> None:
-    out = tmp_path / "field"
-    result = here.splatctrl(
-        "sdf-bake", splats, "-o", out, "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1, *COARSE, "--formats", "npz"
-    )
-    assert result.returncode == 0
-    assert read_npz(out / "field.npz").channels["sdf"].shape == (3, 3, 5)
-    assert not (out / "field.vti").exists()
-
-
 def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
     result = here.splatctrl(
         "sdf-bake", splats, "-o", tmp_path / "field", "--voxel", 0.1, *COARSE, "--require", "num_splats>1000000"
