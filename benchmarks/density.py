@@ -9,8 +9,7 @@ from benchmarks.measure import Options, Result, rms, seconds
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.clusters import cluster_points
 from splatctrl_cli.field.distance import GpdfField, SeField
-from splatctrl_cli.field.kernel import Matern12, SquaredExponential
-from splatctrl_cli.field.voxel_density import voxel_row_sums
+from splatctrl_cli.field.weights import Matern12, SquaredExponential, voxel_row_sums
 from splatctrl_cli.records import Float64
 
 SIZES = (5_000, 50_000, 500_000)

@@ -17,9 +17,8 @@ from experiments.drawn_task import solids_of
 from experiments.paths import joint_length
 from experiments.problems import Problem
 from splatctrl_cli.config import PlannerConfig
-from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.edges import check_edges
-from splatctrl_cli.planner.path import resampled
+from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
+from splatctrl_cli.planner.planned import resampled
 from splatctrl_cli.records import Float64
 
 STEP, FINE = 0.05, 0.01  # [rad] of OMPL's edge check, and of the recheck

@@ -20,9 +20,8 @@ from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.planner.birrt import Plan, plan
-from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.edges import check_edges
-from splatctrl_cli.planner.path import TimedPath, resampled, timed
+from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
+from splatctrl_cli.planner.planned import TimedPath, resampled, timed
 from splatctrl_cli.records import Bool, Float64
 
 FRAME = "panda_grasptarget"

@@ -14,11 +14,11 @@ import numpy as np
 from benchmarks.measure import Options, Result, rms
 from benchmarks.surfaces import Shape, points_around, shapes, splats_on
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.clustered_splats import Spheres
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import make_field
 from splatctrl_cli.field.probability import CalibratedProbability, PaperProbability
 from splatctrl_cli.records import Float64
-from splatctrl_cli.report.reliability import Reliability, reliability, reliability_picture
+from splatctrl_cli.report.field_pictures import Reliability, reliability, reliability_picture
 
 SPACINGS = (0.01, 0.02)  # [m]
 NOISE = 0.002  # [m]

@@ -11,8 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.measure import Options, Result, seconds
-from splatctrl_cli.control.fallbacks import assemble
-from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QpSolver, QuadraticProgram
+from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QpSolver, QuadraticProgram, assemble
 from splatctrl_cli.control.terms import Barrier, reach_cost, stray_cost
 from splatctrl_cli.records import Float64
 

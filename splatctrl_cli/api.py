@@ -10,8 +10,14 @@ from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict
 from splatctrl_cli.jobs.bake.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake.request import BakeRequest
 from splatctrl_cli.jobs.compare.compare import CompareRequest, CompareResult, compare
-from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult, export
-from splatctrl_cli.jobs.export.export_run import ExportRunRequest, ExportRunResult, export_run
+from splatctrl_cli.jobs.export.export import (
+    ExportRequest,
+    ExportResult,
+    ExportRunRequest,
+    ExportRunResult,
+    export,
+    export_run,
+)
 from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
 from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest

@@ -18,9 +18,8 @@ from splatctrl_cli.evaluate.protocols import SURFACE_SCANS
 from splatctrl_cli.evaluate.verdict import verdict_of
 from splatctrl_cli.field.baker import Baker, Planes
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, GridLayout
-from splatctrl_cli.field.grid_field import GridField
-from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
+from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, GridField, GridLayout
+from splatctrl_cli.field.unknown import field_splats, obstacle_spheres
 from splatctrl_cli.files.output import (
     Stopwatch,
     output_path,
@@ -65,16 +64,16 @@ from splatctrl_cli.kernels import native, num_threads
 from splatctrl_cli.kernels.raster import ImageLoss, LossTerms
 from splatctrl_cli.libraries import is_installed, mpl, of_extra
 from splatctrl_cli.planner.birrt import plan
-from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, OnlyDistance
-from splatctrl_cli.planner.edges import check_edges
-from splatctrl_cli.planner.path import TimedPath, resampled
+from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, OnlyDistance, check_edges
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     START_BLOCKED,
     PlannedPath,
+    TimedPath,
     goal_postures,
     planned_detours,
     planned_path,
+    resampled,
 )
 from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.recording.calibrated import Perturbation

@@ -11,6 +11,7 @@ import pytest
 from splatctrl_cli.checks import limits
 from splatctrl_cli.config import Config, fixed, load_config
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.jobs.settings import resolved_settings, template_of, toml_of
 
 
 def test_nothing_given_is_the_defaults() -> None:
@@ -28,18 +29,8 @@ def test_assignments_win_over_the_file_and_the_file_over_the_defaults(tmp_path: 
     assert config.occupancy.rule == "literal"
 
 
-def test_what_is_written_reads_back(tmp_path: Path) -> None:
-    config = load_config(None, ["scene.fill=0.5", "scene.depth_loss=printed"])
-    path = tmp_path / "again.toml"
-    lines = []
-    for section, values in config.as_dict().items():
-        lines += [f"[{section}]", *(f"{key} = {value!r}" for key, value in values.items())]
-    path.write_text("\n".join(lines))
-    assert load_config(path, []) == config
-
-
 @pytest.mark.parametrize(
-    ("assignment", "words"),
+    ("assignments", "words"),
     [
         ("scene.max_splat=9", "unknown key scene.max_splat; did you mean scene.max_splats?"),
         ("scen.max_splats=9", "unknown key scen; did you mean scene?"),
@@ -62,11 +53,25 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
             "occupancy.free_below=0.9",
             "occupancy.free_below: expected at most occupancy.occupied_above = 0.7, got 0.9",
         ),
+        ("scene.min_radius=0.03", "scene.min_radius: expected at most scene.max_radius = 0.02 m, got 0.03"),
+        ("occupancy.voxel=0.01", "occupancy.voxel: expected at least scene.max_radius = 0.02 m, got 0.01"),
+        (
+            "control.barrier_gain=101",
+            "control.barrier_gain: expected at most 1 / control.period = 100 1/s, got 101.0",
+        ),
+        ("control.period=0.05 control.pose_gain=21 control.barrier_gain=1", "pose_gain"),
+        (
+            "control.posture_gain=200",
+            "control.posture_gain: expected at most 1 / control.period = 100 1/s, got 200.0",
+        ),
+        ("control.self_slack_cost=10", "control.self_slack_cost: expected at least control.slack_cost = 1000"),
+        ("control.period=0.1 control.max_time=0.05", "control.max_time: expected at least"),
+        ("planner.shortest=2", "planner.shortest: expected at most planner.reach = 1.5 rad, got 2.0"),
     ],
 )
-def test_what_cannot_be_is_named(assignment: str, words: str) -> None:
+def test_what_cannot_be_or_contradicts_is_named(assignments: str, words: str) -> None:
     with pytest.raises(UsageError) as refused:
-        load_config(None, [assignment])
+        load_config(None, assignments.split())
     assert words in str(refused.value)
 
 
@@ -90,31 +95,6 @@ def test_files_that_are_missing_or_no_toml_are_named(tmp_path: Path) -> None:
     (tmp_path / "flat.toml").write_text("scene = 3\n")
     with pytest.raises(UsageError, match="scene: expected a table, got 3"):
         load_config(tmp_path / "flat.toml", [])
-
-
-@pytest.mark.parametrize(
-    ("assignments", "words"),
-    [
-        (["scene.min_radius=0.03"], "scene.min_radius: expected at most scene.max_radius = 0.02 m, got 0.03"),
-        (["occupancy.voxel=0.01"], "occupancy.voxel: expected at least scene.max_radius = 0.02 m, got 0.01"),
-        (
-            ["control.barrier_gain=101"],
-            "control.barrier_gain: expected at most 1 / control.period = 100 1/s, got 101.0",
-        ),
-        (["control.period=0.05", "control.pose_gain=21", "control.barrier_gain=1"], "pose_gain"),
-        (
-            ["control.posture_gain=200"],
-            "control.posture_gain: expected at most 1 / control.period = 100 1/s, got 200.0",
-        ),
-        (["control.self_slack_cost=10"], "control.self_slack_cost: expected at least control.slack_cost = 1000"),
-        (["control.period=0.1", "control.max_time=0.05"], "control.max_time: expected at least"),
-        (["planner.shortest=2"], "planner.shortest: expected at most planner.reach = 1.5 rad, got 2.0"),
-    ],
-)
-def test_values_that_contradict_each_other_are_named(assignments: list[str], words: str) -> None:
-    with pytest.raises(UsageError) as refused:
-        load_config(None, assignments)
-    assert words in str(refused.value)
 
 
 def test_values_may_pass_each_other_on_the_way(tmp_path: Path) -> None:
@@ -162,3 +142,46 @@ def test_every_fixed_number_says_what_it_decides(module: ModuleType) -> None:
     source = inspect.getsource(module)
     told = re.findall(r"^(\w+) = .*?  # \S", source, re.MULTILINE)
     assert told == [name for name in vars(module) if name.isupper()]
+
+
+GIVEN = ["scene.max_splats=9", "preset=paper", "control.max_acceleration=[1.0, 2.5]"]
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "my.toml"
+    path.write_text("[scene]\nmax_splats = 7\nfill = 0.5\n[control]\nbarrier_gain = 4\n")
+    return path
+
+
+def test_each_value_says_where_it_comes_from(file: Path) -> None:
+    found = {setting.name: (setting.value, setting.source) for setting in resolved_settings(file, GIVEN)}
+    assert found["scene.max_splats"] == (9, "--set")
+    assert found["scene.fill"] == (0.5, str(file))
+    assert found["control.barrier_gain"] == (4.0, str(file))
+    assert found["control.program"] == ("printed", "--preset paper")
+    assert found["control.margin"] == (Config().control.margin, "default")
+    num_keys = sum(len(section) for section in Config().as_dict().values())
+    assert len(found) == num_keys
+
+
+def test_what_is_printed_is_a_file_with_the_same_settings(file: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again.toml"
+    again.write_text("\n".join(toml_of(resolved_settings(file, GIVEN))))
+    assert load_config(again, []) == load_config(file, GIVEN)
+    assert f"fill = 0.5  # {file} (default: 0.85)" in again.read_text()
+
+
+def test_a_template_sets_nothing_and_uncommented_the_defaults(tmp_path: Path) -> None:
+    path, lines = tmp_path / "template.toml", [*template_of(resolved_settings(None, []))]
+    path.write_text("\n".join(lines))
+    assert load_config(path, []) == Config()
+    keys = [line.removeprefix("# ") for line in lines if line.startswith("[") or " = " in line.split(";")[0]]
+    path.write_text("\n".join(keys))
+    assert load_config(path, []) == Config()
+    assert "# budget of splats (IV-C); ten million take 2 GB; 1 to 10000000" in lines
+    assert "# max_splats = 5000" in lines
+
+
+def test_a_template_has_no_value_that_is_given() -> None:
+    assert [*template_of(resolved_settings(None, GIVEN))] == [*template_of(resolved_settings(None, []))]

@@ -16,7 +16,7 @@ from splatctrl_cli.cli.commands import COMMANDS, build_parser
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.parser import GONE
 from splatctrl_cli.config import PRESETS, load_config
-from splatctrl_cli.evaluate.gates import check_gate_names
+from splatctrl_cli.evaluate.verdict import check_gate_names
 from splatctrl_cli.jobs.replay.metrics import metric_names
 
 ROOT = Path(__file__).parent.parent

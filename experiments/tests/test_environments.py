@@ -13,7 +13,7 @@ from experiments.environments import ENVIRONMENTS, Environment, drawn, ring_of_c
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.path import resampled
+from splatctrl_cli.planner.planned import resampled
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.primitives import signed_distance

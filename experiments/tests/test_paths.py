@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.paths import effector_length, joint_length, least_clearance
-from splatctrl_cli.planner.path import resampled
+from splatctrl_cli.planner.planned import resampled
 from tests.control.fakes import PlanarArm
 from tests.planner.walls import clearance, one_wall, thin_post
 

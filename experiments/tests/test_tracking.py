@@ -9,7 +9,7 @@ from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.planner.birrt import plan
-from splatctrl_cli.planner.path import timed
+from splatctrl_cli.planner.planned import timed
 from tests.control.fakes import Balls, PlanarArm
 from tests.planner.walls import clearance, one_wall, thin_post
 

@@ -10,7 +10,7 @@ from experiments.problems import Problem, read_problem
 from experiments.ways import Surroundings, beside_the_start, plain_ways
 from splatctrl_cli.config import Config
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.planner.path import resampled
+from splatctrl_cli.planner.planned import resampled
 from splatctrl_cli.records import Bool, Float64, UInt8
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 

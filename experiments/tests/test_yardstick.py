@@ -5,7 +5,7 @@ import pytest
 
 from experiments.yardstick import Motion, Yardstick, proved_clearance
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.planner.path import resampled
+from splatctrl_cli.planner.planned import resampled
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, PlanarArm
 

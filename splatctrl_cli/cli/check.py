@@ -1,8 +1,9 @@
-"""``splatctrl check`` and ``info``: what is wrong with a recording, and what a file holds."""
+"""``splatctrl check``, ``info``, ``ingest``: what is wrong with a recording, what a file holds, its capture."""
 
 import argparse
 import textwrap
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 
 from splatctrl_cli.checks.finding import CheckReport
 from splatctrl_cli.cli.common import Console, shown, table
@@ -10,6 +11,7 @@ from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.errors import DAMAGED
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.check import CheckRequest, check
+from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
 from splatctrl_cli.recording.source import describe
 
 WIDTH = 118  # columns of text
@@ -122,3 +124,19 @@ def _fact(value: object) -> str:
     if not isinstance(value, float):
         return "-" if value is None else str(value)
     return f"{value:.6f}".rstrip("0").rstrip(".") if value == 0 or abs(value) >= 1e-3 else f"{value:.6g}"
+
+
+def run_ingest(args: argparse.Namespace) -> int:
+    console = Console(args)
+    request = request_of(IngestRequest, args, paths=tuple(args.source), options=source_options(args))
+    return show_ingested(console, ingest(request, console))
+
+
+def show_ingested(console: Console, result: IngestResult) -> int:
+    """Frames by camera, and what was lost."""
+    lost = asdict(result.summary.loss)
+    lines = table(["camera", "frames"], sorted(result.summary.num_frames.items()))
+    lines += [f"{name.replace('_', ' ')}: {value}" for name, value in lost.items() if value and name != "notes"]
+    lines += [f"note: {note}" for note in lost["notes"]]
+    lines += [f"joint states: {result.summary.num_joint_states}", f"wrote {result.capture}"]
+    return console.result({"capture": str(result.capture), **result.metrics}, lines, code=result.exit_code)

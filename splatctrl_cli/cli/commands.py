@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatctrl_cli import __version__
-from splatctrl_cli.cli import recording_options, run_options, scene_options
+from splatctrl_cli.cli import run_options, scene_options
 from splatctrl_cli.cli.options import (
     BASE,
     COMMON,
@@ -23,7 +23,7 @@ from splatctrl_cli.cli.options import (
     settings,
 )
 from splatctrl_cli.cli.parser import Adds, Parser, add_all, either, group, option, real, whole
-from splatctrl_cli.cli.replay_options import REPLAY
+from splatctrl_cli.cli.scene_options import REPLAY
 
 EXIT_CODES = """\
 exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 3 done, but part of the input was
@@ -159,32 +159,32 @@ COMMANDS = {
         summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth",
         examples=("simulate -o out/log", "simulate --urdf fr3.urdf --packages franka_description -o out/fr3"),
         run="demo:run_simulate",
-        options=recording_options.SIMULATE,
+        options=run_options.SIMULATE,
     ),
     "ingest": Command(
         summary="turn a log or image folder into a capture folder",
         examples=(f"ingest {LOG} -o out/x.capture", "ingest run1.bag run2.bag --cameras front,wrist"),
-        run="recordings:run_ingest",
-        options=recording_options.INGEST,
+        run="check:run_ingest",
+        options=run_options.INGEST,
     ),
     "info": Command(
         summary="describe a log, capture, scene, grid, robot or other file",
         examples=(f"info {LOG}", "info out/scene --json"),
         run="check:run_info",
-        options=recording_options.INFO,
+        options=run_options.INFO,
     ),
     "check": Command(
         summary="say what is wrong with a log, capture or image folder",
         examples=(f"check {LOG} {ROBOT}", "check run.bag --quick --fail-on warning"),
         run="check:run",
         judges=True,
-        options=recording_options.CHECK,
+        options=run_options.CHECK,
     ),
     "calibrate": Command(
         summary="place cameras against each other and the robot, from what they recorded",
         examples=(f"calibrate {LOG} {ROBOT}", "calibrate two_cameras.toml --hold front -o rig.toml"),
         run="calibrate:run",
-        options=recording_options.CALIBRATE,
+        options=run_options.CALIBRATE,
     ),
     "reconstruct": Command(
         summary="fit splats to a log, a capture or a DTU scan",

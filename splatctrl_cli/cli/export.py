@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult, export
-from splatctrl_cli.jobs.export.export_run import ExportRunRequest, export_run
+from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult, ExportRunRequest, export, export_run
 from splatctrl_cli.records import Label
 
 SHOWN = {  # of Differences: what the table calls it, and the unit it is shown in

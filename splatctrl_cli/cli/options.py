@@ -14,7 +14,7 @@ from splatctrl_cli.config import PRESETS
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, shown
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.gates import gate
+from splatctrl_cli.evaluate.verdict import gate
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics, PoseTopic, SourceOptions
 
 T = TypeVar("T")

@@ -1,8 +1,15 @@
 """Every number of the method, by section of the paper. The paper's value is the default where it gives one."""
 
 from splatctrl_cli.config.load import PRESETS, Config, check_voxel, load_config, sources_of
-from splatctrl_cli.config.map import FieldConfig, HumanConfig, OccupancyConfig, SceneConfig
-from splatctrl_cli.config.motion import ControlConfig, PlannerConfig, VerdictConfig
+from splatctrl_cli.config.sections import (
+    ControlConfig,
+    FieldConfig,
+    HumanConfig,
+    OccupancyConfig,
+    PlannerConfig,
+    SceneConfig,
+    VerdictConfig,
+)
 
 __all__ = [
     "PRESETS",

@@ -11,9 +11,16 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
-from splatctrl_cli.config.map import FieldConfig, HumanConfig, OccupancyConfig, SceneConfig
-from splatctrl_cli.config.motion import ControlConfig, PlannerConfig, VerdictConfig
 from splatctrl_cli.config.ranges import Section, Within, check, cut, shown
+from splatctrl_cli.config.sections import (
+    ControlConfig,
+    FieldConfig,
+    HumanConfig,
+    OccupancyConfig,
+    PlannerConfig,
+    SceneConfig,
+    VerdictConfig,
+)
 from splatctrl_cli.errors import InputError, UsageError, did_you_mean
 
 

@@ -16,9 +16,8 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.barriers import SceneRows, SelfRows, can_bind, is_immovable
-from splatctrl_cli.control.fallbacks import Choice, Rung, held, is_usable
 from splatctrl_cli.control.limits import box_rows
-from splatctrl_cli.control.qp import QpSolver, QuadraticProgram
+from splatctrl_cli.control.qp import Choice, QpSolver, QuadraticProgram, Rung, held, is_usable
 from splatctrl_cli.control.terms import NO_SPHERE, Barrier, BarrierTerm, Cost, State, configured_weights
 from splatctrl_cli.records import Bool, DistanceField, Float64
 

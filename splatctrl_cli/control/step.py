@@ -11,11 +11,10 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import MULTIPLIER, STEP_SCALES, WITHIN_SHARE
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import BallDistance
-from splatctrl_cli.control.fallbacks import Choice, Rung, descend, held
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.preconditions import check_coverage, check_model, checked_posture
-from splatctrl_cli.control.qp import SOLVERS, QpSolver, unsolved
+from splatctrl_cli.control.qp import SOLVERS, Choice, QpSolver, Rung, descend, held, unsolved
 from splatctrl_cli.control.qp_rows import PRINTED, RowBuilder, Rows, solve_printed
 from splatctrl_cli.control.terms import BarrierTerm, Cost, CostTerm, ReachGoal, RowKind, State, standard_costs, summed
 from splatctrl_cli.records import Bool, DistanceField, Float64

@@ -14,7 +14,7 @@ from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS, 
 from splatctrl_cli.evaluate.views import seen_by
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, Index, RgbdFrame
-from splatctrl_cli.report.reliability import Reliability, reliability
+from splatctrl_cli.report.field_pictures import Reliability, reliability
 from splatctrl_cli.robot.mesh_distance import MeshDistance
 
 

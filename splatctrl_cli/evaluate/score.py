@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import IN_FRONT
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, psnr, published_ssim, ssim_map
 from splatctrl_cli.evaluate.metrics import (
     BAD_SHARE,
     DECIBELS,
@@ -20,6 +19,7 @@ from splatctrl_cli.evaluate.metrics import (
     Better,
     Scale,
 )
+from splatctrl_cli.evaluate.views import DepthErrors, depth_errors, psnr, published_ssim, ssim_map
 from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, SplatSet
 from splatctrl_cli.voxels import OccupancyGrid
 

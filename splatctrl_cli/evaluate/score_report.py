@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import OTHER_VIEW_CLEARLY, SAME_PLACE_DEGREES, SAME_PLACE_METRES
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.held_out_depth import CLOUD_SCALES
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS
 from splatctrl_cli.evaluate.score import metric_scales
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, counted, gate_reasons, noted, verdict_of
 from splatctrl_cli.evaluate.views import View
 from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.records import Bool, Float64

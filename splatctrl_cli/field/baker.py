@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.field.clustered_splats import Spheres
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, SeField, SphereField
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, RESOLUTION, GridLayout, observed_planes
 from splatctrl_cli.field.on_device import device_field

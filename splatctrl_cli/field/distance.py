@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import MARCH_STEPS, SIGNED_CARE
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.field.clustered_splats import Spheres, checked_points, not_finite, shaped_points
-from splatctrl_cli.field.kernel import Matern12, SquaredExponential
-from splatctrl_cli.field.weights import weights_named
+from splatctrl_cli.field.clusters import Spheres, checked_points, not_finite, shaped_points
+from splatctrl_cli.field.weights import Matern12, SquaredExponential, weights_named
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import GridSpan, LogSumExp
 from splatctrl_cli.records import DistanceField, Float32, Float64

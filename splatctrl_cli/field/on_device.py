@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.clustered_splats import Spheres, checked_points
+from splatctrl_cli.field.clusters import Spheres, checked_points
 from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, LogSumExpField, SeField
 from splatctrl_cli.field.grid_cells import RESOLUTION
 from splatctrl_cli.kernels.cuda.field import Answers, Choice, DeviceField

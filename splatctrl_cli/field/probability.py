@@ -10,9 +10,9 @@ from scipy.special import log_ndtr, ndtr
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import CERTAIN_OCCUPANCY, LEAST_VARIANCE, VARIANCE_DIVISOR
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.field.clustered_splats import Spheres, checked_points
+from splatctrl_cli.field.clusters import Spheres, checked_points
 from splatctrl_cli.field.distance import GpdfField
-from splatctrl_cli.field.kernel import Matern12
+from splatctrl_cli.field.weights import Matern12
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import GridSpan
 from splatctrl_cli.records import Float32, Float64

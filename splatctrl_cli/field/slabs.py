@@ -10,8 +10,7 @@ from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker, Planes
 from splatctrl_cli.field.grid_cells import GridLayout, check_memory, check_room, observed_planes
 from splatctrl_cli.field.header import field_header
-from splatctrl_cli.field.obstacles import DEFAULT_LABELS, field_splats
-from splatctrl_cli.field.unknown import BOUND, Cubes, apply_unknown, blank
+from splatctrl_cli.field.unknown import BOUND, DEFAULT_LABELS, Cubes, apply_unknown, blank, field_splats
 from splatctrl_cli.kernels.field import BLOCK
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Label, SplatSet, UInt8
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState

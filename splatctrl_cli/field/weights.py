@@ -1,15 +1,296 @@
-"""Weights of the splats in the occupancy field (paper, III-D)."""
+"""Kernels of the Gaussian-process distance field, and the weights of the splats in it (paper, III-D): by row sums, by
+a voxel grid in linear time, and by the full process of eq. 8.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import product
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfftn, rfftn
+from scipy.sparse import csr_array, eye_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from splatctrl_cli.field.clustered_splats import Spheres
-from splatctrl_cli.field.full_gp import solve_process
-from splatctrl_cli.field.kernel import Kernel, Matern12
-from splatctrl_cli.field.voxel_density import voxel_row_sums
-from splatctrl_cli.records import Float32, Float64
+from splatctrl_cli.config.fixed import (
+    CG_FLOOR,
+    CG_ITERATIONS,
+    CG_MAX_SPREAD,
+    CG_TOLERANCE,
+    KERNEL_MAX_SHARE,
+    KERNEL_REACH,
+    VOXELS_PER_LENGTH,
+)
+from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.field.clusters import ClusteredPoints, Spheres
+from splatctrl_cli.field.grid_cells import available_memory
+from splatctrl_cli.kernels import field as native
+from splatctrl_cli.records import Float32, Float64, Index
+
+KernelValue = Callable[[Float64], Float64]
+NODES = 96  # of a block along each axis: a size that transforms fast, 7 MiB
+MAX_BLOCKS = 2000
+
+
+def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Float64:
+    """``sum_j k(|p_i - p_j|)`` (N,) of centres (N, 3) [m], j = i included, in time linear in N.
+
+    Each centre is one unit spread over the eight nodes around it (trilinear), the nodes are convolved with the
+    kernel, and each centre reads the result back from its eight nodes. What that makes of a centre's own term is
+    known, and replaced by k(0) = 1. Spreading and reading back blur the kernel by a third of h^2 along each axis: the
+    nodes are convolved with ``2 k - (mean of k at the six neighbours)``, which undoes that to second order in h.
+
+    The grid is made in blocks of `NODES`, those alone in which two centres can meet. Raises UsageError for more than
+    `MAX_BLOCKS` of them.
+    """
+    voxel, reach = length / VOXELS_PER_LENGTH, KERNEL_REACH * VOXELS_PER_LENGTH
+    nodes = (centers - centers.min(axis=0)) / voxel
+    cells = np.floor(nodes).astype(np.int64)
+    share = nodes - cells
+    sampled = _sampled_kernel(kernel, voxel, reach)
+    result = 1.0 - _own_terms(share, sampled[reach:, reach:, reach:])
+    meetings = [block for block in _blocks(cells, reach) if len(block[1]) > 1]
+    if len(meetings) > MAX_BLOCKS:
+        raise UsageError(
+            f"field.weights = voxel: expected at most {MAX_BLOCKS} blocks of voxels with splats, got {len(meetings)}",
+            remedy="set field.weights = rowsum, which is fast on splats this far apart, or a larger length scale",
+        )
+    transformed = _transformed_kernel(sampled)
+    alone = np.ones(len(centers), np.bool_)
+    for first, near, own in meetings:
+        density = _convolved(_spread(cells[near] - first, share[near]), transformed)
+        result[own] += _read(density, cells[own] - first, share[own])
+        alone[own] = False
+    result[alone] = 1.0
+    return result
+
+
+def _blocks(cells: Index, reach: int) -> list[tuple[Index, Index, Index]]:
+    """First node (3,) of each block, the centres that can reach its inner cells, and the centres in those."""
+    inner = NODES - 2 * reach - 1  # the cells whose eight nodes no mass from beyond the block reaches
+    blocks, which = np.unique(cells // inner, axis=0, return_inverse=True)
+    order = np.argsort(which.ravel(), kind="stable")
+    bounds = np.searchsorted(which.ravel()[order], np.arange(len(blocks) + 1))
+    members = {(x, y, z): order[bounds[b] : bounds[b + 1]] for b, (x, y, z) in enumerate(blocks.tolist())}
+    steps = list(product((-1, 0, 1), repeat=3))
+    found = []
+    for (x, y, z), own in members.items():
+        around = [members.get((x + i, y + j, z + k)) for i, j, k in steps]
+        near = np.concatenate([some for some in around if some is not None])
+        first = inner * np.array([x, y, z]) - reach
+        local = cells[near] - first
+        found.append((first, near[((local >= -1) & (local < NODES)).all(axis=1)], own))
+    return found
+
+
+def _sampled_kernel(kernel: KernelValue, voxel: float, reach: int) -> Float64:
+    """The sharpened kernel (2 reach + 1,) * 3 between nodes, zero beyond `reach` nodes."""
+    axis = np.arange(-reach - 1, reach + 2) * voxel
+    distance = np.sqrt(axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2)
+    value = kernel(distance)
+    inner = slice(1, -1)
+    neighbours = (
+        *(value[:-2, inner, inner], value[2:, inner, inner], value[inner, :-2, inner]),
+        *(value[inner, 2:, inner], value[inner, inner, :-2], value[inner, inner, 2:]),
+    )
+    sharpened = 2.0 * value[inner, inner, inner] - sum(neighbours) / 6.0
+    return np.asarray(np.where(distance[inner, inner, inner] <= reach * voxel, sharpened, 0.0))
+
+
+def _own_terms(share: Float64, kernel: Float64) -> Float64:
+    """What each centre (N,) reads back of itself: the kernel between its nodes, by the products of their shares."""
+    same = share**2 + (1.0 - share) ** 2  # of an axis, that the mass and the reading fall on the same node
+    pair = np.stack([same, 1.0 - same])
+    return np.asarray(
+        sum(pair[x, :, 0] * pair[y, :, 1] * pair[z, :, 2] * kernel[x, y, z] for x, y, z in product((0, 1), repeat=3))
+    )
+
+
+def _transformed_kernel(sampled: Float64) -> NDArray[np.complex128]:
+    size = len(sampled)
+    padded = np.zeros((NODES,) * 3)
+    padded[:size, :size, :size] = sampled
+    return np.asarray(rfftn(np.roll(padded, -(size // 2), axis=(0, 1, 2))))
+
+
+def _convolved(mass: Float64, transformed: NDArray[np.complex128]) -> Float64:
+    """The circular convolution: what wraps around stays within `reach` of the block's faces."""
+    return np.asarray(irfftn(rfftn(mass) * transformed, s=mass.shape))
+
+
+def _corners(cells: Index, share: Float64) -> list[tuple[Index, Float64]]:
+    """Of the eight nodes around each centre: the index (N, 3), and the centre's share of it (N,)."""
+    return [
+        (cells + np.array(step), np.asarray(np.prod(np.where(step, share, 1.0 - share), axis=1)))
+        for step in product((0, 1), repeat=3)
+    ]
+
+
+def _spread(cells: Index, share: Float64) -> Float64:
+    """Units spread over the nodes of a block (NODES,) * 3; what falls beyond it is left out."""
+    mass = np.zeros(NODES**3)
+    for node, part in _corners(cells, share):
+        is_inside = ((node >= 0) & (node < NODES)).all(axis=1)
+        index = np.ravel_multi_index(tuple(node[is_inside].T), (NODES,) * 3)
+        mass += np.bincount(index, weights=part[is_inside], minlength=NODES**3)
+    return mass.reshape((NODES,) * 3)
+
+
+def _read(density: Float64, cells: Index, share: Float64) -> Float64:
+    """The density (N,) at the centres."""
+    return np.asarray(sum(part * density[tuple(node.T)] for node, part in _corners(cells, share)))
+
+
+BYTES_PER_PAIR = 44  # of the matrix and of the pairs that it is made of; 40 were measured
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solution:
+    """M of eq. 12 (N,) as ``scaled exp(log_scale)``, the iterations it took, and the largest residual that is left.
+
+    The residual is of a row, over the largest value asked for in the group of splats that the row belongs to.
+    """
+
+    scaled: Float64
+    log_scale: Float64
+    num_iterations: int
+    residual: float
+
+
+def solve_process(
+    centers: Float64, log_values: Float64, length: float, kernel: KernelValue, noise: float
+) -> Solution:
+    """``(K(P, P) + noise I)^-1 y`` (eq. 8, 12) for centres (N, 3) [m] and y = exp(log_values) (N,).
+
+    The kernel is cut off at 8 l. Splats that it does not join are groups apart, each with values scaled by its own
+    largest: y of a Matern kernel is ``e^(r / l)``, which overflows. Raises UsageError where the matrix does not fit
+    the memory or a group's values are too far apart, NotEvaluableError where the iteration does not converge.
+    """
+    matrix = _kernel_matrix(centers, length, kernel, noise)
+    num_groups, group = connected_components(matrix, directed=False)
+    largest, smallest = np.full(num_groups, -np.inf), np.full(num_groups, np.inf)
+    np.maximum.at(largest, group, log_values)
+    np.minimum.at(smallest, group, log_values)
+    spread = float((largest - smallest).max())
+    if spread > CG_MAX_SPREAD:
+        raise UsageError(
+            f"field.weights = cg: expected radii that differ by at most {CG_MAX_SPREAD:g} length scales between "
+            f"splats within {KERNEL_REACH} of each other, got {spread:.1f}",
+            remedy="set a larger field.length_scale, or field.weights = rowsum",
+        )
+    tolerance = max(CG_TOLERANCE * float(np.exp(-spread)), CG_FLOOR)
+    scaled, num_iterations, residual = conjugate_gradients(matrix, np.exp(log_values - largest[group]), tolerance)
+    return Solution(scaled=scaled, log_scale=largest[group], num_iterations=num_iterations, residual=residual)
+
+
+def conjugate_gradients(matrix: "csr_array", values: Float64, tolerance: float) -> tuple[Float64, int, float]:
+    """x (N,) with ``max |A x - y| <= tolerance``, the iterations, and that largest residual.
+
+    A of unit diagonal needs no preconditioner. Raises NotEvaluableError where A shows a direction of no curvature,
+    or the residual stays above the tolerance for `CG_ITERATIONS`.
+    """
+    x = np.zeros(len(values))
+    rest = values.copy()
+    direction, squared = rest.copy(), float(rest @ rest)
+    for iteration in range(CG_ITERATIONS):
+        if float(np.abs(rest).max()) <= tolerance:
+            rest = values - matrix @ x  # the recurrence drifts from the true residual
+            residual = float(np.abs(rest).max())
+            if residual <= 2.0 * tolerance:
+                return x, iteration, residual
+            direction, squared = rest.copy(), float(rest @ rest)
+        image = matrix @ direction
+        curvature = float(direction @ image)
+        if curvature <= 0.0:
+            raise _not_solved(f"the kernel matrix is not positive definite (iteration {iteration})")
+        step = squared / curvature
+        x += step * direction
+        rest -= step * image
+        before, squared = squared, float(rest @ rest)
+        direction = rest + squared / before * direction
+    residual = float(np.abs(values - matrix @ x).max())
+    raise _not_solved(f"expected a residual of {tolerance:.1e} after {CG_ITERATIONS} iterations, got {residual:.1e}")
+
+
+def _not_solved(what: str) -> NotEvaluableError:
+    return NotEvaluableError(
+        f"field.weights = cg: {what}",
+        remedy="set a larger field.noise (1e-2) or a smaller field.length_scale, or field.weights = rowsum",
+    )
+
+
+def _kernel_matrix(centers: Float64, length: float, kernel: KernelValue, noise: float) -> "csr_array":
+    """``K + noise I`` (N, N), zero between centres further than 8 l apart."""
+    tree = cKDTree(centers)
+    num_pairs = int(tree.count_neighbors(tree, KERNEL_REACH * length))
+    needed, free = BYTES_PER_PAIR * num_pairs, available_memory()
+    if needed > free:
+        raise UsageError(
+            f"field.weights = cg: {num_pairs} pairs of splats within {KERNEL_REACH} length scales need "
+            f"{needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB is free",
+            remedy="set a smaller field.length_scale, or field.weights = rowsum",
+        )
+    pairs = tree.query_pairs(KERNEL_REACH * length, output_type="ndarray").astype(np.int32)
+    distance = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
+    upper = csr_array((kernel(distance), (pairs[:, 0], pairs[:, 1])), shape=(len(centers), len(centers)))
+    return csr_array(upper + upper.T + (1.0 + noise) * eye_array(len(centers), format="csr"))
+
+
+class Kernel(Protocol):
+    """A stationary kernel k(d) of length scale l [m] with k(0) = 1."""
+
+    @property
+    def length(self) -> float: ...
+
+    def value(self, distance: Float64) -> Float64:
+        """k(d) for distances of any shape [m]."""
+        ...
+
+    def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
+        """``log sum_j k(|p_i - p_j|)`` (N,), j = i included."""
+        ...
+
+
+@dataclass(frozen=True)
+class Matern12:
+    """``k(d) = exp(-d / l)``, the paper's kernel: its inverse is ``r(o) = -l log o``."""
+
+    length: float
+
+    def value(self, distance: Float64) -> Float64:
+        """k(d)."""
+        return np.asarray(np.exp(-distance / self.length))
+
+    def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
+        """``log sum_j exp(-|p_i - p_j| / l)`` (N,)."""
+        return _log_row_sums(points, self.length, is_matern=True, threads=threads)
+
+    def share(self, tolerance: float) -> float:
+        """The share of the sum whose loss raises the distance by t [m], ``1 - exp(-t / l)``; 0.01 at most."""
+        return min(-float(np.expm1(-tolerance / self.length)), KERNEL_MAX_SHARE)
+
+
+@dataclass(frozen=True)
+class SquaredExponential:
+    """``k(d) = exp(-d^2 / (2 l^2))``, the paper's Gaussian kernel: its inverse is ``r(o) = sqrt(-2 l^2 log o)``."""
+
+    length: float
+
+    def value(self, distance: Float64) -> Float64:
+        """k(d)."""
+        return np.asarray(np.exp(-0.5 * (distance / self.length) ** 2))
+
+    def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
+        """``log sum_j exp(-|p_i - p_j|^2 / (2 l^2))`` (N,)."""
+        return _log_row_sums(points, self.length, is_matern=False, threads=threads)
+
+
+def _log_row_sums(points: ClusteredPoints, length: float, *, is_matern: bool, threads: int) -> Float64:
+    sums = native.row_sums(points.clusters, points.is_point, length, is_matern=is_matern, threads=threads)
+    return np.asarray(np.log(points.gathered(sums)))
+
 
 NO_LOG = -1e4  # of a weight that is exactly zero: too small to matter, and finite
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from splatctrl_cli.config import Config, SceneConfig
 from splatctrl_cli.errors import DAMAGED, InputError, UsageError
-from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
+from splatctrl_cli.evaluate.views import psnr
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.formats.grid.npz_grid import read_npz

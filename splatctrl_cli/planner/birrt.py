@@ -15,8 +15,7 @@ from splatctrl_cli.config import PlannerConfig
 from splatctrl_cli.config.fixed import SHORTCUT_WORTH
 from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.edges import check_edges
+from splatctrl_cli.planner.configuration_clearance import Clearance, check_edges
 from splatctrl_cli.records import Float64, Index
 
 

@@ -18,11 +18,16 @@ from splatctrl_cli.robot.urdf import UrdfFile
 from tests.cli.replay_desk import Desk, FakeSource, logged
 from tests.recording.log.make_log import messages_of, write_raw
 
+Solids = dict[str, tuple[Solid, ...]]
+
 
 @pytest.fixture(scope="session", autouse=True)
 def coverage_once() -> Iterator[None]:
-    """Measure the coverage of each robot's spheres once for all replays: it takes longer than most of them."""
+    """Make the solids of each robot of primitive shapes, and measure the coverage of each one's spheres, once for all
+    replays: it takes longer than most of them.
+    """
     measure, measured = inputs.coverage_of_solids, dict[object, CoverageReport]()
+    read, made = inputs.read_solids, dict[str, Solids]()
 
     def known(
         urdf: UrdfFile, solids: Mapping[str, Sequence[Solid]], spheres: SphereSet, **how: Any
@@ -33,8 +38,14 @@ def coverage_once() -> Iterator[None]:
             measured[key] = measure(urdf, solids, spheres, **how)
         return measured[key]
 
+    def solids(urdf: UrdfFile, folders: Sequence[Path]) -> Solids:
+        if urdf.meshes:
+            return read(urdf, folders)
+        return made.get(urdf.text) or made.setdefault(urdf.text, read(urdf, folders))
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(inputs, "coverage_of_solids", known)
+        patch.setattr(inputs, "read_solids", solids)
         yield
 
 
@@ -66,7 +77,7 @@ def unpainted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).touch())
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def arm(plain_arm: Path) -> RobotModel:
     return RobotModel.from_urdf(plain_arm / "tabletop" / "robot.urdf", plain_arm / "tabletop" / "robot_spheres.yaml")
 

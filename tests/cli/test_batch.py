@@ -28,6 +28,12 @@ cameras = ["cam0"]
 """
 
 
+@pytest.fixture
+def quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runners that import what their node's command needs, and not every command beforehand."""
+    monkeypatch.setattr(batch.OfThisProgram, "entry", "splatctrl_cli.cli.main:main")
+
+
 def test_a_suite_runs_once_tells_what_was_not_expected_and_lists_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -81,8 +87,14 @@ def test_a_suite_runs_once_tells_what_was_not_expected_and_lists_it(
     ],
 )
 def test_what_cannot_run_is_said_in_a_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, said: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    code: int,
+    said: str,
 ) -> None:
+    monkeypatch.setattr("splatctrl_cli.jobs.batch.batch.CONNECT_S", 0.5)
     (tmp_path / "suite.toml").write_text(SUITE)
     (tmp_path / "damaged.mcap").touch()
     place = [] if words[0].endswith((".toml", ".")) else [str(tmp_path / "suite.toml")]
@@ -91,12 +103,13 @@ def test_what_cannot_run_is_said_in_a_line(
     assert said in error and error.count("\n") == 1
 
 
+@pytest.mark.usefixtures("quick_start")
 def test_ci_is_told_a_suite_for_each_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     suite, junit = tmp_path / "nightly.toml", tmp_path / "nightly.xml"
     suite.write_text(SUITE + "[jobs.scene]\ncommand = 'reconstruct'\nurdf = 'missing.urdf'\n")
     (tmp_path / "missing.urdf").touch()
     (tmp_path / "damaged.mcap").write_bytes(b"not a log")
-    assert main(["batch", str(suite), "--junit", str(junit), "-q"]) == 1
+    assert main(["batch", str(suite), "--junit", str(junit), "-q", "--workers", "1"]) == 1
     found = {each.name: {case.classname: case for case in each} for each in JUnitXml.fromfile(str(junit))}
     assert set(found) == {"good", "damaged"}
     assert {name: [type(result).__name__ for result in case.result] for name, case in found["damaged"].items()} == {
@@ -111,6 +124,7 @@ def test_ci_is_told_a_suite_for_each_recording(tmp_path: Path, capsys: pytest.Ca
     assert joined.properties["batch"] == "two logs"
 
 
+@pytest.mark.usefixtures("quick_start")
 @pytest.mark.parametrize(("expect", "code", "num_errors"), [("passed", 3, 2), ("exit 3", 0, 0)])
 def test_a_log_that_was_cut_is_named_in_the_table_the_sentence_the_page_and_junit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], expect: str, code: int, num_errors: int
@@ -120,7 +134,7 @@ def test_a_log_that_was_cut_is_named_in_the_table_the_sentence_the_page_and_juni
     (tmp_path / "cut.mcap").write_bytes(whole.read_bytes()[: whole.stat().st_size // 3])
     jobs = "".join(f"[jobs.{job}]\nexpect = '{expect}'\n" for job in ("check", "ingest"))
     (tmp_path / suite).write_text(f"[[recordings]]\npaths = ['cut.mcap']\n{jobs}")
-    assert main(["batch", str(tmp_path / suite), "--junit", str(tmp_path / junit), "-q"]) == code
+    assert main(["batch", str(tmp_path / suite), "--junit", str(tmp_path / junit), "-q", "--workers", "1"]) == code
     printed, _ = capsys.readouterr()
     assert ("AS EXPECTED, part of the recording is damaged and left out (2 nodes" in printed) is (code == 3)
     assert ("; damaged: cut" in printed) is (code == 3)
@@ -138,6 +152,7 @@ def test_a_log_that_was_cut_is_named_in_the_table_the_sentence_the_page_and_juni
     assert "passed, damaged" in page and "done, damaged" in page
 
 
+@pytest.mark.usefixtures("quick_start")
 def test_what_a_page_reads_is_the_suite_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     suite, out = tmp_path / "nightly.toml", tmp_path / "nightly.out"
     (tmp_path / "damaged.mcap").write_bytes(b"not a log")
@@ -160,6 +175,7 @@ def test_what_a_page_reads_is_the_suite_as_it_is(tmp_path: Path, capsys: pytest.
     assert fewer == {"good/info": "done", "good/ingest": "done"}, "what is no longer in the suite is not told"
 
 
+@pytest.mark.usefixtures("quick_start")
 def test_nodes_that_an_interrupted_batch_did_not_come_to_are_to_do(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,7 +183,7 @@ def test_nodes_that_an_interrupted_batch_did_not_come_to_are_to_do(
     make_log(tmp_path / "good.mcap", LogRecipe(num_frames=20))
     suite.write_text('[[recordings]]\npaths = ["good.mcap"]\n[jobs.info]\n[jobs.check]\nquick = 3\n')
     suite.write_text(suite.read_text() + "[jobs.look]\ncommand = 'check'\nquick = 3\n")
-    assert main(["batch", str(suite), "-q"]) == 0
+    assert main(["batch", str(suite), "-q", "--workers", "1"]) == 0
     suite.write_text(suite.read_text().replace("quick = 3", "quick = 4"))
 
     def interrupted(console: object, line: str) -> None:
@@ -185,6 +201,7 @@ def test_nodes_that_an_interrupted_batch_did_not_come_to_are_to_do(
     assert "1 of 3 jobs not as expected; first good/look: has not run since" in page
 
 
+@pytest.mark.usefixtures("quick_start")
 def test_many_recordings_are_printed_where_they_are_not_as_expected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,7 +211,7 @@ def test_many_recordings_are_printed_where_they_are_not_as_expected(
     suite = tmp_path / "bags.toml"
     own = '[[recordings]]\nname = "odd"\npaths = ["bag0.bag"]\njobs.info.expect = "passed"\n'
     suite.write_text(f'[[recordings]]\npaths = ["*.bag"]\n{own}[jobs.info]\nexpect = "exit 4"\n')
-    assert main(["batch", str(suite), "-q"]) == 1
+    assert main(["batch", str(suite), "-q", "--workers", "1"]) == 1
     rows = capsys.readouterr().out.splitlines()
     assert [rows[2].split(), rows[4].split()] == [["recording", "info"], ["odd", "ERROR"]]
     assert rows[5] == "3 recordings as expected; -v prints them, too"

@@ -133,7 +133,7 @@ CODES = {"grid announced": {0, 4}, "splats announced": {0, 4}, "states of 16 GiB
 RUN = """
 import resource, sys
 from splatctrl_cli.cli.main import main
-import splatctrl_cli.cli.recordings, cv2, numpy, splatctrl_cli.recording.source, splatctrl_cli.recording.source
+import splatctrl_cli.cli.check, cv2, numpy, splatctrl_cli.recording.source, splatctrl_cli.recording.source
 pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + 2**30
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

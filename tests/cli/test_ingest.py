@@ -1,14 +1,29 @@
-"""``splatctrl ingest`` and ``splatctrl info`` as a person meets them: exit codes, one line, nothing left behind."""
+"""``splatctrl ingest``, ``info`` and ``check`` as a person meets them: exit codes, one line, nothing left."""
 
 import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from splatctrl_cli.checks.finding import CHECKS
 from splatctrl_cli.cli.main import build_parser, main
 from splatctrl_cli.recording.source import open_source
 from tests.recording.folder.test_image_folder import described
-from tests.recording.log.make_log import LogRecipe, make_log
+from tests.recording.log.make_log import (
+    STORE,
+    LogRecipe,
+    Message,
+    broken_log,
+    encoded,
+    header,
+    make_log,
+    messages_of,
+    write_raw,
+)
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -97,3 +112,141 @@ def test_info_keeps_names_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "\n    robot_spheres.yaml: 12ab\n" in printed
     assert "\n    max_splats: 5\n" in printed
     assert "\n  stamp_ns: -\n" in printed
+
+
+GOOD = LogRecipe(num_frames=20)
+
+
+def test_a_good_log_is_exit_0_and_can_start_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, printed, error = run(capsys, "check", make_log(tmp_path / "log.mcap", GOOD), "--fail-on", "warning")
+    assert (code, error) == (0, "")
+    assert re.match(r"check: PASSED \(log\.mcap: 0 errors, 0 warnings, \d+ notes?\)\n\n", printed)
+    assert "can start: ingest, reconstruct, score, replay" in printed
+
+
+@pytest.mark.parametrize(("fail_on", "code"), [("error", 0), ("warning", 1), ("never", 0)])
+def test_a_warning_fails_where_it_is_asked_to(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fail_on: str, code: int
+) -> None:
+    log = make_log(tmp_path / "log.mcap", replace(GOOD, tf_frames=12))
+    found, printed, _ = run(capsys, "check", log, "--fail-on", fail_on)
+    assert found == code
+    assert "warning: camera cam0, at " in printed
+    assert printed.startswith("check: FAILED (" if code else "check: PASSED (")
+    assert printed.count("[pose-missing]\n") == 1, "its table says it, and nothing else does"
+
+
+@pytest.mark.parametrize(("fail_on", "code"), [("error", 1), ("warning", 1), ("never", 0)])
+def test_an_error_fails_unless_never(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fail_on: str, code: int
+) -> None:
+    log = make_log(tmp_path / "log.mcap", replace(GOOD, depth_counts=1))
+    found, printed, said = run(capsys, "check", log, "--fail-on", fail_on, "--json")
+    assert found == code
+    result = json.loads(printed)
+    assert (said == result["verdict"]["sentence"].join(("splatctrl: ", "\n"))) is bool(code), "stdout has the object"
+    assert run(capsys, "check", log, "--fail-on", fail_on)[2] == "", "stdout has the sentence"
+    assert (result["exit_code"], result["verdict"]["outcome"]) == (code, "failed")
+    assert result["verdict"]["reasons"][0]["criterion"] == "depth-scale"
+    assert result["counts"]["error"] == 1
+    finding = result["findings"][0]
+    assert (finding["severity"], finding["code"], finding["where"]) == (
+        "error",
+        "depth-scale",
+        "/cam0/depth/image_raw",
+    )
+    assert finding["value"] == pytest.approx(0.001)
+    assert all("depth-scale" in result["commands"][name][-1] for name in CHECKS["depth-scale"].blocked)
+
+
+@pytest.mark.parametrize(("fail_on", "code"), [("error", 3), ("warning", 1), ("never", 0)])
+def test_a_log_that_was_cut_is_damaged_in_the_first_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fail_on: str, code: int
+) -> None:
+    log = make_log(tmp_path / "log.mcap", GOOD)
+    log.write_bytes(log.read_bytes()[: log.stat().st_size // 3])
+    found, printed, _ = run(capsys, "check", log, "--fail-on", fail_on)
+    assert found == code
+    first = printed.splitlines()[0]
+    assert ", part of the recording is damaged and left out (log.mcap: " in first
+    assert first.startswith("check: FAILED" if code == 1 else "check: PASSED")
+
+
+def test_cameras_whose_poses_disagree_are_an_error_with_millimetres(
+    real_data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    description = Path(__file__).parents[2] / "docs/examples/arc_bin_2cam.toml"
+    code, printed, _ = run(capsys, "check", description, "--root", real_data / "arc_bin_2cam", "--json")
+    assert code == 1
+    finding = json.loads(printed)["findings"][0]
+    assert (finding["code"], finding["severity"], finding["unit"]) == ("agreement", "error", "mm")
+    assert finding["value"] == pytest.approx(99, abs=3)
+
+
+def test_a_camera_that_sees_a_wall_elsewhere_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def farther(log_time: int, topic: str, kind: str, message: Any) -> Iterator[Message]:
+        if topic == "/cam1/depth/image_raw":
+            counts = message.data.view("<u2")
+            counts[counts > 0] += 100
+        yield log_time, topic, kind, message
+
+    log = broken_log(tmp_path / "log.mcap", farther, replace(GOOD, cameras=("cam0", "cam1")))
+    code, printed, _ = run(capsys, "check", log, "--json")
+    result = json.loads(printed)
+    finding = result["findings"][0]
+    assert (code, finding["code"], finding["where"]) == (1, "agreement", "cameras cam0 and cam1")
+    assert "poses are off, or so little depth is left" in finding["remedy"]
+    assert finding["value"] == pytest.approx(100)
+    assert "agreement" in result["commands"]["reconstruct"][0]
+    assert result["commands"]["ingest"] == []
+
+
+@pytest.mark.parametrize(
+    ("example", "folder"),
+    [
+        ("apc_shelf", "apc_shelf/scene-0000"),
+        ("open3d_rgbd", "open3d_rgbd/RGBD"),
+        ("livingroom1", "open3d_rgbd/livingroom1"),
+        ("tabletop_views", "tabletop_views"),
+    ],
+)
+def test_good_recordings_have_no_finding_above_a_note(
+    real_data: Path, capsys: pytest.CaptureFixture[str], example: str, folder: str
+) -> None:
+    description = Path(__file__).parents[2] / f"docs/examples/{example}.toml"
+    code, printed, _ = run(capsys, "check", description, "--root", real_data / folder, "--fail-on", "warning")
+    assert code == 0, printed
+
+
+def test_a_capture_is_checked_as_its_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, capture = make_log(tmp_path / "log.mcap", replace(GOOD, tf_frames=12)), tmp_path / "x.capture"
+    assert run(capsys, "ingest", log, "-o", capture, "-q")[0] == 0
+    code, printed, _ = run(capsys, "check", capture, "--fail-on", "warning", "--json")
+    result = json.loads(printed)
+    assert (code, result["kind"]) == (1, "capture")
+    assert [f["code"] for f in result["findings"] if f["severity"] != "note"] == ["pose-missing"]
+    (capture / "depth/cam0/000003.png").write_bytes(b"")
+    code, printed, _ = run(capsys, "check", capture, "--fail-on", "warning")
+    assert "depth/cam0/000003.png: its checksum differs" in printed
+
+
+@pytest.mark.parametrize(("num", "is_folded"), [(3, False), (4, True), (66, True)])
+def test_info_folds_topics_that_no_command_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], num: int, is_folded: bool
+) -> None:
+    """A camera's driver records dozens beside its images; what is read, and a pose, stays."""
+    text = STORE.types["std_msgs/msg/String"]
+    pose = STORE.types["geometry_msgs/msg/PoseStamped"]
+    point, turn = STORE.types["geometry_msgs/msg/Point"], STORE.types["geometry_msgs/msg/Quaternion"]
+    at = pose(header(1, "world"), STORE.types["geometry_msgs/msg/Pose"](point(0, 0, 0), turn(0, 0, 0, 1)))
+    others = [encoded(1, f"/device/option_{k}", text(data="x"), STORE) for k in range(num)]
+    good = messages_of(make_log(tmp_path / "good.mcap", GOOD))
+    log = write_raw(tmp_path / "log.mcap", [encoded(1, "/tool_pose", at, STORE), *others, *good])
+    code, printed, _ = run(capsys, "info", log)
+    assert code == 0
+    assert ("/device/option_0 " in printed) is not is_folded
+    assert (f"and {num} topics that no command reads; -v prints them" in printed) is is_folded
+    assert all(name in printed for name in ("/tool_pose", "/cam0/depth/", "/tf"))
+    assert f"/device/option_{num - 1} " in run(capsys, "info", log, "-v")[1]
+    topics = json.loads(run(capsys, "info", log, "--json")[1])["topics"]
+    assert sum(row["topic"].startswith("/device/") for row in topics) == num

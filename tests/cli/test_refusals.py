@@ -12,7 +12,7 @@ from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.records import Label
 from tests.cli import here
 from tests.cli.replay_desk import BALL, START, splats_of, write_scene
-from tests.jobs.export.export_scene import ball
+from tests.jobs.export.test_export_run import ball
 from tests.recording.log.make_log import LogRecipe, make_log
 from tests.recording.log.make_states import START_NS, states_of, write_mcap
 from tests.robot.shapes import BALL as SPHERE

@@ -40,7 +40,6 @@ def events(desk: Desk, out: str = "out") -> list[dict[str, object]]:
     return document
 
 
-@pytest.mark.painted
 def test_open_loop_commands_what_was_logged_where_nothing_is_near(desk: Desk) -> None:
     moving(desk)
     assert desk.replay(*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05)), "-q", "--mode", "open-loop") == 0
@@ -84,7 +83,6 @@ def test_open_loop_may_ask_for_a_goal_instead_of_the_log(desk: Desk) -> None:
     assert float(desk.rows()[-1]["v_joint1"]) < 0 and desk.metrics()["max_velocity_difference"] > 0.5
 
 
-@pytest.mark.painted
 def test_a_clearance_below_the_margin_is_one_interval_with_its_obstacle(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -132,7 +130,6 @@ def test_a_gate_that_fails_names_the_first_time_that_breaks_it(
     assert "required >= 2" in message
 
 
-@pytest.mark.painted
 def test_a_driven_arm_follows_the_log_and_its_divergence_is_measured(desk: Desk) -> None:
     moving(desk)
     assert desk.replay(*scene_of(desk, ((-1.0, 0.0, 1.5), 0.05)), "-q", "--mode", "closed-loop", "--follow") == 0

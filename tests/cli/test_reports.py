@@ -123,10 +123,6 @@ def test_a_report_replaces_a_report_and_nothing_else(log: Path, tmp_path: Path) 
     told = splatctrl("check", log, "--junit", log)
     assert (told.returncode, log.read_bytes()) == (2, before)
     assert told.stderr == f"splatctrl: {log}: would replace the input {log}; give another --junit\n"
-    (tmp_path / "notes.txt").write_text("mine")
-    told = splatctrl("check", log, "--junit", tmp_path / "notes.txt")
-    assert (told.returncode, (tmp_path / "notes.txt").read_text()) == (2, "mine")
-    assert told.stderr.count("no JUnit report of splatctrl") == 1
 
 
 def test_a_report_inside_the_output_is_refused(log: Path, tmp_path: Path) -> None:

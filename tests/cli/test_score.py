@@ -57,14 +57,6 @@ def test_damaged_input_exits_3(scored: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert run(scored) == 3
 
 
-def test_a_single_view_is_counted_as_one(
-    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    set_up(monkeypatch, FakeScene(), FakeSource(frames=FRAMES[2:4]))
-    assert run(scored) == 0
-    assert "\n1 view scored, 0 before" in capsys.readouterr().out
-
-
 def test_free_space_is_printed_and_gated(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (scored / "scene" / "occupancy.npz").touch()
     assert run(scored, "--require", "free_mass<=0.1") == 1

@@ -13,7 +13,7 @@ from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_names
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.grid_field import exact_channel
+from splatctrl_cli.field.grid_cells import exact_channel
 from splatctrl_cli.formats.grid import grid_formats
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
@@ -23,7 +23,7 @@ from splatctrl_cli.simulate.truth import load_truth
 from tests.cli import here
 from tests.cli.test_command_line import splatctrl
 from tests.field.scenes import cloud, splat_set
-from tests.jobs.stopped import interrupt
+from tests.jobs.stage import interrupt
 from tests.plain import known, plain_grid
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -56,16 +56,6 @@ def test_bakes_both_formats_a_header_and_a_run(tmp_path: Path, splats: Path) -> 
     assert json.loads(result.stdout)["shape"] == list(grid.channels["sdf"].shape) == header["shape"]
     assert len(header["digests"]["splats.ply"]) == 64
     assert json.loads((out / "run.json").read_text())["config"]["field"]["voxel"] == 0.05
-
-
-def test_box_voxel_and_formats_are_as_asked(tmp_path: Path, splats: Path) -> None:
-    out = tmp_path / "field"
-    result = here.splatctrl(
-        "sdf-bake", splats, "-o", out, "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1, *COARSE, "--formats", "npz"
-    )
-    assert result.returncode == 0
-    assert read_npz(out / "field.npz").channels["sdf"].shape == (3, 3, 5)
-    assert not (out / "field.vti").exists()
 
 
 def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:

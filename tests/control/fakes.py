@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from splatctrl_cli.control.audit import BallDistance
-from splatctrl_cli.control.fallbacks import Rung
+from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import ReplayTrace
 from splatctrl_cli.kernels.chain import Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet

@@ -12,11 +12,11 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control import line_process, outside
-from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.line_process import Fault
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.outside import OutsideController, class_command
+from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError

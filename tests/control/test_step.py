@@ -8,10 +8,9 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import MULTIPLIER
 from splatctrl_cli.control import barriers
-from splatctrl_cli.control.fallbacks import Rung, is_usable
 from splatctrl_cli.control.open_loop import is_shaped
 from splatctrl_cli.control.preconditions import static_violations
-from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, unsolved
+from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, Rung
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
@@ -86,15 +85,6 @@ def test_a_sphere_within_the_margin_is_pushed_back_out() -> None:
     assert lifted == pytest.approx(-CONFIG.barrier_gain * 0.015, abs=1e-4)
 
 
-def test_a_rate_of_change_of_the_field_enters_the_rows() -> None:
-    wall = Plane([0.0, -1.0, 0.0], -0.55)
-    target = goal(Q)
-    still = controller(wall, home=Q).step(Q, target)
-    coming = controller(wall, home=Q).step(Q, target, distance_rate=-2.0)
-    np.testing.assert_allclose(still.velocity, 0.0, atol=1e-6)
-    assert PlanarArm().sphere_jacobians(Q)[4, 1] @ coming.velocity < -0.1
-
-
 def test_rows_that_cannot_all_hold_are_relaxed_and_named() -> None:
     q = np.array([0.3, 0.0])
     tip = PlanarArm().sphere_centers(q)[4]
@@ -134,14 +124,6 @@ def test_an_unchecked_solution_is_never_used(status: str, residual: float) -> No
     step = controller(far_away(), solver=Scripted(3, status, residual)).step(Q, goal(np.zeros(2)))
     assert step.rung is Rung.HOLD and step.scale == 0.0 and step.num_refused == 2
     assert np.all(step.velocity == 0.0)
-
-
-def test_usable_needs_the_status_and_the_residual() -> None:
-    program = QuadraticProgram(H=np.eye(1), c=np.zeros(1), G=np.eye(1), h=np.ones(1))
-    good = ClarabelSolver().solve(program)
-    assert is_usable(good, 1e-6)
-    assert not is_usable(good, 0.0)
-    assert not is_usable(unsolved(1, 1, "x"), np.inf)
 
 
 class Cliff:

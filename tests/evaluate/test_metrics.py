@@ -1,10 +1,27 @@
-"""How figures of states fold over them, and the interval of a mean change."""
+"""How figures of states fold, the interval of a mean change, agreement with the truth, and the conformal bound."""
+
+from fractions import Fraction
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
 
-from splatctrl_cli.evaluate.metrics import FEWEST, largest, lowest, mean_change
+from splatctrl_cli.evaluate import metrics as module
+from splatctrl_cli.evaluate.conformal import (
+    autocorrelation_time,
+    conformal_bound,
+    conformal_rank,
+    stretch_scores,
+    stretches,
+)
+from splatctrl_cli.evaluate.metrics import FEWEST, clearance_agreement, largest, least, lowest, mark_seen, mean_change
+from splatctrl_cli.records import Float64, Intrinsics
+from tests.plain import plain_frame
+from tests.properties import few
+from tests.reference import conformal as reference
 
 
 def test_a_residual_that_is_infinite_is_not_left_out_of_thelargest() -> None:
@@ -42,3 +59,163 @@ def test_a_mean_of_zero_is_found_to_differ_about_as_often_as_is_promised() -> No
         assert found is not None
         misses += not found.low <= 0 <= found.high
     assert 4 <= misses <= 24
+
+
+STAMPS = np.arange(6, dtype=np.int64) * 10
+
+
+def test_agreement_takes_near_and_seen_states_only() -> None:
+    truth = np.array([0.05, 0.05, 0.05, 0.05, 0.10, 0.09])
+    clearance = np.array([0.04, 0.07, 0.05, 0.9, 0.9, np.nan])
+    seen = np.array([True, True, True, False, True, True])
+    agreement = clearance_agreement(clearance, truth, seen, 0.005)
+    assert agreement["num_compared"] == 3
+    assert agreement["median"] == pytest.approx(0.01)
+    assert agreement["largest"] == pytest.approx(0.02)
+    assert agreement["largest_over"] == pytest.approx(0.02)
+    assert agreement["tolerance"] == pytest.approx(0.015)
+    assert agreement["share_within"] == pytest.approx(2 / 3)
+
+
+def test_an_under_estimate_is_no_over_estimate() -> None:
+    agreement = clearance_agreement(np.array([0.01]), np.array([0.05]), np.array([True]), 0.005)
+    assert agreement["largest_over"] == 0.0 and agreement["share_within"] == 0.0
+
+
+def test_without_a_state_to_compare_there_is_no_figure() -> None:
+    agreement = clearance_agreement(np.ones(2), np.ones(2), np.ones(2, bool), 0.005)
+    assert agreement["num_compared"] == 0 and agreement["median"] is None and agreement["share_within"] is None
+
+
+@pytest.mark.parametrize("block", [1, 4, 6])
+def test_a_frame_shows_a_surface_to_later_states_only(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
+    frame = plain_frame(1.0, Intrinsics(fx=3.0, fy=3.0, cx=1.0, cy=1.0, width=3, height=3), stamp_ns=20)
+    monkeypatch.setattr(module, "BLOCK", block)
+    points = np.tile([0.0, 0.0, 1.0], (6, 1))
+    points[5] = [0.0, 0.0, 1.5]
+    seen = np.zeros(6, bool)
+    mark_seen(seen, points, STAMPS, frame)
+    assert seen.tolist() == [False, False, True, True, True, False]
+    mark_seen(seen, points, STAMPS, frame, has_clock=False)
+    assert seen.tolist() == [True] * 5 + [False]
+
+
+def test_the_least_value_ignores_what_is_not_finite() -> None:
+    assert least(np.array([np.nan, 2.0, np.inf, 1.0])) == 1.0
+    assert least(np.array([np.nan])) is None
+
+
+@few(200)
+@given(scores=st.lists(st.integers(-5, 20).map(float), min_size=1, max_size=40), percent=st.integers(50, 99))
+def test_the_rank_is_that_of_the_definition(scores: list[float], percent: int) -> None:
+    rank = conformal_rank(len(scores), percent / 100)
+    expected = reference.quantile(scores, Fraction(percent, 100))
+    assert (sorted(scores)[rank - 1] if rank <= len(scores) else None) == expected
+
+
+@pytest.mark.parametrize("num", [2, 3, 9, 19, 98, 99, 100, 1000])
+def test_the_highest_confidence_of_n_scores_takes_the_largest(num: int) -> None:
+    assert conformal_rank(num, num / (num + 1)) == num
+    assert conformal_rank(num, (num + 0.01) / (num + 1)) == num + 1
+
+
+@few(100)
+@given(values=st.lists(st.integers(0, 9), min_size=2, max_size=30).filter(lambda v: len(set(v)) > 1))
+def test_the_autocorrelation_time_is_that_of_the_definition(values: list[int]) -> None:
+    series = np.array(values, np.float64)
+    assert autocorrelation_time(series) == int(np.ceil(reference.autocorrelation_time(series) - 1e-9))
+
+
+@few(100)
+@given(num=st.integers(1, 60), length=st.integers(1, 12))
+def test_stretches_are_apart_and_no_set_is_lost(num: int, length: int) -> None:
+    found = stretches(num, length)
+    expected = reference.stretches(num, length)
+    assert found[-1] + 1 == max(len(expected), 1)
+    for number, sets in enumerate(expected):
+        assert (found[sets] == number).all()
+    for before, after in pairwise(expected):
+        assert after[0] - before[-1] == length
+    assert (np.diff(found) >= 0).all() and (np.diff(found) <= 1).all()
+
+
+def test_a_miss_between_two_stretches_counts() -> None:
+    misses = np.zeros(40)
+    misses[::2] = 0.001
+    slow = np.repeat(np.linspace(0.0, 0.004, 5), 8)
+    for at in range(40):
+        series = misses + slow
+        series[at] = 0.5
+        bound = conformal_bound(series, 0.99)
+        assert bound is not None and (bound.bound, bound.at) == (0.5, at)
+
+
+def correlated(rng: np.random.Generator, shape: tuple[int, int], share: float) -> Float64:
+    """Rows (R, T) of a stationary series whose neighbours correlate by `share`."""
+    drive = rng.standard_normal(shape)
+    series = drive.copy()
+    for t in range(1, shape[1]):
+        series[:, t] = share * series[:, t - 1] + np.sqrt(1 - share**2) * drive[:, t]
+    return series
+
+
+def test_white_misses_are_independent_and_slow_ones_are_not() -> None:
+    rng = np.random.default_rng(1)
+    assert np.median([autocorrelation_time(row) for row in rng.standard_normal((50, 200))]) <= 3
+    slow = [autocorrelation_time(row) for row in correlated(rng, (50, 1000), 0.8)]
+    assert 7 <= np.median(slow) <= 12  # (1 + 0.8) / (1 - 0.8) = 9
+    assert autocorrelation_time(np.full(30, 0.004)) == 1
+
+
+def test_what_is_not_there_takes_no_part() -> None:
+    rng = np.random.default_rng(2)
+    rows = correlated(rng, (60, 400), 0.7)
+    with_holes = np.where(rng.random(rows.shape) < 0.3, np.nan, rows)
+    whole, part = (np.median([autocorrelation_time(row) for row in given]) for given in (rows, with_holes))
+    assert abs(whole - part) <= 1
+    holes = with_holes[0]
+    bound = conformal_bound(holes, 0.9)
+    assert bound is not None and np.isfinite(bound.bound) and holes[bound.at] == bound.bound
+    scores, deciding = stretch_scores(np.array([1.0, np.nan, 3.0, np.nan, np.nan, 2.0]), np.array([0, 0, 1, 2, 2, 3]))
+    assert scores.tolist() == [1.0, 3.0, 2.0] and deciding.tolist() == [0, 2, 5]
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.8, 0.9, 0.99])
+@pytest.mark.parametrize("num", [5, 20, 120])
+@pytest.mark.parametrize("kind", ["normal", "heavy", "mixed"])
+def test_a_further_exchangeable_score_is_covered_as_promised(kind: str, num: int, confidence: float) -> None:
+    rng = np.random.default_rng([num, int(100 * confidence), len(kind)])
+    trials = 4000
+    scores = rng.standard_normal((trials, num + 1))
+    if kind == "heavy":
+        scores = rng.standard_cauchy((trials, num + 1))
+    if kind == "mixed":  # exchangeable but dependent: every row has its own place and width
+        scores = 3 * rng.standard_normal((trials, 1)) + rng.random((trials, 1)) * scores
+    allowed = min(confidence, num / (num + 1))
+    bound = np.sort(scores[:, :-1], axis=1)[:, conformal_rank(num, allowed) - 1]
+    covered = float(np.mean(scores[:, -1] <= bound))
+    spread = 3.5 * np.sqrt(allowed * (1 - allowed) / trials)
+    assert allowed - spread <= covered <= allowed + 1 / (num + 1) + spread
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6, 0.85])
+def test_a_further_stretch_of_a_slow_series_is_covered_as_promised(share: float) -> None:
+    rng = np.random.default_rng(int(100 * share))
+    num_sets, covered, promised = 150, [], []
+    for row in correlated(rng, (600, 4 * num_sets), share):
+        bound = conformal_bound(row[:num_sets], 0.9)
+        assert bound is not None
+        later = row[num_sets + 100 :][: bound.length]
+        covered.append(later.max() <= bound.bound)
+        promised.append(bound.confidence)
+    assert np.mean(covered) >= np.mean(promised) - 3.5 * np.sqrt(0.09 / 600)
+
+
+def test_one_stretch_bounds_nothing() -> None:
+    assert conformal_bound(np.array([0.01]), 0.99) is None
+    assert conformal_bound(np.full(7, np.nan), 0.99) is None
+    assert conformal_bound(np.zeros(0), 0.99) is None
+    assert conformal_bound(np.linspace(0.0, 1.0, 6), 0.99) is None  # all of it is one drift
+    two = conformal_bound(np.array([0.01, 0.03]), 0.99)
+    assert two is not None and (two.bound, two.num_stretches) == (0.03, 2)
+    assert two.confidence == pytest.approx(2 / 3)

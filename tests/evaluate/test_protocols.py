@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import cloud_of_scan, read_observed, score_protocol
-from tests.evaluate.make_observed_space import RESOLUTION, write_observed
+from splatctrl_cli.records import Bool, Float64
 
 DTU = range(49)
 
@@ -159,3 +160,16 @@ def test_points_of_a_scan_are_found_by_either_name(tmp_path: Path) -> None:
     assert cloud_of_scan(tmp_path, "bird").name == "bird.ply"
     with pytest.raises(InputError, match=r"the points of scan8, scan8.ply or stl008_total.ply, got neither"):
         cloud_of_scan(tmp_path, "scan8")
+
+
+RESOLUTION = 5.0  # [mm]
+
+
+def write_observed(folder: Path, number: int, low: Float64, high: Float64, is_observed: Bool | None = None) -> None:
+    """The files of a scan: a box [mm], observed everywhere unless said otherwise, the ground half way up in z."""
+    shape = tuple(int(n) for n in np.ceil((high - low) / RESOLUTION))
+    mask = np.ones(shape, np.uint8) if is_observed is None else is_observed.astype(np.uint8)
+    variables = {"ObsMask": mask, "BB": np.vstack([low, high]), "Res": RESOLUTION}
+    savemat(folder / f"ObsMask{number}_10.mat", variables, do_compression=True)
+    plane = np.array([[0.0], [0.0], [1.0], [-0.5 * (low[2] + high[2])]])
+    savemat(folder / f"Plane{number}.mat", {"P": plane})

@@ -7,8 +7,15 @@ import math
 import pytest
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons, parse_gate
-from splatctrl_cli.evaluate.verdict import EXIT_CODES, Outcome, Reason, verdict_of
+from splatctrl_cli.evaluate.verdict import (
+    EXIT_CODES,
+    Outcome,
+    Reason,
+    check_gate_names,
+    gate_reasons,
+    parse_gate,
+    verdict_of,
+)
 
 
 def reason(outcome: Outcome, criterion: str = "clearance", label: str = "", **more: object) -> Reason:

@@ -3,7 +3,7 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.field.clustered_splats import Spheres
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import make_field
 from splatctrl_cli.field.probability import (
     CalibratedProbability,

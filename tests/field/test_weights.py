@@ -3,13 +3,17 @@ import pytest
 
 from splatctrl_cli.config.fixed import VOXELS_PER_LENGTH
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.field import full_gp, voxel_density
-from splatctrl_cli.field.clustered_splats import Spheres
+from splatctrl_cli.field import weights as weights_module
+from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField
-from splatctrl_cli.field.full_gp import conjugate_gradients, solve_process
-from splatctrl_cli.field.kernel import Matern12, SquaredExponential
-from splatctrl_cli.field.voxel_density import voxel_row_sums
-from splatctrl_cli.field.weights import weights_named
+from splatctrl_cli.field.weights import (
+    Matern12,
+    SquaredExponential,
+    conjugate_gradients,
+    solve_process,
+    voxel_row_sums,
+    weights_named,
+)
 from splatctrl_cli.geometry import rotation_from_quat
 from tests.field.scenes import cloud, queries
 from tests.reference import field as reference
@@ -23,7 +27,7 @@ def test_voxel_density_is_spread_convolved_and_read_back(monkeypatch: pytest.Mon
     expected = reference.voxel_row_sums(centers, LENGTH, LENGTH / VOXELS_PER_LENGTH)
     sums = voxel_row_sums(centers, LENGTH, Matern12(LENGTH).value)
     np.testing.assert_allclose(sums, expected, rtol=1e-9)
-    monkeypatch.setattr(voxel_density, "NODES", 48)  # blocks of 15 cells rather than 63
+    monkeypatch.setattr(weights_module, "NODES", 48)  # blocks of 15 cells rather than 63
     np.testing.assert_allclose(voxel_row_sums(centers + 7.0, LENGTH, Matern12(LENGTH).value), expected, rtol=1e-9)
 
 
@@ -58,7 +62,7 @@ def test_voxel_weights_give_nearly_the_field_of_the_row_sums() -> None:
 
 def test_too_many_blocks_are_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
     centers, radii = cloud()
-    monkeypatch.setattr(voxel_density, "MAX_BLOCKS", 0)
+    monkeypatch.setattr(weights_module, "MAX_BLOCKS", 0)
     with pytest.raises(UsageError, match=r"at most 0 blocks of voxels with splats, got .*; set"):
         GpdfField(centers, radii, LENGTH, weights="voxel")
 
@@ -127,10 +131,10 @@ def test_what_cannot_be_solved_is_refused_in_words(monkeypatch: pytest.MonkeyPat
         UsageError, match=r"radii that differ by at most 16 length scales .*, got 60\.0; set a larger"
     ):
         GpdfField(centers, radii, 0.005, weights="cg")
-    monkeypatch.setattr(full_gp, "CG_ITERATIONS", 20)
+    monkeypatch.setattr(weights_module, "CG_ITERATIONS", 20)
     with pytest.raises(NotEvaluableError, match=r"after 20 iterations, got .*; set a larger field.noise"):
         SeField(centers, radii, LENGTH, weights="cg")
-    monkeypatch.setattr(full_gp, "available_memory", lambda: 1000)
+    monkeypatch.setattr(weights_module, "available_memory", lambda: 1000)
     with pytest.raises(UsageError, match=r"pairs of splats within 8 length scales need .* GiB is free"):
         SeField(centers, radii, LENGTH, weights="cg")
 

@@ -5,8 +5,7 @@ import pytest
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.conftest import arm, coverage_once, desk, unpainted, without_plots
 from tests.cli.replay_desk import Desk
-from tests.jobs.runs import run
-from tests.jobs.stage import Stage
+from tests.jobs.stage import Stage, run
 
 __all__ = ["arm", "coverage_once", "desk", "run", "unpainted", "without_plots"]
 

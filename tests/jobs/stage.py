@@ -1,11 +1,16 @@
 """One run that is safe, and what it takes to break one thing of it."""
 
-from collections.abc import Sequence
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import pytest
 from numpy.typing import ArrayLike
 
 from splatctrl_cli.files.output import part_digests, write_json
@@ -186,3 +191,69 @@ def unseen_about(place: ArrayLike, reach: float) -> KnownVoxels:
 def decisive(verdict: dict[str, Any]) -> dict[str, str]:
     """Outcome by criterion of what did not pass."""
     return {r["criterion"]: r["outcome"] for r in verdict["reasons"] if r["outcome"] != "passed"}
+
+
+Runs = Callable[..., Path]
+
+
+@pytest.fixture
+def run(desk: Desk, arm: RobotModel, unpainted: None, monkeypatch: pytest.MonkeyPatch) -> Runs:
+    """A replay in which a ball comes near, as the command leaves it; its scene and robot beside it."""
+
+    def made(out: str = "audit", mode: str = "audit", *more: str) -> Path:
+        desk.source.states = passing()
+        near = ball_beside(arm, passing()[-1].position, 0.012, way=np.array([s.position for s in passing()[:-1]]))
+        stage = Stage(desk=desk, arm=arm, balls=(FAR,), later=(near,), later_from=500_000_000)
+        scene = desk.folder / "scene"
+        if not scene.exists():
+            stage.scene()
+            patch_json(scene / "run.json", lambda found: found | {"command": "reconstruct", "arguments": []})
+        words = ["--scene", "scene", "--urdf", desk.robot[1], "--spheres", desk.robot[3]]
+        monkeypatch.setattr(sys, "argv", ["splatctrl", "replay", "fake.mcap", *words, "--mode", mode])
+        monkeypatch.chdir(desk.folder)
+        desk.replay(*words[:2], "--mode", mode, "-q", *more, out=out)
+        cv2.imwrite(str(desk.folder / out / "worst_1.png"), np.full((90, 1200, 3), 200, np.uint8))
+        for name in ("clearance", "evidence"):
+            (desk.folder / out / f"{name}.png").unlink()
+        if mode != "audit":
+            for name in ("commands", "divergence"):
+                (desk.folder / out / f"{name}.png").unlink(missing_ok=True)
+        folder = desk.folder / out
+        patch_json(folder / "run.json", lambda found: found | {"parts": part_digests(folder)})
+        return folder
+
+    return made
+
+
+def patch_json(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+
+
+def contents(folder: Path) -> dict[str, Any]:
+    """Bytes by name, of run.json all but the timings and the command line."""
+    found: dict[str, Any] = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    run = json.loads(found["run.json"])
+    del run["seconds"], run["arguments"]
+    return found | {"run.json": run}
+
+
+def failing(real: Callable[..., Any], when: int, error: BaseException) -> Callable[..., Any]:
+    """`real`, but its call number `when` raises: after half of its work where that is a file, else before any."""
+    calls = 0
+
+    def call(path: Any, *rest: Any, **named: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == when and not isinstance(path, Path):
+            raise error
+        result = real(path, *rest, **named)
+        if calls == when:
+            os.truncate(path, path.stat().st_size // 2)
+            raise error
+        return result
+
+    return call
+
+
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt

@@ -8,9 +8,8 @@ from splatctrl_cli.config import PlannerConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.planner import birrt
 from splatctrl_cli.planner.birrt import PlanOutcome, plan, shortened
-from splatctrl_cli.planner.configuration_clearance import Clearance, OnlyDistance
-from splatctrl_cli.planner.edges import EdgeCheck, check_edges
-from splatctrl_cli.planner.path import resampled
+from splatctrl_cli.planner.configuration_clearance import Clearance, EdgeCheck, OnlyDistance, check_edges
+from splatctrl_cli.planner.planned import resampled
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, PlanarArm, Plane
 from tests.planner.walls import clearance, closed_ring, one_wall, thin_post

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import LEAST_OVERLAP
-from splatctrl_cli.control.fallbacks import Rung
+from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
 from splatctrl_cli.formats.mesh import TriangleMesh
 from splatctrl_cli.geometry import pose_at

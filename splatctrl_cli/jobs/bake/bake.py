@@ -12,15 +12,14 @@ from tqdm import tqdm
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
-from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.verdict import Verdict, brief
+from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
 from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker
 from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
 from splatctrl_cli.field.header import field_header
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
-from splatctrl_cli.field.obstacles import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.field.report import grid_statistics
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
+from splatctrl_cli.field.unknown import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_json, write_run
 from splatctrl_cli.formats.grid.grid_format import GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.formats.grid.grid_formats import FORMATS, check_formats, write_grid
@@ -48,8 +47,12 @@ from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
 from splatctrl_cli.jobs.running.resume import deciding_versions, told_how_to_go_on
 from splatctrl_cli.kernels.cuda.memory import DeviceError
 from splatctrl_cli.records import DistanceGrid
-from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
-from splatctrl_cli.report.reliability import reliability_picture
+from splatctrl_cli.report.field_pictures import (
+    gradient_picture,
+    probability_picture,
+    reliability_picture,
+    slices_picture,
+)
 
 FOLDER = "channels"
 CHECKPOINT = f"{FOLDER}/progress.json"

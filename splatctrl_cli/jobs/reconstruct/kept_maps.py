@@ -12,7 +12,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import NEWS_LEAST, SAME_MOMENT_NS
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.field.obstacles import obstacle_spheres
+from splatctrl_cli.field.unknown import obstacle_spheres
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.formats.scene.voxel_file import read_states, read_unrepresented
 from splatctrl_cli.formats.splat.splats import read_ply

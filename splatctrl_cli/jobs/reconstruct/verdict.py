@@ -7,9 +7,8 @@ from typing import Any
 from splatctrl_cli.calibration.displacement import is_corrected, is_displaced
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import MISPLACED
-from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, FAULTS, Better, Scale
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, note, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, noted, verdict_of
 from splatctrl_cli.records import LossReport
 from splatctrl_cli.robot.declared_contact import carried_words
 from splatctrl_cli.scene.time_steps import AuditRow

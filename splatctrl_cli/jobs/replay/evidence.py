@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.calibration.displacement import placed
 from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
-from splatctrl_cli.config.motion import VerdictConfig
+from splatctrl_cli.config.sections import VerdictConfig
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import DistanceFunction
-from splatctrl_cli.control.events import Event, EventFold, EventKind, Obstacle
-from splatctrl_cli.control.signals import clearance_signals
+from splatctrl_cli.control.events import Event, EventFold, EventKind, Obstacle, clearance_signals
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.clearance_agreement import clearance_agreement, mark_seen
 from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges
+from splatctrl_cli.evaluate.metrics import clearance_agreement, mark_seen
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, ranges
 from splatctrl_cli.formats.scene.scene_folder import open_scene

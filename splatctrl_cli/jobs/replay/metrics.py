@@ -11,7 +11,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import MOTION_WINDOW
 from splatctrl_cli.control.events import first_intervention
-from splatctrl_cli.control.fallbacks import Rung
+from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTrace
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.evaluate.metrics import (

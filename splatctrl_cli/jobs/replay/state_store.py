@@ -9,8 +9,8 @@ from typing import Generic, TypeVar, overload
 import numpy as np
 
 from splatctrl_cli.control.audit import AuditTrace, Clearance
-from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.open_loop import OpenLoopTrace, is_shaped
+from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.step import ControlStep, VelocityMargin
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.files.spilled_rows import IN_MEMORY, RowFile, Rows, scratch_folder

@@ -5,8 +5,7 @@ from dataclasses import replace
 from operator import attrgetter
 
 from splatctrl_cli.control.line_process import shown
-from splatctrl_cli.evaluate.gates import gate_reasons
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, verdict_of
 from splatctrl_cli.jobs.replay.criteria import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words, displaced
 from splatctrl_cli.jobs.replay.metrics import counts_of, first_time

@@ -8,14 +8,22 @@ from typing import Any
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons, parse_gate
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import (
+    Outcome,
+    Reason,
+    Verdict,
+    check_gate_names,
+    gate_reasons,
+    noted,
+    parse_gate,
+    verdict_of,
+)
 from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.records import SphereSet
-from splatctrl_cli.report.robot_picture import robot_picture
+from splatctrl_cli.report.pictures import robot_picture
 from splatctrl_cli.robot.coverage import CoverageReport, LinkCoverage, coverage_of_solids
 from splatctrl_cli.robot.link_meshes import Solid, mesh_path, read_solids
 from splatctrl_cli.robot.model import RobotModel

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.score import PROTOCOL, as_json, free_mass, total_score
 from splatctrl_cli.evaluate.score_report import (
     AVERAGING,
@@ -21,8 +20,8 @@ from splatctrl_cli.evaluate.score_report import (
     report_of_scans,
     score_verdict,
 )
-from splatctrl_cli.evaluate.verdict import Verdict, brief
-from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
+from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
+from splatctrl_cli.field.unknown import field_splats, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_splats, run_value
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest

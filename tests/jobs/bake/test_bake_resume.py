@@ -26,7 +26,7 @@ from splatctrl_cli.jobs.bake.bake import BakeResult
 from splatctrl_cli.records import Label
 from tests.field.scenes import cloud, splat_set
 from tests.jobs.bake.baked import Said, baked
-from tests.jobs.stopped import contents, failing
+from tests.jobs.stage import contents, failing
 
 ROOT = Path(__file__).parents[3]
 CHANNELS = ("gradient", "bound", "observed", "label", "se")
@@ -56,13 +56,6 @@ def whole(splats: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, A
 def bake(splats: Path, out: Path, **more: Any) -> BakeResult:
     options: dict[str, Any] = {"voxel": 0.03, "channels": CHANNELS, "formats": ("npz", "vti")}
     return baked(splats, out, **(options | more))
-
-
-@pytest.mark.usefixtures("small_slabs")
-def test_slabs_do_not_change_a_bit(splats: Path, whole: dict[str, Any], tmp_path: Path) -> None:
-    bake(splats, tmp_path / "field")
-    assert contents(tmp_path / "field") == whole
-    assert [path.name for path in tmp_path.iterdir()] == ["field"]
 
 
 def interrupted(splats: Path, out: Path, after: int) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
 from splatctrl_cli.evaluate.metrics import Better
 from splatctrl_cli.evaluate.verdict import Outcome
@@ -19,7 +18,7 @@ from splatctrl_cli.jobs.compare import judged_runs
 from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, CompareResult, compare
 from splatctrl_cli.jobs.replay.metrics import metric_names
 from splatctrl_cli.jobs.report.report import WriteReportRequest, write_report
-from tests.jobs.runs import Runs
+from tests.jobs.stage import Runs
 
 OLDER = Path(__file__).parents[2] / "data" / "older.zip"
 NEAR = {"criterion": "clearance", "outcome": "failed", "sentence": "hand[9] is 4 mm away", "time_s": 1.5}
@@ -381,17 +380,3 @@ def test_a_margin_that_was_taken_away_is_found_with_the_state_where_it_shows(run
     assert worst.where.time_s == pytest.approx(float(least["time_s"]))
     back = compared(after, before)
     assert not [one for one in back.figures if one.metric == "min_clearance" and one.change is Change.WORSE]
-
-
-def test_more_iterations_are_no_regression_and_fewer_are(sample_data: Path, tmp_path: Path) -> None:
-    dtu = ("--dtu", str(sample_data / "dtu"), "--protocol", "dtu-holdout8", "-q")
-    for name, count in (("few", 10), ("many", 60)):
-        scene, steps = str(tmp_path / f"{name}_scene"), f"scene.refine_iterations={count}"
-        fit = ("--max-splats", "2000", "--set", f"scene.first_iterations={count}", "--set", steps)
-        assert main(["reconstruct", *dtu, *fit, "-o", scene]) == 0
-        assert main(["score", scene, *dtu, "-o", str(tmp_path / name), "--images", "none"]) == 0
-    few, many = tmp_path / "few", tmp_path / "many"
-    assert compared(few, many).verdict.exit_code == 0
-    worse = compared(many, few)
-    assert worse.verdict.exit_code == 1
-    assert {"psnr_seen", "depth_median_seen"} <= {one.metric for one in worse.figures if one.change is Change.WORSE}

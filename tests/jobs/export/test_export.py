@@ -17,7 +17,7 @@ from splatctrl_cli.jobs.export import export as job
 from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult
 from splatctrl_cli.records import Float64, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.render import Rendering
-from tests.jobs.export.export_scene import ball, written
+from tests.jobs.export.test_export_run import ball, written
 
 
 @pytest.fixture

@@ -16,13 +16,15 @@ from mcap_protobuf.decoder import DecoderFactory
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.scene.scene_folder import open_scene
+from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.jobs.export.export_run import ExportRunRequest, export_run
+from splatctrl_cli.jobs.export.export import ExportRunRequest, export_run
 from splatctrl_cli.recording.container.foxglove import read_foxglove
+from splatctrl_cli.records import SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import VoxelState
-from tests.jobs.runs import Runs, patch_json
-from tests.jobs.stage import QUARTER, passing
+from tests.jobs.stage import QUARTER, Runs, passing, patch_json
+from tests.plain import plain_splats
 
 Messages = dict[str, list[tuple[int, Any]]]
 
@@ -183,3 +185,22 @@ def test_the_command_writes_beside_the_run_and_takes_no_option_of_splats(
     assert folder.with_name("audit.mcap").is_file()
     assert "/splats" in capsys.readouterr().out
     assert main(["export", str(folder), "--mcap", "--isotropic", "--force"]) == 2
+
+
+def ball(num: int = 400) -> SplatSet:
+    directions = np.random.default_rng(0).normal(size=(num, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return plain_splats(
+        0.3 * directions + [0.5, 0.0, 0.2],
+        0.02,
+        colors=0.5 + 0.4 * directions,
+        opacities=np.linspace(0.2, 1.0, num),
+        labels=np.arange(num) % 3,
+    )
+
+
+def written(folder: Path, splats: SplatSet) -> Path:
+    """A scene folder of them."""
+    folder.mkdir()
+    write_ply(folder / "splats.ply", splats, {"scene": "ball"})
+    return folder

@@ -12,10 +12,10 @@ from splatctrl_cli.formats.arrays import savez
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter, read_checkpoint
 from splatctrl_cli.jobs.reconstruct import reconstruct
-from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructRequest
+from splatctrl_cli.jobs.reconstruct.reconstruct import LearnRequest, ReconstructRequest, learn_robot
 from splatctrl_cli.jobs.replay.inputs import grasp_contacts, open_log, read_states
 from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL
+from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, with_self_model
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
@@ -146,3 +146,17 @@ def test_a_hand_may_touch_what_it_takes_and_leaves_at_its_place_and_no_other_lin
         False
     ] * 3
     assert [*grasp_contacts(bare, states)] == []
+
+
+def test_a_log_whose_arm_is_as_its_urdf_draws_it_gives_a_self_model_without_parts(
+    sample_data: Path, tmp_path: Path
+) -> None:
+    folder, out = sample_data / "tabletop", tmp_path / "self.npz"
+    found = learn_robot(LearnRequest(log=folder / "log.mcap", urdf=folder / "robot.urdf", out=out))
+    assert found.pieces() == [] and len(found.learned) > 3
+    assert "panda_link0" in found.unknown
+    model = RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
+    assert len(with_self_model(model, out).surface.triangles) == len(model.surface.triangles)
+    out.write_bytes(out.read_bytes()[:400])
+    with pytest.raises(InputError, match="not a self-model"):
+        with_self_model(model, out)

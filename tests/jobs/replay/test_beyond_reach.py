@@ -20,10 +20,9 @@ from splatctrl_cli.jobs.report.spaces import space_of_scene
 from splatctrl_cli.records import SplatSet
 from tests.cli.replay_desk import splats_of
 from tests.jobs.bake.baked import baked
-from tests.jobs.runs import patch_json
 from tests.jobs.score.test_score import run as scores
 from tests.jobs.score.wall import FRAMES, FakeScene, FakeSource, set_up, wall, write_scene
-from tests.jobs.stage import FAR, Stage, ball_beside, voxels
+from tests.jobs.stage import FAR, Stage, ball_beside, patch_json, voxels
 
 pytestmark = pytest.mark.usefixtures("without_plots")
 

@@ -1,4 +1,4 @@
-"""A user's own controller in a replay: judged like ours, refused, or failed by name."""
+"""A user's own controller in a replay; waypoints as a file has them, and detours around what is known."""
 
 import json
 import shutil
@@ -6,13 +6,21 @@ import subprocess
 import textwrap
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from splatctrl_cli.config import Config
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.jobs.replay.goal import goal_waypoints
+from splatctrl_cli.jobs.replay.known_scene import certified_distance, splat_fields
 from splatctrl_cli.jobs.replay.metrics import metric_names
+from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, Desk, splats_of, write_scene
 from tests.cli.test_replay_modes import ball_ahead, events, moving
 from tests.jobs.stage import MOVE, QUARTER, Stage, decisive, passing
+from tests.robot.test_fingers import ARM, FRANKA, robot
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -197,3 +205,60 @@ def assert_same_commands(a: list[dict[str, str]], b: list[dict[str, str]]) -> No
     assert len(a) == len(b)
     for name in (f"v_joint{j}" for j in range(1, 8)):
         assert [float(row[name]) for row in a] == pytest.approx([float(row[name]) for row in b], abs=1e-6)
+
+
+END = np.array([0.01, 0.02, 0.03, 0.04])  # of shoulder, wrist and two fingers
+
+
+def goal(folder: Path, moved: list[str], *values: float) -> Float64:
+    urdf = robot(folder, *ARM, *FRANKA)
+    spheres = SphereSet(links=("l",), centers=np.zeros((1, 3)), radii=np.full(1, 0.01))
+    model = RobotModel.from_urdf(urdf, spheres).moved_by(moved)
+    request = ReplayRequest(log=urdf, urdf=urdf, out=urdf, mode="closed-loop", goal_joints=values)
+    (waypoint,) = goal_waypoints(request, model, "hand", END[: model.num_joints])
+    assert waypoint.posture is not None
+    assert waypoint.T_world_goal.tolist() == model.frame_pose(waypoint.posture, "hand").tolist()
+    return waypoint.posture
+
+
+def test_fingers_that_the_log_does_not_move_take_no_value(tmp_path: Path) -> None:
+    assert goal(tmp_path, ["shoulder", "wrist"], 0.03, 0.04).tolist() == [0.03, 0.04]
+
+
+def test_fingers_that_the_log_knows_stay_as_logged_at_the_end_or_take_values(tmp_path: Path) -> None:
+    moved = ["shoulder", "wrist", "left", "right"]
+    assert goal(tmp_path, moved, 0.03, 0.04).tolist() == [0.03, 0.04, 0.03, 0.04]
+    assert goal(tmp_path, moved, 0.03, 0.04, 0.0, 0.01).tolist() == [0.03, 0.04, 0.0, 0.01]
+
+
+def test_another_number_of_values_is_refused_with_the_joints(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--goal-joints: expected 2 joints \(shoulder, wrist\), got shape \(4,\)"):
+        goal(tmp_path, ["shoulder", "wrist"], 0, 0, 0, 0)
+
+
+def test_what_is_planned_in_never_exceeds_the_exact_distance_and_the_kernel_field_is_no_proof() -> None:
+    """Beside and between splats of many sizes: certified <= the exact distance in float64 everywhere, which is
+    1-Lipschitz; the controller's own field is steeper than that somewhere, so nothing follows from its samples.
+    """
+    steepest = 0.0
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        centers = random.uniform(-1.5, 1.5, (200, 3)).astype(np.float32)
+        centers[100:] = centers[0] + random.normal(size=(100, 3)) * 0.03
+        radii = random.uniform(0.002, 0.02, 200).astype(np.float32)
+        fields = splat_fields(splats_of(*zip(map(tuple, centers), map(float, radii), strict=True)), Config(), 1)  # type: ignore[arg-type]
+        points = np.concatenate(
+            [
+                random.uniform(-3, 3, (500, 3)),
+                centers[100:] + random.normal(size=(100, 3)) * 0.02,
+                centers.astype(float),
+            ]
+        )
+        gap = np.linalg.norm(points[:, None] - centers.astype(np.float64), axis=2) - radii.astype(np.float64)
+        certified = certified_distance(fields)(points)
+        assert np.all(certified < gap.min(axis=1))
+        assert np.all(certified > gap.min(axis=1) - 3e-5)
+        near = points + random.normal(size=points.shape) * 2e-3
+        change = np.abs(fields.barrier.query(near)[0] - fields.barrier.query(points)[0])
+        steepest = max(steepest, float(np.max(change / np.linalg.norm(near - points, axis=1))))
+    assert steepest > 1.2

@@ -17,8 +17,3 @@ def test_a_row_per_step_with_nothing_where_there_is_no_value(tmp_path: Path) -> 
 def test_columns_of_unequal_length_are_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="shorter"):
         write_steps(tmp_path / "steps.csv", [{"a": [1, 2], "b": [1]}])
-
-
-def test_chunks_follow_each_other_under_one_header(tmp_path: Path) -> None:
-    write_steps(tmp_path / "steps.csv", ({"a": [k, k + 1]} for k in (0, 2)))
-    assert (tmp_path / "steps.csv").read_text() == "a\n0\n1\n2\n3\n"

@@ -1,4 +1,4 @@
-"""Occupied voxels without a splat are obstacles wherever a scene is asked for a distance."""
+"""Occupied voxels without a splat are obstacles wherever a distance is asked for; people are kept farther off."""
 
 import json
 from pathlib import Path
@@ -14,8 +14,10 @@ from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.jobs.replay.known_scene import from_splats, splat_fields
 from splatctrl_cli.records import Float64, Label
+from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import Balls, OccupancyGrid
-from tests.cli.replay_desk import SECOND, splats_of, write_scene
+from tests.cli.replay_desk import SECOND, START, splats_of, write_scene
+from tests.jobs.stage import FAR, Ball, Stage, decisive, resting
 from tests.reference.unrepresented import unrepresented
 
 RADIUS = 0.05 * 3**0.5  # of a ball: the grid's voxels have 10 cm
@@ -111,3 +113,45 @@ def test_a_scene_of_an_older_version_has_none(tmp_path: Path, scene: Path) -> No
     (old / "snapshots" / "000000.npz").unlink()
     distances = from_splats(old, Config(), 1).at(0).distances["exact"](POINTS)
     assert distances[0] > 0.6
+
+
+pytestmark = pytest.mark.usefixtures("without_plots")
+
+
+@pytest.mark.parametrize(("human_margin", "code"), [(0.02, 0), (0.055, 0), (0.065, 1)])
+def test_people_are_kept_at_a_margin_of_their_own(stage: Stage, human_margin: float, code: int) -> None:
+    stage.people = [stage.ball_at_the_end(0.06)]
+    found, verdict = stage.judged("--set", f"control.human_margin={human_margin}")
+    assert (found, decisive(verdict)) == (code, {"clearance of people": "failed"} if code else {})
+
+
+def test_things_are_not_kept_at_the_margin_of_people(stage: Stage) -> None:
+    stage.balls = [FAR, stage.ball_at_the_end(0.06)]
+    assert stage.judged("--set", "control.human_margin=0.1")[0] == 0
+
+
+def nearest_to(stage: Stage, ball: Ball) -> float:
+    """Of the moving arm's surface over the logged motion [m]."""
+    moving = np.flatnonzero(stage.arm.moving_spheres)
+    centers = stage.arm.sphere_centers_batch(np.array([s.position for s in stage.states]))[:, moving]
+    gaps = np.linalg.norm(centers - np.array(ball[0]), axis=2) - stage.arm.sphere_set.radii[moving] - ball[1]
+    return float(gaps.min())
+
+
+def test_the_truth_is_that_of_the_nearest_surface_not_of_the_nearest_centre(stage: Stage, arm: RobotModel) -> None:
+    stage.states = resting(num=3)
+    ball = deceiving(arm, START)
+    stage.balls = [FAR]
+    stage.judged("--truth", str(stage.truth(ball)))
+    assert stage.desk.metrics()["min_clearance_true"] == pytest.approx(nearest_to(stage, ball), abs=1e-9)
+
+
+def deceiving(arm: RobotModel, q: Float64) -> Ball:
+    """A ball whose nearest sphere by the centre is not the one whose surface is nearest."""
+    moving = np.flatnonzero(arm.moving_spheres)
+    centers, radii = arm.sphere_centers(q)[moving], arm.sphere_set.radii[moving]
+    for point in np.random.default_rng(0).uniform(-1, 1, (5000, 3)):
+        gaps = np.linalg.norm(centers - point, axis=1)
+        if (gaps - radii)[np.argmin(gaps)] > (gaps - radii).min() + 0.005 and (gaps - radii).min() > 0.15:
+            return (float(point[0]), float(point[1]), float(point[2])), 0.05
+    raise AssertionError

@@ -22,8 +22,7 @@ from splatctrl_cli.jobs.report.report import MOST_SCENES, ViewRequest, WriteRepo
 from splatctrl_cli.jobs.report.spaces import space_of
 from splatctrl_cli.jobs.runs.run_folder import open_run
 from splatctrl_cli.robot.model import RobotModel
-from tests.jobs.runs import Runs, patch_json
-from tests.jobs.stage import passing
+from tests.jobs.stage import Runs, passing, patch_json
 from tests.report.browser import found_on
 
 ARM = "const arm = () => viewer.links.map((link) => link.position.toArray().concat(link.quaternion.toArray()));"

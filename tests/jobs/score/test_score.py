@@ -1,32 +1,50 @@
-"""`score` on scenes and recordings whose scores are known."""
+"""`score` on scenes whose scores are known: of one log, of a session, and of other programs' splats."""
 
 import csv
 import json
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.evaluate.views import psnr
+from splatctrl_cli.formats.splat.gaussian_ply import write_gaussian_ply
+from splatctrl_cli.formats.splat.splats import FORMATS, as_gaussians, write_ply
+from splatctrl_cli.jobs.bake.request import read_bake_source
+from splatctrl_cli.jobs.compare.compare import CompareRequest, compare
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
+from splatctrl_cli.jobs.recordings.provenance import first_frame
+from splatctrl_cli.jobs.score import reference as score_reference
+from splatctrl_cli.jobs.score import score as score_job
 from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.score.views import CloudSettings
+from splatctrl_cli.recording.container.raw_log import RawMessage
 from splatctrl_cli.recording.folder.dtu import DtuView, write_dtu
+from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import Label, RgbdFrame
+from splatctrl_cli.records import GaussianSet, Label, RgbdFrame
+from splatctrl_cli.scene.gaussians import render_gaussians
 from tests.jobs.score.wall import (
     AWAY,
     FRAMES,
     FRONT,
+    INTRINSICS,
     SECOND,
     SIDE,
     FakeScene,
+    FakeSnapshot,
     FakeSource,
     frame,
     set_up,
     wall,
     write_scene,
 )
+from tests.recording.log.make_log import FRAME_NS, START_NS, LogRecipe, make_log, messages_of, write_raw
 
 
 @pytest.fixture
@@ -104,6 +122,7 @@ def test_the_output_folder_holds_scores_rows_pictures_and_the_run(scored: Path) 
     assert rows[2]["psnr_seen"] == ""
     run_json = json.loads((result.out / "run.json").read_text())
     assert run_json["metrics"] == report["metrics"]
+    assert compare(CompareRequest(runs=(result.out, result.out))).metrics["num_figures"] > 5
     assert set(run_json["inputs"]) == {"fake", "scene/splats.ply"}
 
 
@@ -193,3 +212,157 @@ def test_what_no_splat_covers_shows_the_background_of_the_scene(
     set_up(monkeypatch, FakeScene(background=(0.0, 1.0, 0.0)), FakeSource(frames=FRAMES))
     away = run(scored).report["views"][2]
     assert away["psnr_all"] == pytest.approx(10 * np.log10(3), abs=0.01), "green before a black view of nothing"
+
+
+Keep = Callable[[RawMessage], bool]
+
+
+def of(*words: str) -> Keep:
+    return lambda message: any(word in message.topic.name for word in words)
+
+
+@pytest.fixture
+def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """a.mcap with cam0 and all of tf, b.mcap with cam1; and a scene that cam0 trained."""
+    whole = make_log(tmp_path / "whole.mcap", LogRecipe(cameras=("cam0", "cam1")))
+    for name, keep in (("a", of("cam0", "tf")), ("b", of("cam1"))):
+        write_raw(tmp_path / f"{name}.mcap", filter(keep, messages_of(whole)))
+    first = next(r for r in open_source(tmp_path / "a.mcap").records() if isinstance(r, RgbdFrame))
+    snapshots = (FakeSnapshot(stamp_ns=START_NS), FakeSnapshot(stamp_ns=START_NS + 2 * FRAME_NS))
+    scene = FakeScene(snapshots=snapshots)
+    scene.run |= {"metrics": {"first_frames": [dict(first_frame(first))]}}
+    (tmp_path / "scene").mkdir()
+    write_ply(tmp_path / "scene" / "splats.ply", wall(), {})
+    monkeypatch.setattr(score_job, "open_splats", lambda path: scene)
+    return tmp_path
+
+
+def run_session(folder: Path, *names: str) -> ScoreResult:
+    first, *beside = (folder / name for name in names)
+    recording = RecordingRequest(path=first, beside=tuple(beside))
+    return score(ScoreRequest(scene=folder / "scene", recording=recording, images="none"))
+
+
+def test_a_camera_of_another_log_is_scored_beside_the_log_that_trained(session: Path) -> None:
+    report = run_session(session, "a.mcap", "b.mcap").report
+    assert report["cameras"] == ["cam1"] and report["metrics"]["num_views"] == 5
+    assert report["metrics"]["seen_share"] > 0.99, "both cameras stand at one place"
+    assert report["reference"] == f"{session / 'a.mcap'} + {session / 'b.mcap'}"
+
+
+def test_several_references_are_one_session(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    logs = [word for name in "ab" for word in ("--reference", str(session / f"{name}.mcap"))]
+    assert main(["score", str(session / "scene"), *logs]) == 0
+    assert "5 views scored" in capsys.readouterr().out
+
+
+def test_the_other_log_alone_asks_for_the_one_that_trained(session: Path) -> None:
+    whole = make_log(session / "whole.mcap", LogRecipe(cameras=("cam0", "cam1")))
+    write_raw(session / "alone.mcap", filter(of("cam1", "tf"), messages_of(whole)))
+    with pytest.raises(
+        InputError, match=r"has no camera cam0; give that recording, .* give both, each as --reference"
+    ):
+        run_session(session, "alone.mcap")
+
+
+def test_a_camera_that_no_transform_joins_to_the_world_is_refused_by_name(session: Path) -> None:
+    alone = make_log(session / "apart.mcap", LogRecipe(cameras=("cam2",), has_tf=False))
+    with pytest.raises(InputError, match=r"camera cam2: no tf for frame 'cam2_optical'"):
+        run_session(session, "a.mcap", alone.name)
+
+
+def test_a_camera_of_another_time_is_refused_by_name(session: Path) -> None:
+    path = make_log(session / "late.mcap", LogRecipe(cameras=("cam1",), num_frames=40, tf_frames=40))
+    late = [m for m in messages_of(path) if m.log_time_ns > START_NS + 10 * FRAME_NS or "static" in m.topic.name]
+    write_raw(path, late)
+    with pytest.raises(InputError) as refused:
+        run_session(session, "a.mcap", path.name)
+    line = (
+        f"camera cam1: expected frames between those that trained, {START_NS} to {START_NS + 4 * FRAME_NS} ns, got"
+        f" {START_NS + 11 * FRAME_NS} to {START_NS + 39 * FRAME_NS} ns; give logs of the same time and clock"
+    )
+    assert line in str(refused.value)
+
+
+def test_a_log_beside_an_image_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"views.toml: expected a log beside others, got images in a folder"):
+        RecordingRequest(path=tmp_path / "views.toml", beside=(tmp_path / "b.mcap",))
+
+
+STRETCHED = np.array([1.0, 0.6, 1.4], np.float32)
+
+
+@pytest.fixture
+def one_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder; every recording is of one view from the side."""
+    frames = [frame for frame in FRAMES if frame.camera == "cam3"][:1]
+    monkeypatch.setattr(score_reference, "open_source", lambda path, options, **_: FakeSource(frames=frames))
+    return tmp_path
+
+
+def wall_with_harmonics() -> GaussianSet:
+    """The wall, its Gaussians stretched and of another colour from each side."""
+    round_ones = as_gaussians(wall())
+    rng = np.random.default_rng(0)
+    shape = (len(round_ones), 3, 3)
+    more = rng.uniform(-0.3, 0.3, shape).astype(np.float32)
+    return replace(
+        round_ones,
+        scales=round_ones.scales * STRETCHED,
+        harmonics=np.concatenate([round_ones.harmonics, more], axis=1),
+    )
+
+
+def run_file(file: Path, **changes: object) -> ScoreResult:
+    recording = RecordingRequest(path=file.parent / "fake.mcap")
+    return score(ScoreRequest(scene=file, recording=recording, **changes))  # type: ignore[arg-type]
+
+
+def test_stretched_gaussians_with_harmonics_are_scored_as_they_are(one_view: Path) -> None:
+    gaussians = wall_with_harmonics()
+    write_gaussian_ply(one_view / "other.ply", gaussians, {})
+    result = run_file(one_view / "other.ply", out=one_view / "out")
+    frame = next(frame for frame in FRAMES if frame.camera == "cam3")
+    render = render_gaussians(gaussians, INTRINSICS, SIDE, threads=1).color
+    assert result.metrics["psnr_all"] == pytest.approx(psnr(np.clip(render, 0, 1), frame.color / 255.0), abs=0.01)
+    assert (one_view / "out" / "score.json").is_file()
+
+
+def test_that_a_view_may_have_trained_is_told_with_a_remedy(one_view: Path) -> None:
+    write_gaussian_ply(one_view / "other.ply", wall_with_harmonics(), {})
+    assert "does not say which views trained it" in run_file(one_view / "other.ply").notes[0]
+    assert run_file(one_view / "other.ply").metrics["psnr_seen"] is None
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".splat", ".spz"])
+def test_round_splats_of_each_format_are_scored_and_have_distances(one_view: Path, suffix: str) -> None:
+    file = one_view / f"other{suffix}"
+    FORMATS[suffix].write(file, as_gaussians(wall()), {})
+    assert (run_file(file).metrics["psnr_all"] or 0) > 35
+    found = read_bake_source(file, None).splats
+    assert found.centers == pytest.approx(wall().centers, abs=1e-3)
+    assert found.radii == pytest.approx(wall().radii, rel=0.04)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz"])
+def test_colour_by_side_costs_no_distance_and_stretch_is_refused(tmp_path: Path, suffix: str) -> None:
+    coloured = replace(wall_with_harmonics(), scales=as_gaussians(wall()).scales)
+    file = tmp_path / f"other{suffix}"
+    FORMATS[suffix].write(file, coloured, {})
+    assert len(read_bake_source(file, None).splats) == len(coloured)
+    FORMATS[suffix].write(file, wall_with_harmonics(), {})
+    with pytest.raises(InputError, match=r"whose scales differ.*'splatctrl export --isotropic' writes the nearest"):
+        read_bake_source(file, None)
+
+
+def test_splats_in_another_unit_are_refused(one_view: Path) -> None:
+    file = one_view / "other.ply"
+    write_gaussian_ply(file, wall_with_harmonics(), {"units": "millimetre"})
+    with pytest.raises(InputError, match="comment 'units: millimetre': expected m"):
+        run_file(file)
+
+
+def test_a_surface_cannot_be_looked_at_without_training_views(one_view: Path) -> None:
+    write_gaussian_ply(one_view / "other.ply", wall_with_harmonics(), {})
+    with pytest.raises(UsageError, match="--cloud: the surface is looked at from the views that trained, which"):
+        run_file(one_view / "other.ply", cloud=CloudSettings(path=one_view / "cloud.ply"))

@@ -25,7 +25,7 @@ from splatctrl_cli.recording.folder.dtu_source import DtuSource
 from splatctrl_cli.recording.folder.idr import write_idr
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64
-from tests.evaluate.make_observed_space import write_observed
+from tests.evaluate.test_protocols import write_observed
 from tests.recording.folder.make_layout import half_size
 
 QUICK = ("-q", "--max-splats", "600", "--set", "scene.first_iterations=8", "--set", "scene.refine_iterations=4")
