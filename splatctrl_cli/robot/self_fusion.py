@@ -15,10 +15,11 @@ from skimage.measure import marching_cubes
 from splatctrl_cli.config.fixed import MASK_SIGMAS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import back_project, invert_transform, project, strided_lens, transform_points
-from splatctrl_cli.records import Bool, Float32, Float64, Index, Intrinsics, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, Index, Intrinsics, RgbdFrame, spread
 from splatctrl_cli.robot.self_intervals import (
     LEAST_CELLS,
     NUM_CONFIGURATIONS,
+    TOUCHING,
     TRUNCATION,
     VOXEL,
     Fused,
@@ -34,7 +35,8 @@ MOST_REACH = 0.24  # [m], to which it grows with parts that go as far
 STEP = 0.02  # [m] by which some corner of a link's box moves between clearly different configurations
 SAME = 0.01  # [m] within which cameras of one moment see a link in one configuration
 PATH_SHARE = 0.5  # of how far a link went between two moments, that parts them where it came back
-TURN = 0.97  # mean length of a surface's normals in world, below which they turn by 15 degrees or more
+AWAY = 0.04  # [m] from where a cell was, beyond which what is still there is another thing
+MOST_ASKED = 8  # configurations whose places are looked at in the others
 MOST_LOST = 0.5  # of a piece, which more cells that belong elsewhere make no part
 MOST_SETS = 40  # frame sets
 WIDE = 320  # pixels of an image across, to which it is thinned
@@ -76,7 +78,7 @@ def learn(
     links: all of the robot's. reach [m]: how far outside a link's visual surface its parts are looked for; it grows
     to `MOST_REACH` with parts that go as far. A cell of a link's grid is robot in a run of the link's configurations
     where it is a surface in `NUM_CONFIGURATIONS` of them, no more than `FREE_SHARE` of those that see it see through
-    it, no plane that stays in the world explains it, and it moves against each nearer link. Frames are in order of
+    it, it leaves its place in the world with the link, and it moves against each nearer link. Frames are in order of
     time. Raises InputError where no link can be learned.
     """
     boxes = _boxes(surface)
@@ -112,11 +114,12 @@ def learn(
 
 @dataclass(frozen=True, kw_only=True)
 class _View:
-    """A thinned image: depth (H, W) float32 [m]; links (H, W) int16, the link that explains a pixel, `UNEXPLAINED` or
-    `EXPLAINED` by some; points_world (M, 3) [m] of what no link explains.
+    """An image: depth (H, W) float32 [m]; links (h, w) int16, the link that explains each `stride`-th pixel,
+    `UNEXPLAINED` or `EXPLAINED` by some; points_world (M, 3) [m] of what no link explains.
     """
 
     stamp_ns: int
+    stride: int
     lens: Intrinsics
     T_camera_world: Float64
     T_world_link: Float64
@@ -137,10 +140,10 @@ def _views(
         lens, depth = strided_lens(frame.intrinsics, stride), np.ascontiguousarray(frame.depth[::stride, ::stride])
         shown = surface.render(T, lens, frame.T_world_camera, depth)
         is_close = (depth > 0) & (shown.depth > 0) & (np.abs(depth - shown.depth) < FAR_OFF)
-        thinned.append((lens, depth, shown))
+        thinned.append((stride, lens, depth, shown))
         ratios.append(np.abs(depth - shown.depth)[is_close] / np.square(depth[is_close]))
     noise = MEDIAN_SIGMA * float(np.median(np.concatenate(ratios)))
-    for frame, T, near, (lens, depth, shown) in zip(frames, T_world_link, boxes, thinned, strict=True):
+    for frame, T, near, (stride, lens, depth, shown) in zip(frames, T_world_link, boxes, thinned, strict=True):
         tolerance = (VOXEL + MASK_SIGMAS * noise * np.square(depth)).astype(np.float32)
         is_link = (shown.depth > 0) & (np.abs(shown.depth - depth) <= tolerance)
         links = np.where(is_link, shown.link, np.int16(UNEXPLAINED))
@@ -152,8 +155,8 @@ def _views(
         is_own = surface.distance(T, points, within=tolerance[v, u]) <= tolerance[v, u]
         links[v[is_own], u[is_own]] = EXPLAINED
         view = _View(
-            stamp_ns=frame.stamp_ns, lens=lens, T_camera_world=invert_transform(frame.T_world_camera),
-            T_world_link=T, depth=depth, links=links, points_world=points[~is_own],
+            stamp_ns=frame.stamp_ns, stride=stride, lens=frame.intrinsics, links=links, points_world=points[~is_own],
+            T_camera_world=invert_transform(frame.T_world_camera), T_world_link=T, depth=frame.depth,
         )  # fmt: skip
         views.append(view)
     return views
@@ -195,10 +198,12 @@ def _learn_link(
         distance, seen, free = fused.within(run)
         solid = np.where(owner == index, np.maximum(distance, VOXEL - gap), TRUNCATION)
         is_solid = solid < 0
-        normals = _normals(spread_cells(mask, distance, np.nan))[mask][is_solid]
-        its = (cells[is_solid], seen[:, is_solid])
+        its, shown = (
+            (cells[is_solid], seen[:, is_solid]),
+            [(v, k - run.start) for v, k in used if run.start <= k < run.stop],
+        )
         stays, moves, is_other = np.zeros((3, len(cells)), bool)
-        stays[is_solid], moves[is_solid] = _stays_in_world(*its, normals, poses[run, number])
+        stays[is_solid], moves[is_solid] = _stays_in_world(*its, shown, number, poses[run, number])
         is_other[is_solid] = _is_on_other_link(surface, number, *its, gap[is_solid], poses[run], reach)
         grid = _without_scene(spread_cells(mask, solid, TRUNCATION), spread_cells(mask, stays, 0) > 0)
         is_elsewhere = spread_cells(mask, is_other | (stays & moves), 0) > 0
@@ -238,34 +243,49 @@ def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: i
     seen, free = (np.zeros((num, len(cells)), bool) for _ in range(2))
     for view, k in used:
         points = transform_points(view.T_camera_world @ view.T_world_link[number], cells)
-        ahead = np.flatnonzero(points[:, 2] > TRUNCATION)
-        u, v = np.floor(project(view.lens, points[ahead]) + 0.5).astype(int).T
-        lands = (u >= 0) & (v >= 0) & (u < view.lens.width) & (v < view.lens.height)
-        ahead, u, v = ahead[lands], u[lands], v[lands]
-        before, link = view.depth[v, u] - points[ahead, 2], view.links[v, u]
+        ahead, v, u, before = _landing(view, points, np.arange(len(cells)))
+        link = view.links[v // view.stride, u // view.stride]
         is_free = before > TRUNCATION
         is_seen = (np.abs(before) <= TRUNCATION) & ((link == UNEXPLAINED) | (link == number))
-        is_known = (is_free | is_seen) & (view.depth[v, u] > 0)
-        share = np.clip((before + TRUNCATION) / (TRUNCATION - VOXEL), 0.0, 1.0) * is_known
+        share = np.clip((before + TRUNCATION) / (TRUNCATION - VOXEL), 0.0, 1.0) * (is_free | is_seen)
         total[k, ahead] += share * np.minimum(before, TRUNCATION)
         weight[k, ahead] += share
-        seen[k, ahead] |= is_seen & is_known
-        free[k, ahead] |= is_free & is_known
+        seen[k, ahead] |= is_seen
+        free[k, ahead] |= is_free
     return Fused(total=total, weight=weight, seen=seen, free=free)
 
 
-def _stays_in_world(cells: Float64, seen: Bool, normals: Float64, poses: Float64) -> tuple[Bool, Bool]:
-    """Cells (N,) whose surface a plane that stays in the world explains in the configurations (K, N) that see it: its
-    normal does not turn, and it does not move along it by `STEP`. And cells (N,) that move by `STEP` at all: beside a
-    joint's axis no cell does. normals (N, 3), link frame; T_world_link (K, 4, 4).
+def _stays_in_world(
+    cells: Float64, seen: Bool, shown: Sequence[tuple[_View, int]], number: int, poses: Float64
+) -> tuple[Bool, Bool]:
+    """Cells (N,) that stay in the world: where they were a surface in one of their configurations (K, N), views of
+    others (`shown`, each with its configuration) show one still, and at least as often as they see through it once
+    the cell is `AWAY`. And cells (N,) that move by `STEP` at all: beside a joint's axis no cell does.
+    T_world_link (K, 4, 4), of the link with that number.
     """
-    turned = np.einsum("kij,nj->kni", poses[:, :3, :3], normals)
-    normal = np.einsum("kn,kni->ni", seen / np.maximum(seen.sum(axis=0), 1), turned)
-    length = np.linalg.norm(normal, axis=1)
-    places = _moved(poses, cells)
-    along = np.einsum("kni,ni->kn", places, normal) / np.maximum(length, 1e-6)
-    stays = (length >= TURN) & (_span(along[..., None], seen) < STEP)
-    return np.asarray(stays), _span(places, seen) >= STEP
+    places, votes = _moved(poses, cells), np.zeros(len(cells), np.int64)
+    for view, k in shown:
+        for m in spread(range(len(poses)), MOST_ASKED):
+            asked = np.flatnonzero(seen[m] & (np.linalg.norm(places[m] - places[k], axis=1) >= AWAY))
+            points = transform_points(view.T_camera_world, places[m, asked])
+            asked, v, u, before = _landing(view, points, asked)
+            is_unexplained = view.links[v // view.stride, u // view.stride] == UNEXPLAINED
+            is_surface = is_unexplained & (np.abs(before) <= TRUNCATION)
+            votes[asked] += is_surface.astype(np.int64) - (before > TRUNCATION)
+    return votes >= 0, _span(places, seen) >= STEP
+
+
+def _landing(view: _View, points: Float64, numbers: Index) -> tuple[Index, Index, Index, Float64]:
+    """Of points (N, 3) [m], camera frame, with their numbers (N,), those before a pixel with depth: number, pixel
+    (v, u), and how far [m] the point lies before its depth.
+    """
+    ahead = np.flatnonzero(points[:, 2] > TRUNCATION)
+    u, v = np.floor(project(view.lens, points[ahead]) + 0.5).astype(int).T
+    lands = (u >= 0) & (v >= 0) & (u < view.lens.width) & (v < view.lens.height)
+    ahead, u, v = ahead[lands], u[lands], v[lands]
+    known = view.depth[v, u] > 0
+    ahead, u, v = ahead[known], u[known], v[known]
+    return numbers[ahead], v, u, view.depth[v, u] - points[ahead, 2]
 
 
 def _is_on_other_link(
@@ -312,18 +332,9 @@ def _candidates(points: Float64, configurations: Index) -> tuple[Float64, Bool]:
     return edge * first + VOXEL / 2, mask.repeat(BLOCK, 0).repeat(BLOCK, 1).repeat(BLOCK, 2)
 
 
-def _normals(distance: Float32) -> Float64:
-    """Unit normals (X, Y, Z, 3), outwards, of a grid smoothed over its cells; NaN ones are as the nearest other."""
-    nearest = ndimage.distance_transform_edt(np.isnan(distance), return_distances=False, return_indices=True)
-    filled = distance[tuple(nearest)]
-    slopes = [ndimage.gaussian_filter(filled, 1.5, order=order) for order in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
-    normals = np.stack(slopes, axis=-1).astype(np.float64)
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12))
-
-
 def _without_scene(distance: Float32, stays: Bool) -> Float32:
     """The grid without pieces most of which stays in the world, and without those of fewer than `LEAST_CELLS`."""
-    pieces, num = ndimage.label(distance < 0)
+    pieces, num = ndimage.label(distance < 0, TOUCHING)
     sizes = np.bincount(pieces.ravel(), minlength=num + 1)
     is_out = (sizes < LEAST_CELLS) | (np.bincount(pieces.ravel(), stays.ravel(), num + 1) > MOST_LOST * sizes)
     is_out[0] = False

@@ -18,6 +18,10 @@ VOXEL = 0.004  # [m]
 TRUNCATION = 3 * VOXEL  # [m] before and behind a measured surface
 LEAST_CELLS = 24  # of a part, 1.5 cm^3
 NUM_CONFIGURATIONS = 5  # that a cell has to be a surface in
+TOUCHING = np.ones((3, 3, 3))  # cells that are one piece: thin things lie aslant
+FEWER_CONFIGURATIONS = 3  # the same of a cell beside such cells
+FREE_BESIDE = 0.5  # of the configurations that see such a cell, as `FREE_SHARE`
+SURE_SHARE = 0.25  # of a piece of cells, that has enough of them
 FREE_SHARE = 0.3  # of the configurations that see a cell; where more see through it, it is no robot
 FREE_WEIGHT = (1 - FREE_SHARE) / FREE_SHARE  # votes of a configuration that sees through a cell
 AROUND = 7  # cells across, whose votes choose an interval
@@ -46,11 +50,13 @@ class Fused:
         mean = np.where(weight > 0.5, total / np.maximum(weight, 1e-9), np.nan).astype(np.float64)
         return mean, self.seen[run] & ~self.free[run], self.free[run]
 
-    def is_robot(self, gap: Float64, run: slice) -> Bool:
-        """Cells (N,) inside of a surface that a run shows, beside the link's own, which is `gap` (N,) [m] away."""
+    def is_robot(self, gap: Float64, run: slice, least: int, most_free: float) -> Bool:
+        """Cells (N,) inside of a surface that `least` configurations of a run show and a share of at most `most_free`
+        sees through, beside the link's own, which is `gap` (N,) [m] away.
+        """
         mean, seen, free = self.within(run)
         num, num_free = seen.sum(axis=0), free.sum(axis=0)
-        is_robot = (num >= NUM_CONFIGURATIONS) & (num_free <= FREE_SHARE * (num + num_free))
+        is_robot = (num >= least) & (num_free <= most_free * (num + num_free))
         return np.asarray(is_robot & (np.maximum(np.nan_to_num(mean, nan=TRUNCATION), VOXEL - gap) < 0))
 
     def votes(self, run: slice) -> Float32:
@@ -99,7 +105,7 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
     own = Fused(
         total=fused.total * inside, weight=fused.weight * inside, seen=fused.seen & inside, free=fused.free & inside
     )
-    left = own.is_robot(gap, slice(num)) & ((before >= 0) | (after < num))
+    left = own.is_robot(gap, slice(num), NUM_CONFIGURATIONS, FREE_SHARE) & ((before >= 0) | (after < num))
     first, last = np.where(before < 0, 0, first), np.where(after == num, num - 1, last)
     found = [Interval(first=0, last=num - 1)]
     while len(found) < MOST_INTERVALS and np.count_nonzero(left) >= LEAST_CELLS:
@@ -134,10 +140,15 @@ def _interval(before: int, first: int, last: int, after: int, stamps: Stamps) ->
 
 def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:
     """The number (N,) of the interval in which each cell is robot, -1 for none: that with most votes of the robot's
-    cells around it.
+    cells around it. In all of the recording, the first one, it is also robot beside such cells where fewer
+    configurations show it: in some, rays pass beside what is as thin as a pixel.
     """
     runs = [slice(interval.first, interval.last + 1) for interval in intervals]
-    is_robot = np.array([fused.is_robot(gap, run) for run in runs])
+    is_robot = np.array([fused.is_robot(gap, run, NUM_CONFIGURATIONS, FREE_SHARE) for run in runs])
+    perhaps = fused.is_robot(gap, runs[0], FEWER_CONFIGURATIONS, FREE_BESIDE)
+    pieces = ndimage.label(spread_cells(mask, perhaps, 0), TOUCHING)[0][mask]
+    num, num_sure = np.bincount(pieces), np.bincount(pieces, is_robot[0])
+    is_robot[0] |= perhaps & (num_sure >= SURE_SHARE * num)[pieces]
     votes = [np.where(is_robot.any(axis=0), fused.votes(run), 0) for run in runs]
     around = [ndimage.uniform_filter(spread_cells(mask, each, 0), AROUND)[mask].round(3) for each in votes]
     chosen = np.argmax(around, axis=0)

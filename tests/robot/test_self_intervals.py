@@ -11,7 +11,7 @@ from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.kernels.triangles import TriangleTree
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.robot.self_fusion import choose_moments, learn
-from splatctrl_cli.robot.self_intervals import VOXEL
+from splatctrl_cli.robot.self_intervals import VOXEL, Fused, Interval, choose_intervals
 from splatctrl_cli.robot.self_model import ALWAYS, SelfModel
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
@@ -96,3 +96,20 @@ def test_moments_part_a_way_there_and_back() -> None:
     at = np.array([ROBOT.poses(poses(turn, 0.0)) for turn in turns])
     chosen = choose_moments(ROBOT, at, most=12)
     assert len(chosen) == 12 and max(np.diff(chosen)) <= 9
+
+
+@pytest.mark.parametrize(("num_sure", "is_whole"), [(4, True), (2, False), (0, False)])
+def test_a_thin_thing_is_whole_where_enough_of_its_piece_is_surely_there(num_sure: int, is_whole: bool) -> None:
+    """A rod of 12 cells aslant: a surface in six of ten configurations, or in four and free in three."""
+    mask = np.ones((14, 14, 14), np.bool_)
+    rod = np.zeros((14, 14, 14), np.bool_)
+    steps = np.arange(1, 13)
+    rod[steps, steps, 3] = True
+    seen, free = np.zeros((2, 10, mask.size), np.bool_)
+    cells = np.flatnonzero(rod)
+    seen[:6, cells[:num_sure]] = True
+    seen[:4, cells[num_sure:]] = free[6:9, cells[num_sure:]] = True
+    weight = (seen | free).astype(np.float32)
+    fused = Fused(total=-0.002 * weight, weight=weight, seen=seen, free=free)
+    found = choose_intervals(fused, mask, np.full(mask.size, 0.02), [Interval(first=0, last=9)])
+    assert np.flatnonzero(found == 0).tolist() == cells[: 12 if is_whole else num_sure].tolist()

@@ -151,6 +151,14 @@ def test_a_plate_that_the_arm_moves_along_stays_in_the_world() -> None:
     assert learn(ROBOT, LINKS, frames, at).pieces() == []
 
 
+def test_a_rod_along_which_the_arm_moves_stays_in_the_world() -> None:
+    """The arm nods at a rod 2 cm before its tip: in the arm's frame it stays, but for its slant."""
+    rod = Shape(link="world", kind="capsule", size=(0.006, 0.6), T_link_shape=pose_at((0.42, 0.0, 0.4)))
+    truth = RobotSurface.from_parts([*shapes(has_bracket=False), rod])
+    nods = [(0.0, float(lift)) for lift in np.linspace(-0.45, 0.45, 19)]
+    assert learn(ROBOT, LINKS, *recorded(nods, truth)).pieces() == []
+
+
 def test_a_rib_goes_on_beside_the_joint_where_it_hardly_moves() -> None:
     rib = Shape(link="arm", kind="box", size=(0.34, 0.02, 0.02), T_link_shape=pose_at((0.17, 0.0, 0.06)))
     truth = RobotSurface.from_parts([*shapes(has_bracket=False), rib])
