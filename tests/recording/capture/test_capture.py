@@ -81,9 +81,11 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
     assert all((first / name).read_bytes() == (second / name).read_bytes() for name in files)
 
 
-def test_every_file_stands_in_sha256sums(tmp_path: Path) -> None:
-    _, folder = captured(tmp_path, LogRecipe())
+def test_every_file_stands_in_sha256sums_by_name(tmp_path: Path) -> None:
+    lens = (0.4, 0.0, 0.0, 0.0, 0.0)  # with a mask of what it saw
+    _, folder = captured(tmp_path, LogRecipe(cameras=("cam", "cam-b", "cam0"), distortion=lens))
     sums = dict(reversed(line.split("  ")) for line in (folder / "SHA256SUMS").read_text().splitlines())
+    assert list(sums) == sorted(sums)
     files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} - {"SHA256SUMS"}
     assert set(sums) == files
     assert all(hashlib.sha256((folder / name).read_bytes()).hexdigest() == sums[name] for name in files)
