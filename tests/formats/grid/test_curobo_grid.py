@@ -68,6 +68,7 @@ def test_0_7_reads_the_value_of_the_cell_that_a_centre_lies_in(tmp_path: Path, g
     file = loaded(tmp_path / "field.curobo.npz")
     shape = grid.channels["sdf"].shape
     assert host_shape_07(file["dims"].tolist(), float(file["voxel_size"])) == list(shape) == file["shape"].tolist()
+    assert (json.loads(str(file["header"])), file["pose"][3:].tolist()) == (HEADER, [1.0, 0.0, 0.0, 0.0])
     assert (file["features"].dtype, file["features"].shape) == (np.float32, (math.prod(shape),))
     points = centers(grid).reshape(-1, 3)
     expected = np.array(list(np.ndindex(shape)))
@@ -78,14 +79,6 @@ def test_0_7_reads_the_value_of_the_cell_that_a_centre_lies_in(tmp_path: Path, g
         np.testing.assert_array_equal(values[is_read], -grid.channels["sdf"].ravel()[is_read])
         assert is_read.any()
         assert (values[~is_read] == -1000.0).all(), "as the docs say: free"
-
-
-def test_the_file_says_what_it_is_for(tmp_path: Path) -> None:
-    write_curobo(tmp_path / "a", random_grid())
-    file = loaded(tmp_path / "a")
-    assert (str(file["curobo"]), str(file["channel"])) == ("0.7", "sdf")
-    assert json.loads(str(file["header"])) == HEADER
-    assert file["pose"][3:].tolist() == [1.0, 0.0, 0.0, 0.0]
 
 
 def test_what_curobo_cannot_take_is_refused(tmp_path: Path) -> None:

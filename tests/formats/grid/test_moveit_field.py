@@ -92,13 +92,6 @@ def test_cells_without_a_distance_are_occupied(tmp_path: Path) -> None:
     assert not cells[grid.channels["sdf"] > 0].any()
 
 
-def test_the_head_is_read_by_itself(tmp_path: Path) -> None:
-    write_moveit(tmp_path / "a", random_grid())
-    numbers, start = read_moveit_head(tmp_path / "a")
-    assert numbers["resolution"] == 0.02
-    assert len(zlib.decompress((tmp_path / "a").read_bytes()[start:])) == 5 * 4 * 2
-
-
 def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected the channel bound or hard, got sdf; bake it with one of them"):
         write_moveit(tmp_path / "field.moveit", random_grid("sdf"))

@@ -5,7 +5,7 @@ import pytest
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.grid import grid_format
-from splatctrl_cli.formats.grid.vti import read_vti, read_vti_head, write_vti
+from splatctrl_cli.formats.grid.vti import read_vti, write_vti
 from tests.formats.grid.make_grid import SHAPE, random_grid, with_unknown
 
 
@@ -34,23 +34,6 @@ def test_vtk_reads_every_value_at_its_place(tmp_path: Path, channels: tuple[str,
     assert data.GetScalars().GetName() == "sdf"
     assert (data.GetVectors() is not None) == ("gradient" in grid.channels)
     assert grid_format.parse_header("x", image.GetFieldData().GetAbstractArray("header").GetValue(0)) == grid.header
-
-
-@pytest.mark.parametrize("chunk", [1, 500, 1 << 24])
-def test_it_reads_back_whatever_the_pieces_it_is_written_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: int
-) -> None:
-    monkeypatch.setattr(grid_format, "CHUNK", chunk)
-    monkeypatch.setattr(grid_format, "TILE", 3)
-    grid = with_unknown(random_grid())
-    write_vti(tmp_path / "field.vti", grid)
-    read = read_vti(tmp_path / "field.vti")
-    assert (read.header, read.voxel, read.origin.tolist()) == (grid.header, grid.voxel, grid.origin.tolist())
-    assert list(read.channels) == list(grid.channels)
-    for name, values in grid.channels.items():
-        np.testing.assert_array_equal(read.channels[name], values)
-    head = read_vti_head(tmp_path / "field.vti")
-    assert (head.shape, head.channels) == (SHAPE, tuple(grid.channels))
 
 
 @pytest.mark.parametrize(
