@@ -1,5 +1,7 @@
 """The same recording in every container gives the same records."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.records import JointState, Record, RgbdFrame
-from tests.recording.log.make_log import STORE, LogRecipe, make_log, messages_of, write_bag
+from tests.recording.log.make_log import STORE, LogRecipe, make_log, messages_of, write_bag, write_raw
 
 
 def as_ros2_folder(log: Path, folder: Path, plugin: StoragePlugin) -> Path:
@@ -37,24 +39,28 @@ def assert_same(before: list[Record], after: list[Record]) -> None:
             assert np.array_equal(a.depth, b.depth)
             assert b.T_world_camera == pytest.approx(a.T_world_camera, abs=1e-12)
             assert (a.camera, a.intrinsics) == (b.camera, b.intrinsics)
+            assert np.array_equal(a.human, b.human) and np.array_equal(a.valid, b.valid)
         else:
             assert isinstance(b, JointState)
             assert np.array_equal(a.position, b.position)
             assert np.array_equal(a.velocity, b.velocity)
 
 
-@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_a_ros2_bag_folder_gives_the_records_of_its_mcap(tmp_path: Path, plugin: StoragePlugin) -> None:
-    log = make_log(tmp_path / "log.mcap", LogRecipe(color_format="rgb8"))
-    bag = as_ros2_folder(log, tmp_path / "bag", plugin)
-    assert_same(list(open_source(log).records()), list(open_source(bag).records()))
-    assert describe(bag).missing == ()
+FORMS: dict[str, Callable[[Path, Path], Path]] = {
+    "ROS 2, sqlite3": partial(as_ros2_folder, plugin=StoragePlugin.SQLITE3),
+    "ROS 2, MCAP": partial(as_ros2_folder, plugin=StoragePlugin.MCAP),
+    "ROS 1": lambda log, path: as_ros1_bag(log, path.with_suffix(".bag")),
+    "ROS 1 in MCAP": lambda log, path: write_raw(path, messages_of(as_ros1_bag(log, path.with_suffix(".bag")))),
+}
 
 
-def test_a_ros1_bag_gives_the_same_records(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
-    bag = as_ros1_bag(log, tmp_path / "log.bag")
-    assert_same(list(open_source(log).records()), list(open_source(bag).records()))
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("recipe", [LogRecipe(color_format="rgb8"), LogRecipe(cameras=("cam0", "cam1"))])
+def test_a_recording_gives_the_same_records_in_every_container(tmp_path: Path, form: str, recipe: LogRecipe) -> None:
+    log = make_log(tmp_path / "log.mcap", recipe)
+    other = FORMS[form](log, tmp_path / "other")
+    assert_same(list(open_source(log).records()), list(open_source(other).records()))
+    assert describe(other).missing == ()
 
 
 def test_a_bag_folder_that_lacks_a_file_is_refused(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """DTU scans in MVSNet's and IDR's layouts: what is written reads back, damage is named, views become records."""
 
 import shutil
-import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, project
-from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, read_image, write_dtu
+from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.recording.folder.dtu_source import DtuSource, shrunk, view_numbers
 from splatctrl_cli.recording.folder.idr import decompose, projection, read_idr, write_idr
 from splatctrl_cli.recording.source import open_source
@@ -385,17 +384,3 @@ def test_the_sample_scan_is_seen_the_same_from_two_views(sample_data: Path) -> N
     error = np.abs(b.depth[np.rint(vb[inside]).astype(int), np.rint(ub[inside]).astype(int)] - in_b[..., 2][inside])
     assert inside.sum() > 80
     assert np.median(error) < 0.003
-
-
-def test_a_cut_photograph_is_refused_and_a_turned_one_keeps_its_pixels(tmp_path: Path) -> None:
-    pixels = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
-    jpeg = bytes(cv2.imencode(".jpg", pixels)[1])
-    entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)  # EXIF: turn by 90 degrees
-    exif = b"Exif\x00\x00" + b"II*\x00" + struct.pack("<IH", 8, 1) + entry + bytes(4)
-    path = tmp_path / "rect_001.jpg"
-    path.write_bytes(jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:])
-    assert read_image(path).shape == (8, 12, 3)
-    assert np.array_equal(read_image(path), cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1])
-    path.write_bytes(jpeg[: len(jpeg) // 2])
-    with pytest.raises(InputError, match="not an image that can be read"):
-        read_image(path)

@@ -71,13 +71,6 @@ def test_float_depth_is_metres_and_what_was_not_measured_is_zero() -> None:
     assert np.array_equal(depth_of(image, 0.5), np.array([[0.75, 0], [0, 0]], dtype=np.float32))
 
 
-def test_too_few_bytes_are_refused_not_padded() -> None:
-    short = message(COUNTS, "16UC1")
-    short.data = short.data[:-1]
-    with pytest.raises(UndecodableMessageError, match="do not hold it"):
-        read_image(short, IMAGE)
-
-
 @pytest.mark.parametrize(("suffix", "error"), [("png", 0), ("jpeg", 1)])
 def test_compressed_color_keeps_its_bytes(suffix: str, error: int) -> None:
     rgb = np.full((16, 16, 3), (200, 60, 20), dtype=np.uint8)  # one colour comes back from JPEG
@@ -185,7 +178,7 @@ def test_planar_yuv_is_read_with_the_rows_of_colour_behind_those_of_grey(
     image = read_image(planar, IMAGE)
     assert (image.width, image.height, image.kind) == (6, 4, "color")
     assert color_of(image)[..., :2] == pytest.approx(np.broadcast_to(EXPECTED, (4, 6, 2)), abs=1.5)
-    planar.data = planar.data[:-7]
+    planar.data = planar.data[: -1 - padding]
     with pytest.raises(UndecodableMessageError, match="do not hold it"):
         read_image(planar, IMAGE)
 
@@ -329,20 +322,3 @@ def test_a_png_with_a_palette_or_a_gamma_has_the_values_that_are_written(lazily:
         recorded = SimpleNamespace(header=header(5, "o"), format="png", data=np.frombuffer(data, np.uint8))
         image = read_image(recorded, COMPRESSED_IMAGE, lazily=lazily)
         assert np.array_equal(color_of(image), RGB[:1])
-
-
-def test_an_interlaced_png_is_read() -> None:
-    """Adam7: the seven passes of an image of one row are its first, fifth, third, and the even pixels."""
-    passes = [(0,), (4,), (), (2,), (), (1, 3, 5), ()]
-    rows = b"".join(b"\0" + RGB[0, list(columns)].tobytes() for columns in passes if columns)
-    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 6, 1, 8, 2, 0, 0, 1))
-    png += chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
-    pixels = decode_file(png, color=True)
-    assert pixels is not None and np.array_equal(pixels, RGB[:1])
-
-
-def test_a_jpeg_decoded_as_rgb_has_the_pixels_of_opencvs_own_order() -> None:
-    pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
-    jpeg = bytes(cv2.imencode(".jpg", pixels)[1])
-    bgr, rgb = decode_file(jpeg, color=False), decode_file(jpeg, color=True)
-    assert bgr is not None and rgb is not None and np.array_equal(bgr[..., ::-1], rgb)

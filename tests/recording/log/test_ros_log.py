@@ -19,7 +19,6 @@ from splatctrl_cli.recording.log.survey import survey
 from splatctrl_cli.recording.source import CameraTopics, SourceOptions, describe, open_source
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from splatctrl_cli.scene.keyframes import make_view
-from tests.recording.container.test_log_formats import as_ros1_bag, assert_same
 from tests.recording.log.make_log import (
     FRAME_NS,
     HEIGHT,
@@ -31,8 +30,6 @@ from tests.recording.log.make_log import (
     color_pixels,
     make_log,
     mask_pixels,
-    messages_of,
-    write_raw,
 )
 
 
@@ -298,13 +295,6 @@ def test_a_distorted_lens_is_undone_on_masks_without_new_values(tmp_path: Path) 
     assert human is not None
     assert set(np.unique(human)) == {0, 1}
     assert not np.array_equal(human, mask_pixels(0) > 0)
-
-
-def test_ros1_messages_in_an_mcap_give_the_same_records(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "log.mcap")
-    bag = as_ros1_bag(log, tmp_path / "log.bag")
-    converted = write_raw(tmp_path / "ros1.mcap", messages_of(bag))
-    assert_same(records_of(log), records_of(converted))
 
 
 def test_a_lens_that_a_person_gives_stands_in_for_camera_info(tmp_path: Path) -> None:
