@@ -310,15 +310,20 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("lazily", [False, True])
-def test_a_png_with_a_palette_or_a_gamma_has_the_values_that_are_written(lazily: bool) -> None:
-    """Six colours of a row; a gamma says how to show them, not what was measured."""
+def test_a_png_with_a_palette_a_gamma_or_interlaced_rows_has_the_values_that_are_written(lazily: bool) -> None:
+    """Six colours of a row; a gamma says how to show them, not what was measured. Adam7's seven passes of one row are
+    its first, fifth, third, and the even pixels.
+    """
     signature, row = b"\x89PNG\r\n\x1a\n", bytes([0, *range(6)])
     palette = signature + chunk(b"IHDR", struct.pack(">IIBBBBB", 6, 1, 8, 3, 0, 0, 0))
     palette += chunk(b"PLTE", RGB[0].tobytes()) + chunk(b"IDAT", zlib.compress(row)) + chunk(b"IEND", b"")
     plain = signature + chunk(b"IHDR", struct.pack(">IIBBBBB", 6, 1, 8, 2, 0, 0, 0))
     plain += chunk(b"gAMA", struct.pack(">I", 100_000))
     plain += chunk(b"IDAT", zlib.compress(b"\0" + RGB[0].tobytes())) + chunk(b"IEND", b"")
-    for data in (palette, plain):
+    passes = [RGB[0, columns].tobytes() for columns in ([0], [4], [2], [1, 3, 5])]
+    interlaced = signature + chunk(b"IHDR", struct.pack(">IIBBBBB", 6, 1, 8, 2, 0, 0, 1))
+    interlaced += chunk(b"IDAT", zlib.compress(b"".join(b"\0" + rows for rows in passes))) + chunk(b"IEND", b"")
+    for data in (palette, plain, interlaced):
         recorded = SimpleNamespace(header=header(5, "o"), format="png", data=np.frombuffer(data, np.uint8))
         image = read_image(recorded, COMPRESSED_IMAGE, lazily=lazily)
         assert np.array_equal(color_of(image), RGB[:1])
