@@ -1,4 +1,4 @@
-"""What every file of a grid keeps: written, described, read back, refused where cut; and a bake in slabs that goes on."""
+"""What every file of a grid keeps: written, described, read back, refused where cut; and bakes in slabs."""
 
 import json
 from dataclasses import replace

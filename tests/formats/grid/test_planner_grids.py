@@ -1,7 +1,7 @@
 """Grids for planners: the index arithmetic here is cuRobo's, as its source has it (NVlabs/curobo 0.7.5 to 0.7.7:
 src/curobo/geom/types.py, VoxelGrid.get_grid_shape, and src/curobo/curobolib/cpp/sphere_obb_kernel.cu,
-compute_voxel_index). `read_from_stream` follows MoveIt's PropagationDistanceField::readFromStream and VoxelGrid::resize
-line by line (moveit_core, distance_field; the same in MoveIt 1 and 2). Neither program itself was run.
+compute_voxel_index). `read_from_stream` follows MoveIt's PropagationDistanceField::readFromStream and
+VoxelGrid::resize line by line (moveit_core, distance_field; the same in MoveIt 1 and 2). Neither program was run.
 """
 
 import io

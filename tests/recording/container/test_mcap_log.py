@@ -1,14 +1,19 @@
-"""Damaged and hostile MCAP files: what is whole is read, what is lost is counted, memory stays bounded."""
+"""Damaged and hostile MCAP files: what is whole is read, what is lost is counted, memory stays bounded. And the MCAP
+project's conformance files are read as their JSON says.
+"""
 
 import bisect
+import json
 import os
 import struct
 import subprocess
 import sys
 import zlib
+from collections.abc import Iterator
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zstandard
@@ -19,10 +24,11 @@ from mcap.writer import Writer as McapWriter
 
 from benchmarks.mcap_recovery import DAMAGES, LOGS, NUM_MESSAGES, damaged, log
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.formats.unpacking import MAX_BLOCK
+from splatctrl_cli.formats.unpacking import MAX_BLOCK, unpacked
 from splatctrl_cli.recording.container.mcap_file import McapFile, Part
 from splatctrl_cli.recording.container.mcap_log import McapLog
-from splatctrl_cli.recording.container.mcap_records import CHUNK, HEAD, MAGIC, MESSAGE
+from splatctrl_cli.recording.container.mcap_records import CHUNK, HEAD, MAGIC, MESSAGE, parse_record
+from splatctrl_cli.recording.container.mcap_records import Chunk as StoredChunk
 from splatctrl_cli.recording.container.raw_log import MAX_NOTES, Damage
 from splatctrl_cli.recording.source import SourceOptions, open_source
 from tests.recording.log.make_log import LogRecipe, make_log
@@ -299,3 +305,67 @@ def test_no_message_is_lost_whose_record_stands_and_each_loss_is_told(tmp_path: 
             found = {(m.topic.name, m.log_time_ns, m.data) for m in McapLog(path).messages(damage)}
             assert {message for message, at in written.items() if at in places} <= found, f"{kind} {number}"
             assert written.keys() <= found or damage.count > 0, f"{kind} {number}"
+
+
+KINDS = ("Footer", "Schema", "Channel", "Statistics", "ChunkIndex", "DataEnd")  # messages: below
+
+
+def records_of(path: Path, damage: Damage) -> Iterator[Any]:
+    """The records of a file whose fields are read, those in its chunks in their place."""
+    for part in McapFile(path).parts(damage):
+        record = parse_record(part.opcode, part.content)
+        if isinstance(record, StoredChunk):
+            yield from records_in(record)
+        elif record is not None:
+            yield record
+
+
+def records_in(chunk: StoredChunk) -> Iterator[Any]:
+    content = unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
+    assert chunk.uncompressed_crc in {0, zlib.crc32(content)}
+    at = 0
+    while at < len(content):
+        opcode, length = HEAD.unpack_from(content, at)
+        at += HEAD.size + length
+        record = parse_record(opcode, content[at - length : at])
+        if record is not None:
+            yield record
+
+
+def as_json(record: Any) -> dict[str, Any]:
+    """A record in the suite's form: numbers as text, bytes as lists of numbers, fields by name."""
+    fields = vars(record)
+    return {"type": type(record).__name__, "fields": [[name, _value(fields[name])] for name in sorted(fields)]}
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return [str(byte) for byte in value]
+    if isinstance(value, dict):
+        return {str(key): _value(item) for key, item in value.items()}
+    return str(value)
+
+
+@pytest.mark.parametrize("group", ["NoData", "OneMessage", "OneAttachment", "OneMetadata", "TenMessages"])
+def test_every_conformance_file_reads_as_its_json_says(real_data: Path, group: str) -> None:
+    files = sorted((real_data / "mcap_conformance" / group).glob("*.mcap"))
+    assert files
+    for file in files:
+        damage = Damage()
+        found = [as_json(record) for record in records_of(file, damage)]
+        records = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))["records"]
+        expected = [record for record in records if record["type"] in KINDS]
+        assert len(expected) >= 2  # the end of the data and a footer
+        assert found == expected, file.name
+        assert damage.notes == [], file.name
+
+
+def test_the_messages_of_every_conformance_file_are_those_of_its_json(real_data: Path) -> None:
+    for file in sorted((real_data / "mcap_conformance").rglob("*.mcap")):
+        damage = Damage()
+        records = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))["records"]
+        expected = [dict(r["fields"]) for r in records if r["type"] == "Message"]
+        found = list(McapLog(file).messages(damage))
+        assert [_value(m.data) for m in found] == [m["data"] for m in expected], file.name
+        assert [str(m.log_time_ns) for m in found] == [m["log_time"] for m in expected], file.name
+        assert damage.count == 0, file.name
