@@ -160,21 +160,25 @@ def test_float_depth_files_are_read_in_their_unit(tmp_path: Path, suffix: str) -
     assert source.loss.invalid_depth == 6
 
 
-def test_files_without_partner_are_counted(tmp_path: Path) -> None:
-    path = described(tmp_path)
-    (tmp_path / "images/depth/8.png").unlink()
+@pytest.mark.parametrize(
+    ("name", "content", "lost", "notes"),
+    [
+        ("depth/8.png", None, (1, 0), []),
+        ("rgb/8.png", b"\x89PNG nonsense", (0, 1), ["8.png: not an image that can be read"]),
+    ],
+)
+def test_an_image_without_partner_or_whose_file_is_broken_is_counted(
+    tmp_path: Path, name: str, content: bytes | None, lost: tuple[int, int], notes: list[str]
+) -> None:
+    path, file = described(tmp_path), tmp_path / "images" / name
+    if content is None:
+        file.unlink()
+    else:
+        file.write_bytes(content)
     source = open_source(path)
     assert len(list(source.records())) == 2
-    assert source.loss.unpaired_color == 1
-
-
-def test_a_broken_image_is_counted_as_damage(tmp_path: Path) -> None:
-    path = described(tmp_path)
-    (tmp_path / "images/rgb/8.png").write_bytes(b"\x89PNG nonsense")
-    source = open_source(path)
-    assert len(list(source.records())) == 2
-    assert source.loss.damaged == 1
-    assert "8.png: not an image" in source.loss.notes[0]
+    assert (source.loss.unpaired_color, source.loss.damaged) == lost
+    assert [note.rpartition("/")[2] for note in source.loss.notes] == notes
 
 
 MATRIX = CAMERA.replace("[camera]", "[depth_camera]") + "depth_to_color = "
@@ -185,6 +189,7 @@ MATRIX = CAMERA.replace("[camera]", "[depth_camera]") + "depth_to_color = "
     [
         (FRAMES, f"{FRAMES}[stamps]\nrat = 3\n", "unknown key stamps.rat; did you mean stamps.rate?"),
         ("fx = 10\n", "", "camera.fx is missing"),
+        ('"images"', '"~nobody-of-that-name/x"', "root: no home folder of ~nobody-of-that-name/x"),
         (FRAMES, "", "[frames] is missing"),
         ("trajectory-log", "trajectory", "poses.format: expected one of matrix-blocks"),
         ("width = 8", 'width = "8"', "camera.width: expected int, got '8'"),
@@ -205,13 +210,6 @@ def test_a_description_that_cannot_be_meant_is_refused(tmp_path: Path, good: str
     path.write_text(path.read_text().replace(good, bad))
     assert said in refusal(path)
     assert ("--depth-scale" in refusal(path)) == ("implausible" in said)
-
-
-def test_a_root_in_the_home_of_nobody_is_named(tmp_path: Path) -> None:
-    make_folder(tmp_path)
-    path = tmp_path / "x.toml"
-    path.write_text('root = "~nobody-of-that-name/x"\n')
-    assert "root: no home folder of ~nobody-of-that-name/x" in refusal(path)
 
 
 def test_a_missing_root_or_pose_file_is_named(tmp_path: Path) -> None:
