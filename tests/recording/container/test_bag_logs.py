@@ -12,7 +12,7 @@ import yaml
 import zstandard
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1 import Writer as Bag1Writer
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Reader as Bag2Reader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_typestore
@@ -23,7 +23,7 @@ from splatctrl_cli.recording.container.bag_logs import Bag1Log, BagFile, Db3Log
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage
 from tests.cases.container_cases import kill_recorder
-from tests.recording.log.make_log import STORE, T
+from tests.recording.log.make_log import T, encoded, write_bag
 
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
 COMPRESSIONS = [None, Bag1Writer.CompressionFormat.BZ2, Bag1Writer.CompressionFormat.LZ4]
@@ -147,19 +147,12 @@ def make_bag(
     folder: Path,
     num: int = 400,
     mode: CompressionMode = CompressionMode.NONE,
-    version: int = 9,
     plugin: StoragePlugin = StoragePlugin.SQLITE3,
 ) -> Path:
     """Texts of 700 bytes on one topic, message i at time i + 1."""
-    writer = Writer(folder, version=version, storage_plugin=plugin)
-    if mode != CompressionMode.NONE:
-        writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        topic = writer.add_connection("/text", "std_msgs/msg/String", typestore=STORE)
-        for index in range(num):
-            message = T["std_msgs/msg/String"](data=f"{index:7d}" * 100)
-            writer.write(topic, index + 1, bytes(STORE.serialize_cdr(message, "std_msgs/msg/String")))
-    return folder
+    texts = (T["std_msgs/msg/String"](data=f"{index:7d}" * 100) for index in range(num))
+    messages = [encoded(index + 1, "/text", text) for index, text in enumerate(texts)]
+    return write_bag(folder, messages, plugin=plugin, mode=mode)
 
 
 def read(path: Path) -> tuple[list[RawMessage], Damage]:

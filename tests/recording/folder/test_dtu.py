@@ -17,7 +17,8 @@ from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.recording.folder.dtu_source import DtuSource, shrunk, view_numbers
 from splatctrl_cli.recording.folder.idr import decompose, projection, read_idr, write_idr
 from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.records import Intrinsics, RgbdFrame
+from splatctrl_cli.records import Intrinsics
+from tests.recording.log.make_log import frames_of
 
 K = Intrinsics(fx=61.0, fy=62.0, cx=32.5, cy=23.0, width=64, height=48)
 IMAGES, DEPTHS = "Rectified/scan7_train", "Depths_raw/scan7"
@@ -54,10 +55,6 @@ def scan(tmp_path: Path) -> Path:
 def idr(tmp_path: Path) -> Path:
     """The folder of a scan in IDR's layout, in a root of its own."""
     return write_idr(tmp_path / "idr", "scan7", VIEWS)
-
-
-def frames_of(source: DtuSource) -> list[RgbdFrame]:
-    return [record for record in source.records() if isinstance(record, RgbdFrame)]
 
 
 def places(source: DtuSource) -> list[tuple[str, int]]:

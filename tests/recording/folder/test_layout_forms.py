@@ -29,7 +29,6 @@ from tests.recording.folder.make_layout import (
     K,
     check,
     counts_of,
-    frames_of,
     make_arkit,
     make_bop,
     make_frames,
@@ -42,6 +41,7 @@ from tests.recording.folder.make_layout import (
     matrix_text,
     write_pair,
 )
+from tests.recording.log.make_log import frames_of
 
 DOCS = Path(__file__).parents[3] / "docs"
 

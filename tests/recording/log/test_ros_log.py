@@ -28,6 +28,7 @@ from tests.recording.log.make_log import (
     broken_log,
     camera_x,
     color_pixels,
+    frames_of,
     make_log,
     mask_pixels,
 )
@@ -35,10 +36,6 @@ from tests.recording.log.make_log import (
 
 def records_of(path: Path, options: SourceOptions | None = None) -> list[Record]:
     return list(open_source(path, options).records())
-
-
-def frames_of(path: Path, options: SourceOptions | None = None) -> list[RgbdFrame]:
-    return [record for record in records_of(path, options) if isinstance(record, RgbdFrame)]
 
 
 def refusal(path: Path, options: SourceOptions | None = None) -> str:

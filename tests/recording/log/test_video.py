@@ -33,6 +33,7 @@ from tests.recording.log.make_log import (
     WIDTH,
     LogRecipe,
     color_pixels,
+    frames_of,
     header,
     make_log,
     messages_of,
@@ -114,10 +115,6 @@ def video_log(
         if number in kept:
             written.append(as_message(message, kept[number], kind, form))
     return write_raw(path, written)
-
-
-def frames_of(source: Any) -> list[RgbdFrame]:
-    return [record for record in source.records() if isinstance(record, RgbdFrame)]
 
 
 def numbers_of(frames: list[RgbdFrame]) -> list[int]:

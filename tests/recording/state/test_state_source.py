@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Float64, JointState, RecordSource, RgbdFrame
 from tests.recording.log.make_log import LogRecipe, make_log
 from tests.recording.log.make_states import (
+    AB,
     FRANKA_ROBOT_STATE,
     FRANKA_STATE,
     NEW_CONTROLLER,
@@ -27,6 +25,9 @@ from tests.recording.log.make_states import (
     Message,
     header,
     joint_state,
+    opened,
+    refusal,
+    states,
     states_of,
     store_with,
     write_bag1,
@@ -35,7 +36,6 @@ from tests.recording.log.make_states import (
 )
 
 ARM = tuple(f"fr3_joint{i}" for i in range(1, 8))
-AB = ("a", "b")
 
 
 def ramp(num: int, joints: int = 2) -> Float64:
@@ -52,28 +52,11 @@ def sent(topic: str, kind: str, contents: Iterable[Any]) -> list[Message]:
     ]
 
 
-def opened(path: Path, joints: tuple[str, ...] = AB, **options: Any) -> RecordSource:
-    return open_states(path, SourceOptions(**options), joints)
-
-
-def states(source: RecordSource) -> list[JointState]:
-    """In the order of the source's joint names."""
-    return [record for record in source.records() if isinstance(record, JointState)]
-
-
 def columns(source: RecordSource, joints: tuple[str, ...]) -> tuple[Float64, Float64]:
     """Positions and velocities (T, J) of joints."""
     order = [source.joint_names.index(name) for name in joints]
     found = states(source)
     return np.array([s.position for s in found])[:, order], np.array([s.velocity for s in found])[:, order]
-
-
-def refusal(path: Path, joints: tuple[str, ...] = AB, **options: Any) -> str:
-    with pytest.raises(InputError) as caught:
-        opened(path, joints, **options)
-    assert caught.value.exit_code == 4
-    assert caught.value.remedy
-    return str(caught.value)
 
 
 def test_a_log_without_cameras_gives_its_states_and_says_why_it_has_no_frames(tmp_path: Path) -> None:

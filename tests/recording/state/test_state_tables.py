@@ -11,12 +11,15 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.recording.state.twists import read_twists
-from splatctrl_cli.records import Float64, JointState, RecordSource
+from splatctrl_cli.records import Float64, JointState
 from tests.recording.log.make_states import (
     START_NS,
     STORE,
     Message,
     header,
+    opened,
+    refusal,
+    states,
     states_of,
     write_bag1,
     write_bag2,
@@ -24,22 +27,6 @@ from tests.recording.log.make_states import (
 )
 
 ARM = tuple(f"panda_joint{i}" for i in range(1, 8))
-
-
-def opened(path: Path, joints: tuple[str, ...] = ("a", "b")) -> RecordSource:
-    return open_states(path, SourceOptions(), joints)
-
-
-def states(path: Path, joints: tuple[str, ...] = ("a", "b")) -> list[JointState]:
-    return [record for record in opened(path, joints).records() if isinstance(record, JointState)]
-
-
-def refusal(path: Path) -> str:
-    with pytest.raises(InputError) as caught:
-        opened(path)
-    assert caught.value.exit_code == 4
-    assert caught.value.remedy
-    return str(caught.value)
 
 
 def block(name: str, num: int = 7, separator: str = ", ") -> str:
@@ -97,7 +84,7 @@ def test_libfranka_logs_of_both_kinds_are_read(tmp_path: Path, is_new: bool) -> 
 
 
 def test_without_a_velocity_command_the_desired_velocity_stands_for_it(tmp_path: Path) -> None:
-    found = states(old_log(tmp_path / "x.csv", is_commanded=False), ARM)
+    found = states(opened(old_log(tmp_path / "x.csv", is_commanded=False), ARM))
     assert found[3].commanded_velocity == pytest.approx(np.full(7, 0.25))
 
 
@@ -107,7 +94,7 @@ def test_an_end_effector_pose_that_a_program_added_is_read_by_columns(tmp_path: 
     path = tmp_path / "x.csv"
     rows = [f"{i},1,{values(q_at(i), T.T.ravel())}" for i in range(5)]
     path.write_text("\n".join([f"duration, success rate, {block('q')},{block('O_T_EE', 16)}", *rows]))
-    assert states(path, ARM)[2].T_base_ee == pytest.approx(T)
+    assert states(opened(path, ARM))[2].T_base_ee == pytest.approx(T)
 
 
 def test_a_csv_of_no_known_kind_asks_for_a_description(tmp_path: Path) -> None:
