@@ -209,20 +209,22 @@ def test_what_the_lens_did_not_see_comes_back_and_is_stored_once(tmp_path: Path)
     assert sum("valid/cam0/" in line for line in sums) == 1 and len(set(sums)) == len(sums)
 
 
-def test_a_frame_whose_valid_pixels_are_not_known_is_left_out(tmp_path: Path) -> None:
-    _, folder = captured(tmp_path, PINCUSHION)
-    next((folder / "valid/cam0").iterdir()).write_bytes(b"no image")
-    source = open_source(folder)
-    assert frames_of(list(source.records())) == [] and source.loss.damaged == 5
-
-
-def test_a_damaged_mask_is_counted_and_its_frame_kept(tmp_path: Path) -> None:
-    _, folder = captured(tmp_path, LogRecipe(mask_every=1), options=MASKED)
-    (folder / "human/cam0/000001.png").write_bytes(b"no image")
+@pytest.mark.parametrize(
+    ("recipe", "mask", "num_frames", "damaged"),
+    [
+        (PINCUSHION, "valid/cam0/*", 0, 5),  # of every frame, which are left out
+        (LogRecipe(mask_every=1), "human/cam0/000001.png", 5, 1),  # its frame is kept
+    ],
+)
+def test_a_damaged_mask_is_counted(
+    tmp_path: Path, recipe: LogRecipe, mask: str, num_frames: int, damaged: int
+) -> None:
+    _, folder = captured(tmp_path, recipe, options=MASKED if recipe.mask_every else None)
+    next(folder.glob(mask)).write_bytes(b"no image")
     source = open_source(folder)
     frames = frames_of(list(source.records()))
-    assert [frame.human is not None for frame in frames] == [True, False, True, True, True]
-    assert source.loss.damaged == 1
+    assert (len(frames), source.loss.damaged) == (num_frames, damaged)
+    assert [frame.stamp_ns for frame in frames if frame.human is None] == [START_NS + FRAME_NS][:num_frames]
 
 
 def test_provenance_says_where_each_image_lies(tmp_path: Path) -> None:

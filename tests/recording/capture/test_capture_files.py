@@ -74,28 +74,28 @@ def test_rows_are_those_of_the_cameras(tmp_path: Path) -> None:
     assert rows[0]["camera"] == "a"
 
 
+OTHER = r"expected columns camera, stamp_ns, .*"
+
+
 @pytest.mark.parametrize(
-    "lines",
+    ("head", "lines", "said"),
     [
-        (line("a", 0), "a,1,b\n"),
-        (line("a", 0).replace("a,0,", "a,x,"),),
-        (line("a", 0).replace(",0,0,0,0", ",0,?,0,0"),),
-        (line("a", 0).replace("color/a", "color/../../a"),),
-        (line("a", 0).replace("depth/a", "/depth/a"),),
-        ("a" * (1 << 17),),
-        ("\xff\x00".encode("latin-1").decode("latin-1") + '"',),
+        (HEAD, (line("a", 0), "a,1,b\n"), ""),
+        (HEAD, (line("a", 0).replace("a,0,", "a,x,"),), ""),
+        (HEAD, (line("a", 0).replace(",0,0,0,0", ",0,?,0,0"),), ""),
+        (HEAD, (line("a", 0).replace("color/a", "color/../../a"),), ""),
+        (HEAD, (line("a", 0).replace("depth/a", "/depth/a"),), ""),
+        (HEAD, ("a" * (1 << 17),), ""),
+        (HEAD, ("\xff\x00".encode("latin-1").decode("latin-1") + '"',), ""),
+        (HEAD.replace("qw", "w"), (), OTHER),
+        ("", (), OTHER),
     ],
 )
-def test_what_is_no_row_is_refused(tmp_path: Path, lines: tuple[str, ...]) -> None:
-    with pytest.raises(InputError, match=r"frames.csv: .*; run `splatctrl ingest` again"):
-        FrameRows(frames(tmp_path, *lines), ("a",))
-
-
-def test_other_columns_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected columns camera, stamp_ns"):
-        FrameRows(frames(tmp_path, head=HEAD.replace("qw", "w")), ("a",))
-    with pytest.raises(InputError, match="expected columns camera, stamp_ns"):
-        FrameRows(frames(tmp_path, head=""), ("a",))
+def test_other_columns_and_what_is_no_row_are_refused(
+    tmp_path: Path, head: str, lines: tuple[str, ...], said: str
+) -> None:
+    with pytest.raises(InputError, match=rf"frames.csv: {said}.*; run `splatctrl ingest` again"):
+        FrameRows(frames(tmp_path, *lines, head=head), ("a",))
 
 
 def test_sums_are_found_by_name_and_the_last_line_of_a_name_holds(tmp_path: Path) -> None:
