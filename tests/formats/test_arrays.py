@@ -73,23 +73,6 @@ def test_a_zip_of_a_later_version_is_no_fault_of_the_program(tmp_path: Path, nam
         describe(path)
 
 
-def test_arrays_are_read_as_numpy_reads_them(tmp_path: Path) -> None:
-    arrays = {
-        "a": np.arange(6.0).reshape(2, 3),
-        "by columns": np.asfortranarray(np.arange(6).reshape(2, 3)),
-        "none": np.zeros((0, 4)),
-        "number": np.array(2.5),
-        "text": np.array("héllo"),
-    }
-    np.savez_compressed(tmp_path / "x.npz", **arrays)  # type: ignore[arg-type]
-    found = read_arrays(tmp_path / "x.npz", most=1000)
-    with np.load(tmp_path / "x.npz") as whole:
-        assert list(found) == list(whole.files)
-        for name in whole.files:
-            assert (found[name].dtype, found[name].tolist()) == (whole[name].dtype, whole[name].tolist())
-    assert list(read_arrays(tmp_path / "x.npz", ["number"], most=8)) == ["number"]
-
-
 def test_arrays_that_are_missing_too_large_or_not_whole_raise(tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
     savez(path, {"a": np.arange(100.0), "b": np.arange(100.0)})

@@ -143,12 +143,3 @@ def test_what_is_farther_than_2_km_is_held_in_larger_steps(tmp_path: Path) -> No
 def test_what_is_no_file_of_these_versions_is_refused(tmp_path: Path, header: tuple[int, ...], message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_spz(packed(tmp_path / "a.spz", HEADER.pack(*header)))
-
-
-def test_what_is_no_gzip_stream_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.spz").write_bytes(b"\x1f\x8b and more")
-    with pytest.raises(InputError, match=r"no whole \.spz file"):
-        read_spz(tmp_path / "a.spz")
-    (tmp_path / "a.spz").write_bytes(b"NGS and more")
-    with pytest.raises(InputError, match=r"expected it to start as gzip or with NGSP, got 4e475320$"):
-        read_spz(tmp_path / "a.spz")

@@ -365,19 +365,3 @@ def test_a_protocol_makes_images_as_small_as_its_published_figures_are_of(tmp_pa
 def test_a_protocol_leaves_out_what_neither_trains_nor_scores(scan: Path) -> None:
     protocol = replace(score_protocol("holdout:1"), training=(3, 0))
     assert places(DtuSource(scan, protocol=protocol)) == [("camera", 0), ("holdout", 1), ("camera", 3)]
-
-
-def test_the_sample_scan_is_seen_the_same_from_two_views(sample_data: Path) -> None:
-    views = read_dtu(sample_data / "dtu").views
-    assert len(views) == 8
-    a, b = views[2], views[3]
-    v, u = np.mgrid[60:150:10, 60:200:10]
-    z = a.depth[v, u].astype(np.float64)
-    k = a.intrinsics
-    points = np.stack([(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z, np.ones_like(z)], -1)
-    in_b = points @ (invert_transform(b.T_world_camera) @ a.T_world_camera).T
-    ub, vb = in_b[..., 0] / in_b[..., 2] * k.fx + k.cx, in_b[..., 1] / in_b[..., 2] * k.fy + k.cy
-    inside = (ub > 0) & (ub < k.width - 1) & (vb > 0) & (vb < k.height - 1)
-    error = np.abs(b.depth[np.rint(vb[inside]).astype(int), np.rint(ub[inside]).astype(int)] - in_b[..., 2][inside])
-    assert inside.sum() > 80
-    assert np.median(error) < 0.003
