@@ -3,7 +3,7 @@
 Each of four small logs (zstd, lz4, no compression, no chunks; checksums on) is damaged in five ways at many places:
 cut; one byte changed; 64 bytes of zeros; 64 bytes taken out; eight bytes replaced by a large number. Counted are the
 messages that are right (topic, time and bytes) out of those that the undamaged log holds. The tool is `mcap recover`
-as `tests.recording.container.mcap_recover` tells it.
+as `benchmarks.mcap_recover` tells it.
 """
 
 import argparse
@@ -17,10 +17,10 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
+from benchmarks.mcap_recover import Key, recover
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.raw_log import Damage
-from tests.recording.container.mcap_recover import Key, recover
 
 NUM_MESSAGES, SIZE, CHUNK = 48, 120, 1200
 DAMAGES: dict[str, Callable[[bytes, int], bytes]] = {

@@ -63,6 +63,10 @@ class Calibration:
     clock: float | None = None
     sigma_clock: float = 0.0
 
+    def is_held(self, camera: str) -> bool:
+        """Whether a camera's pose was taken as recorded."""
+        return f"camera {camera}" in self.held
+
 
 def calibration_text(calibration: Calibration) -> str:
     """The TOML file of a calibration."""

@@ -1,7 +1,7 @@
 """Everything that is wrong with a capture or an image folder, from one pass; the judgement is that of logs too."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,6 @@ from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import (
     CheckReport,
     Finding,
-    Rate,
     Severity,
     damage_findings,
     error,
@@ -44,38 +43,28 @@ from splatctrl_cli.scene.scale import RecordedDepth
 class Evidence:
     """What is kept of a recording, in bounded memory.
 
-    start_ns: None without a clock; num_frames: of the camera that has most. frames: reduced, a few of each camera
-    whose poses are known; depth_units: [m] per count by camera, None where depth is stored as floats; motion: of the
-    first images. states: joint states to compare, in the model's order where there is one; states_lack: what keeps
-    `replay` from them. cut: says that not all was read. is_guessed: the unit of its lengths.
+    frames: reduced, a few of each camera whose poses are known; depth_units: [m] per count by camera, None where
+    depth is stored as floats; motion: of the first images. states: joint states to compare, in the model's order
+    where there is one. cut: says that not all was read. is_guessed: the unit of its lengths.
     """
 
-    path: Path
-    kind: str
-    duration_s: float
-    num_messages: int
-    start_ns: int | None
-    num_cameras: int
-    num_frames: int
-    rates: Sequence[Rate]
     frames: Sequence[RgbdFrame]
     depth_units: Mapping[str, float | None]
     motion: ImageMotion
     states: StateColumns | None
-    states_lack: str
     cut: str = ""
     is_guessed: bool = False
 
 
 def judged(
-    evidence: Evidence, found: Sequence[Finding], model: RobotModel | None, *, only_errors: bool = False
+    report: CheckReport, evidence: Evidence, model: RobotModel | None, *, only_errors: bool = False
 ) -> CheckReport:
-    """Add to the findings what frames and states say of each other.
+    """Add to a report what frames and states say of each other, and the frames.
 
     only_errors: leave out checks that give notes and warnings alone, four fifths of the work.
     """
-    findings = [*found, *alignment_findings(evidence.frames)]
-    frames, is_still = usable_frames(evidence.frames, findings), evidence.start_ns is None
+    findings = [*report.findings, *alignment_findings(evidence.frames)]
+    frames, is_still = usable_frames(evidence.frames, findings), report.start_ns is None
     is_sure = not is_still or not (evidence.is_guessed or are_far(frames))
     wrong, scaled, corrected = check_views(frames, evidence.depth_units, is_sure=is_sure, only_errors=only_errors)
     findings += wrong if only_errors else [*wrong, *exposure_findings(corrected)]
@@ -83,20 +72,8 @@ def judged(
     if states is not None and not any(finding.code == "joints-degrees" for finding in findings):
         units = evidence.depth_units.values()
         findings += motion_findings(corrected, evidence.motion, states, model, units)
-    findings += [note("quick", evidence.path.name, evidence.cut)] if evidence.cut else []
-    return CheckReport(
-        path=str(evidence.path),
-        kind=evidence.kind,
-        duration_s=evidence.duration_s,
-        num_messages=evidence.num_messages,
-        start_ns=evidence.start_ns,
-        findings=findings,
-        rates=evidence.rates,
-        needs=needs(
-            num_cameras=evidence.num_cameras, num_frames=evidence.num_frames, states_lack=evidence.states_lack
-        ),
-        frames=scaled,
-    )
+    findings += [note("quick", Path(report.path).name, evidence.cut)] if evidence.cut else []
+    return replace(report, findings=findings, frames=scaled)
 
 
 def usable_frames(frames: Sequence[RgbdFrame], findings: Sequence[Finding]) -> list[RgbdFrame]:
@@ -259,24 +236,29 @@ def check_folder(
         of_states = robot_states(model, source.joint_names, logged)
         findings += of_states.findings
     stamps = [stamp for camera in cameras.values() for stamp in camera.stamps]
-    evidence = Evidence(
-        path=path,
+    report = CheckReport(
+        path=str(path),
         kind=kind,
         duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps and source.has_clock else 0.0,
         num_messages=len(stamps) + len(logged),
         start_ns=min(stamps, default=None) if source.has_clock else None,
-        num_cameras=len(cameras),
-        num_frames=max((len(camera.stamps) for camera in cameras.values()), default=0),
+        findings=findings,
         rates=[camera.times.rate(is_read=True) for camera in cameras.values()] if source.has_clock else [],
+        needs=needs(
+            num_cameras=len(cameras),
+            num_frames=max((len(camera.stamps) for camera in cameras.values()), default=0),
+            states_lack=of_states.lack,
+        ),
+    )
+    evidence = Evidence(
         frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
         depth_units={name: camera.images.scale for name, camera in cameras.items()},
         motion=watch.motion,
         states=of_states.states,
-        states_lack=of_states.lack,
         is_guessed=isinstance(source, ImageFolderSource) and source.guess != "",
         cut="" if watch.is_whole else f"only the first {num_images} frames of a camera were read",
     )
-    return judged(evidence, findings, of_states.model, only_errors=only_errors)
+    return judged(report, evidence, of_states.model, only_errors=only_errors)
 
 
 def _refused(path: Path, kind: str, wrong: InputError) -> CheckReport:

@@ -17,7 +17,7 @@ from splatctrl_cli.checks.check_times import (
     peer_findings,
     time_findings,
 )
-from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, note, warning
+from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, needs, note, warning
 from splatctrl_cli.checks.log_pass import LogWatch, image_motion, ready, reduced_frames
 from splatctrl_cli.recording.calibrated import correction_of
 from splatctrl_cli.recording.container.raw_log import RawLog
@@ -76,26 +76,31 @@ def check_log(
         if of_states.states is not None:
             of_states = replace(of_states, states=correction.states(of_states.states))
     first, last = _span(found)
-    evidence = Evidence(
-        path=log.path,
+    report = CheckReport(
+        path=str(log.path),
         kind=log.container,
         duration_s=(last - first) * 1e-9,
         num_messages=found.num_messages,
         start_ns=watch.first_ns,
-        num_cameras=len(cameras),
-        num_frames=max((images.count for images in watch.images.values()), default=0),
+        findings=[*findings, *of_states.findings],
         rates=[
             t.rate(is_read=found.topics[name].topic.type_name in (*IMAGES, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS))
             for name, t in sorted(watch.times.items())
         ],
+        needs=needs(
+            num_cameras=len(cameras),
+            num_frames=max((images.count for images in watch.images.values()), default=0),
+            states_lack=of_states.lack,
+        ),
+    )
+    evidence = Evidence(
         frames=list(chain.from_iterable(frames.values())),
         depth_units={c.name: watch.images[t.depth].unit for t, c in whole if frames[c.name]},
         motion=image_motion(watch, whole, frames),
         states=of_states.states,
-        states_lack=of_states.lack,
         cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
     )
-    return judged(evidence, [*findings, *of_states.findings], of_states.model, only_errors=only_errors)
+    return judged(report, evidence, of_states.model, only_errors=only_errors)
 
 
 def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:

@@ -8,7 +8,7 @@ from splatctrl_cli.calibration.board import board_of
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.config import fixed
-from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, CameraChange, calibrate
+from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 
 
 def run(args: argparse.Namespace) -> int:
@@ -26,20 +26,20 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _lines(result: CalibrateResult) -> Iterator[str]:
-    free = [change for change in result.changes if not change.is_held]
-    sigma, turn = max(c.sigma_position for c in free), max(c.sigma_rotation for c in free)
-    num_unsure = sum(bool(change.unobserved) for change in free)
+    calibration = result.calibration
+    free = [camera for name, camera in calibration.cameras.items() if not calibration.is_held(name)]
+    sigma, turn = max(max(c.sigma_position) for c in free), math.degrees(max(max(c.sigma_rotation) for c in free))
+    num_unsure = sum(bool(camera.unobserved) for camera in free)
     sure = f"each within {_mm(sigma)} and {turn:.2g} deg (one sigma)"
     unsure = f"{num_unsure} of them only in the directions that the recording shows"
-    yield f"calibrate: {len(free)} of {len(result.changes)} cameras placed, {unsure if num_unsure else sure}"
+    yield f"calibrate: {len(free)} of {len(calibration.cameras)} cameras placed, {unsure if num_unsure else sure}"
     yield ""
     header = ("camera", "moved mm", "turned deg", "sigma mm", "sigma deg", "depth", "")
-    yield from table(header, [_row(change) for change in result.changes])
+    yield from table(header, [_row(result, name) for name in calibration.cameras])
     yield ""
     if result.before is not None and result.after is not None:
         before, after = _mm(result.before), _mm(result.after)
         yield f"points of a camera lie {after} from what another, or the robot, shows there (median); before {before}"
-    calibration = result.calibration
     if calibration.clock is not None:
         sign = f"{1e3 * calibration.clock:+.1f} ms"
         yield f"frames are stamped {sign} against the joint states (sigma {1e3 * calibration.sigma_clock:.1f} ms)"
@@ -47,19 +47,21 @@ def _lines(result: CalibrateResult) -> Iterator[str]:
     yield f"wrote {result.out}"
 
 
-def _row(change: CameraChange) -> list[object]:
-    remark = "held" if change.is_held else "; ".join(f"not observed: {text}" for text in change.unobserved)
+def _row(result: CalibrateResult, name: str) -> list[object]:
+    camera, (distance, angle) = result.calibration.cameras[name], result.moved[name]
+    unobserved = "; ".join(f"not observed: {text}" for text in camera.unobserved)
+    remark = "held" if result.calibration.is_held(name) else unobserved
     depth = "as recorded"
-    if math.isfinite(change.bias_noticed):
-        depth += f" ({1e3 * change.bias_noticed:.0f} mm off would show)"
-    if (change.scale, change.bias) != (1.0, 0.0):
-        depth = f"x {change.scale:.4f}" + (f" {1e3 * change.bias:+.1f} mm" if change.bias else "")
+    if math.isfinite(camera.depth_noticed[1]):
+        depth += f" ({1e3 * camera.depth_noticed[1]:.0f} mm off would show)"
+    if (camera.scale, camera.bias) != (1.0, 0.0):
+        depth = f"x {camera.scale:.4f}" + (f" {1e3 * camera.bias:+.1f} mm" if camera.bias else "")
     return [
-        change.camera,
-        f"{1e3 * change.distance:.1f}",
-        f"{change.angle:.2f}",
-        f"{1e3 * change.sigma_position:.2f}",
-        f"{change.sigma_rotation:.3f}",
+        name,
+        f"{1e3 * distance:.1f}",
+        f"{angle:.2f}",
+        f"{1e3 * max(camera.sigma_position):.2f}",
+        f"{math.degrees(max(camera.sigma_rotation)):.3f}",
         depth,
         remark,
     ]

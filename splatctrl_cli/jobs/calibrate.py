@@ -51,32 +51,14 @@ class CalibrateRequest(RobotOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraChange:
-    """What became of a camera: how far it was moved [m] and turned [deg], and the largest sigma of each; scale and
-    bias [m] of its depths, and the bias that would have been noticed.
-    """
-
-    camera: str
-    distance: float
-    angle: float
-    sigma_position: float
-    sigma_rotation: float
-    scale: float
-    bias: float
-    bias_noticed: float
-    is_held: bool
-    unobserved: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
 class CalibrateResult:
     """The file, what stands in it, and how far [m] points lie from what another camera or the robot shows there,
-    before and after (`Adjustment.distance`).
+    before and after (`Adjustment.distance`). moved: how far [m] and by what angle [deg], by camera.
     """
 
     out: Path
     calibration: Calibration
-    changes: tuple[CameraChange, ...]
+    moved: Mapping[str, tuple[float, float]]
     before: float | None
     after: float | None
     num_frames: int
@@ -91,18 +73,18 @@ class CalibrateResult:
             "clock_offset_ms": None if clock is None else round(1e3 * clock, 3),
             "sigma_clock_ms": None if clock is None else round(1e3 * self.calibration.sigma_clock, 3),
             "cameras": {
-                change.camera: {
-                    "moved_mm": round(1e3 * change.distance, 3),
-                    "turned_deg": round(change.angle, 4),
-                    "sigma_mm": round(1e3 * change.sigma_position, 3),
-                    "sigma_deg": round(change.sigma_rotation, 4),
-                    "depth_scale": change.scale,
-                    "depth_bias_mm": round(1e3 * change.bias, 3),
-                    "depth_bias_noticed_mm": finite(round(1e3 * change.bias_noticed, 3)),
-                    "held": change.is_held,
-                    "unobserved": list(change.unobserved),
+                name: {
+                    "moved_mm": round(1e3 * self.moved[name][0], 3),
+                    "turned_deg": round(self.moved[name][1], 4),
+                    "sigma_mm": round(1e3 * max(camera.sigma_position), 3),
+                    "sigma_deg": round(float(np.degrees(max(camera.sigma_rotation))), 4),
+                    "depth_scale": camera.scale,
+                    "depth_bias_mm": round(1e3 * camera.bias, 3),
+                    "depth_bias_noticed_mm": finite(round(1e3 * camera.depth_noticed[1], 3)),
+                    "held": self.calibration.is_held(name),
+                    "unobserved": list(camera.unobserved),
                 }
-                for change in self.changes
+                for name, camera in self.calibration.cameras.items()
             },
         }
 
@@ -158,10 +140,14 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
         partial.write_text(calibration_text(calibration), encoding="utf-8")
     recorded = Estimate(corrections={camera: invert_transform(T) for camera, T in begin.items()})
     before, after = (solution.adjustment.distance(estimate) for estimate in (recorded, solution.estimate))
+    twists = {camera: twist_of(begin[camera] @ solution.estimate.corrections[camera]) for camera in evidence.cameras}
     return CalibrateResult(
         out=out,
         calibration=calibration,
-        changes=tuple(_change(calibration, solution, begin, camera) for camera in evidence.cameras),
+        moved={
+            camera: (float(np.linalg.norm(twist[3:])), float(np.degrees(np.linalg.norm(twist[:3]))))
+            for camera, twist in twists.items()
+        },
         before=before,
         after=after,
         num_frames=len(frames),
@@ -335,21 +321,4 @@ def _calibration(
         held=(*((BASE,) if evidence.arm is not None else ()), *(f"camera {camera}" for camera in solution.held)),
         clock=float(estimate.clock) if solution.adjustment.unknowns.has_clock else None,
         sigma_clock=certainty.sigma_clock,
-    )
-
-
-def _change(calibration: Calibration, solution: Solution, begin: Mapping[str, Float64], camera: str) -> CameraChange:
-    twist = twist_of(begin[camera] @ solution.estimate.corrections[camera])
-    entry = calibration.cameras[camera]
-    return CameraChange(
-        camera=camera,
-        distance=float(np.linalg.norm(twist[3:])),
-        angle=float(np.degrees(np.linalg.norm(twist[:3]))),
-        sigma_position=max(entry.sigma_position),
-        sigma_rotation=float(np.degrees(max(entry.sigma_rotation))),
-        scale=entry.scale,
-        bias=entry.bias,
-        bias_noticed=entry.depth_noticed[1],
-        is_held=camera in solution.held,
-        unobserved=entry.unobserved,
     )

@@ -44,7 +44,7 @@ class SourceOptions:
     cy [px] and the coefficients of a distortion by camera name, instead of those recorded. depth_scale: [m per count]
     of depth images. root: folder of an image folder's files. holdout: frames (index or name) of an image folder that
     become camera `holdout`. stamps: ``header``, or ``log`` for the times of logging. calibration: what `calibrate`
-    wrote of the recording. perturb: what is done to its frames, by name (`sources.perturbed`).
+    wrote of the recording. perturb: what is done to its frames, by name (`calibrated`).
     """
 
     world_frame: str | None = None

@@ -1,4 +1,4 @@
-"""`calibration.toml`: written, read back, and refused where it is damaged."""
+"""A calibration reads back as it was written, and is refused where it is damaged; how sure it may be."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,9 @@ from splatctrl_cli.calibration.calibration_file import (
     is_calibration,
     read_calibration,
 )
+from splatctrl_cli.calibration.certainty import Certainty
+from splatctrl_cli.calibration.evidence import POSE, Unknowns
+from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import look_at
 
@@ -74,3 +77,14 @@ def test_another_or_damaged_file_is_refused(written: Path, old: str, new: str, s
     written.write_text(written.read_text().replace(old, new, 1))
     with pytest.raises(InputError, match=says):
         read_calibration(written)
+
+
+@pytest.mark.parametrize("uncertain", ["cam0", "cam1", None])
+def test_a_calibration_is_full_where_every_camera_is_certain(uncertain: str | None) -> None:
+    cameras = ("cam0", "cam1")
+    sigma = {name: fixed.CALIBRATION_SIGMA * (2.0 if name == uncertain else 0.5) for name in cameras}
+    covariance = np.diag(np.repeat([sigma[name] ** 2 for name in cameras], POSE))
+    certainty = Certainty(
+        unknowns=Unknowns(cameras=cameras, poses=cameras), covariance=covariance, reach=np.eye(2 * POSE)
+    )
+    assert certainty.is_full == (uncertain is None)

@@ -12,7 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from splatctrl_cli.recording.capture.capture_header import read_capture_header
 from splatctrl_cli.recording.container.log_formats import open_raw_log
@@ -22,7 +22,6 @@ from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import Float32, Float64, RgbdFrame
 from tests.cases.case import Case, Run
 from tests.recording.log.make_log import (
-    STORE,
     LogRecipe,
     T,
     broken_log,
@@ -30,6 +29,7 @@ from tests.recording.log.make_log import (
     header,
     make_log,
     messages_of,
+    write_bag,
     write_raw,
 )
 from tests.recording.log.make_rvl import encoded_rvl
@@ -50,16 +50,7 @@ def first_depth(path: Path) -> Float32:
 
 def write_db3(folder: Path, messages: Iterable[RawMessage], mode: CompressionMode = CompressionMode.NONE) -> Path:
     """A ROS 2 bag of sqlite3 in the folder `folder`, by rosbags; its storage file."""
-    writer = Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3)
-    if mode != CompressionMode.NONE:
-        writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        connections = {}
-        for message in messages:
-            name = message.topic.name
-            if name not in connections:
-                connections[name] = writer.add_connection(name, message.topic.type_name, typestore=STORE)
-            writer.write(connections[name], message.log_time_ns, message.data)
+    write_bag(folder, messages, plugin=StoragePlugin.SQLITE3, mode=mode)
     return next(path for path in folder.iterdir() if ".db3" in path.suffixes)
 
 

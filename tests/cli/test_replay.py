@@ -27,7 +27,7 @@ from tests.cli.replay_desk import (
 )
 from tests.evaluate.test_worst_frames import frame
 from tests.recording.log.make_states import START_NS, states_of, write_mcap
-from tests.recording.state.test_twists import stamped
+from tests.recording.state.test_state_tables import stamped
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

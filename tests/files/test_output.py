@@ -50,25 +50,15 @@ def test_what_must_not_be_replaced_is_refused_untouched(
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == [precious] and precious.read_text() == "mine"
 
 
-def test_force_replaces_a_folder_whole(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "old").write_text("x")
-    (tmp_path / "out" / "run.json").write_text("{}")
-    with output_path(tmp_path / "out", force=True, is_folder=True) as partial:
-        (partial / "new").write_text("y")
-        assert (tmp_path / "out" / "old").exists()
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["new"]
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
-
-
 @pytest.mark.parametrize("name", ["run.json", "capture.json", None])
-def test_force_replaces_a_folder_that_a_command_wrote_or_that_is_empty(tmp_path: Path, name: str | None) -> None:
+def test_force_replaces_a_folder_of_a_command_or_an_empty_one_whole(tmp_path: Path, name: str | None) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out.old").mkdir()
     if name:
         (tmp_path / "out" / name).write_text("{}")
     with output_path(tmp_path / "out", force=True, is_folder=True) as partial:
         (partial / "new").write_text("y")
+        assert [p.name for p in (tmp_path / "out").iterdir()] == ([name] if name else [])
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["new"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "out.old"]
 
@@ -223,26 +213,17 @@ def test_the_second_of_two_writers_is_refused_and_the_first_ends_well(
     assert kind == "file" or (out / "state").read_text() == "half"
 
 
-@pytest.mark.parametrize("kind", ["folder", "file"])
-def test_a_killed_writer_leaves_no_lock_behind(tmp_path: Path, kind: str) -> None:
-    out = tmp_path / "out"
+@pytest.mark.parametrize(("kind", "resume"), [("folder", False), ("file", False), ("folder", True)])
+def test_a_killed_writer_leaves_no_lock_and_can_be_gone_on_from(tmp_path: Path, kind: str, resume: bool) -> None:
+    out, checkpoint = tmp_path / "out", "state" if resume else ""
     with another_writer(out, kind) as first:
         first.send_signal(signal.SIGKILL)
         first.wait()
     assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
-    with output_path(out, force=False, is_folder=kind == "folder") as partial:
-        assert not (partial / "state").exists()
+    with output_path(out, force=False, is_folder=kind == "folder", checkpoint=checkpoint, resume=resume) as partial:
+        assert (partial / "state").exists() == resume
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-def test_a_killed_writer_can_be_gone_on_from(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    with another_writer(out, "folder") as first:
-        first.send_signal(signal.SIGKILL)
-        first.wait()
-    with output_path(out, force=False, is_folder=True, checkpoint="state", resume=True) as partial:
-        assert (partial / "state").read_text() == "half"
-    assert (out / "state").read_text() == "half"
+    assert not resume or (out / "state").read_text() == "half"
 
 
 def test_an_output_within_an_output_is_written(tmp_path: Path) -> None:

@@ -1,11 +1,19 @@
-"""Arrays that hold gigabytes in a small file are refused by what may be meant, before they are read."""
+"""Arrays that hold gigabytes in a small file are refused by what may be meant, before they are read; and any bytes
+are read, or end in the errors that the reader names: of every reader of foreign bytes in the program.
+"""
 
+import contextlib
+import random
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from benchmarks.fuzz_mutate import mutated
+from benchmarks.readers import Reader, all_readers, splat_suffixes
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.arrays import DAMAGE, NpzFile, read_arrays, savez
 from splatctrl_cli.formats.grid.npz_grid import MOST_PACKED, read_npz
@@ -14,6 +22,7 @@ from splatctrl_cli.formats.scene.voxel_file import read_occupancy, read_states
 from splatctrl_cli.recording.folder.idr import read_idr
 from splatctrl_cli.recording.source import describe
 from tests.formats.make_npz import write_zeros
+from tests.properties import few
 
 GIB4 = (1 << 14, 1 << 9, 1 << 9)  # of bytes
 
@@ -64,23 +73,6 @@ def test_a_zip_of_a_later_version_is_no_fault_of_the_program(tmp_path: Path, nam
         describe(path)
 
 
-def test_arrays_are_read_as_numpy_reads_them(tmp_path: Path) -> None:
-    arrays = {
-        "a": np.arange(6.0).reshape(2, 3),
-        "by columns": np.asfortranarray(np.arange(6).reshape(2, 3)),
-        "none": np.zeros((0, 4)),
-        "number": np.array(2.5),
-        "text": np.array("héllo"),
-    }
-    np.savez_compressed(tmp_path / "x.npz", **arrays)  # type: ignore[arg-type]
-    found = read_arrays(tmp_path / "x.npz", most=1000)
-    with np.load(tmp_path / "x.npz") as whole:
-        assert list(found) == list(whole.files)
-        for name in whole.files:
-            assert (found[name].dtype, found[name].tolist()) == (whole[name].dtype, whole[name].tolist())
-    assert list(read_arrays(tmp_path / "x.npz", ["number"], most=8)) == ["number"]
-
-
 def test_arrays_that_are_missing_too_large_or_not_whole_raise(tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
     savez(path, {"a": np.arange(100.0), "b": np.arange(100.0)})
@@ -95,3 +87,47 @@ def test_arrays_that_are_missing_too_large_or_not_whole_raise(tmp_path: Path) ->
     write_zeros(path, {"a": ((1 << 20,), "|u1")})
     with pytest.raises(DAMAGE, match="Bad CRC-32"):
         read_arrays(path, most=1 << 20)
+
+
+NAMES = (
+    *("mcap", "bag", "db3", "capture.json", "frames.csv", "joints.npz", "compressed image", "image", "image head"),
+    *("rvl", "protobuf", "arrays", "npy", "grid.npz", "vti", "nrrd", "pfm"),
+    *(suffix[1:] for suffix in splat_suffixes()),
+    *("x.urdf", "x.yaml", "x.toml", "x.tum", "x.log", "transforms.json"),
+)
+
+
+@pytest.fixture(scope="module")
+def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Reader]:
+    return {reader.name: reader for reader in all_readers(tmp_path_factory.mktemp("readers"))}
+
+
+def test_every_reader_takes_the_input_that_it_starts_from(readers: dict[str, Reader]) -> None:
+    assert tuple(readers) == NAMES
+    for reader in readers.values():
+        for seed in reader.seeds:
+            reader.read(seed)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_bytes_are_read_or_end_in_a_named_error(readers: dict[str, Reader], name: str) -> None:
+    reader = readers[name]
+
+    @few(12)
+    @given(
+        st.integers(0, len(reader.seeds) - 1),
+        st.integers(0, 2**32),
+        st.one_of(st.none(), st.binary(max_size=200), st.integers(0, 2**16)),
+    )
+    def check(seed: int, change: int, other: bytes | int | None) -> None:
+        data = reader.seeds[seed]
+        if other is None:
+            data = mutated(data, random.Random(change))
+        elif isinstance(other, int):
+            data = data[:other]
+        else:
+            data = data[: change % 32] + other
+        with contextlib.suppress(*reader.errors):
+            reader.read(data)
+
+    check()

@@ -189,9 +189,9 @@ def test_a_camera_on_the_wrist_is_put_right_on_its_mount(wrist: SetUp, wrist_res
     assert np.linalg.norm(twist[3:]) < 0.002
     assert np.linalg.norm(twist[:3]) < np.radians(0.2)
     assert largest(wrist, wrist_result, "clock") < 0.003
-    change = next(change for change in wrist_result.changes if change.camera == WRIST)
-    assert change.distance == pytest.approx(0.02, abs=0.002)
-    assert change.angle == pytest.approx(2.0, abs=0.2)
+    distance, angle = wrist_result.moved[WRIST]
+    assert distance == pytest.approx(0.02, abs=0.002)
+    assert angle == pytest.approx(2.0, abs=0.2)
 
 
 def test_each_frame_of_the_wrist_is_where_the_hand_was(
@@ -211,7 +211,7 @@ def test_each_frame_of_the_wrist_is_where_the_hand_was(
 def test_check_has_the_frames_of_the_wrist_there_too(
     wrist: SetUp, wrist_log: Path, wrist_result: CalibrateResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(check_log, "judged", lambda evidence, *_, **__: evidence)
+    monkeypatch.setattr(check_log, "judged", lambda _, evidence, *__, **___: evidence)
     evidence: Any = check_log.check_log(open_raw_log(wrist_log), SourceOptions(calibration=wrist_result.out))
     frames = [frame for frame in evidence.frames if frame.camera == WRIST]
     assert frames

@@ -116,8 +116,8 @@ def check_errors(setup: SetUp, result: CalibrateResult) -> None:
     assert rows
     assert max(abs(row.error) for row in rows if row.unknown == "position") < 0.002
     assert max(abs(row.error) for row in rows if row.unknown == "rotation") < np.radians(0.2)
-    moved = [change for change in result.changes if not change.is_held]
-    assert all(change.distance > 0.4 and change.angle == pytest.approx(60, abs=0.5) for change in moved)
+    moved = [moved for camera, moved in result.moved.items() if not result.calibration.is_held(camera)]
+    assert all(distance > 0.4 and angle == pytest.approx(60, abs=0.5) for distance, angle in moved)
 
 
 def test_cameras_half_a_metre_off_are_found_by_a_board_that_somebody_holds(tmp_path: Path) -> None:

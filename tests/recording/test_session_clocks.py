@@ -13,10 +13,10 @@ from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.recording.log.survey import StampClock, dropped, first_of_each
 from splatctrl_cli.recording.source import describe, open_session, open_source
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import JointState, Record, RgbdFrame
+from splatctrl_cli.records import JointState
 from tests.recording.container.test_log_formats import assert_same
 from tests.recording.log import make_log as maker
-from tests.recording.log.make_log import FRAME_NS, START_NS, LogRecipe, broken_log, camera_x, make_log
+from tests.recording.log.make_log import FRAME_NS, START_NS, LogRecipe, broken_log, camera_x, frames_of, make_log
 
 Message = tuple[int, str, str, Any]
 
@@ -24,10 +24,6 @@ Message = tuple[int, str, str, Any]
 def make_part(path: Path, recipe: LogRecipe, change: Callable[[Message], list[Message]]) -> Path:
     """A log whose messages (log time, topic, type, content) are changed, left out or repeated."""
     return broken_log(path, lambda *message: change(message), recipe)
-
-
-def frames_of(records: list[Record]) -> list[RgbdFrame]:
-    return [record for record in records if isinstance(record, RgbdFrame)]
 
 
 def only(*words: str) -> Callable[[Message], list[Message]]:
@@ -107,18 +103,19 @@ def test_what_is_no_log_is_not_read_beside_one(tmp_path: Path) -> None:
 def test_sim_time_in_the_headers_pairs_and_poses_as_any_clock(tmp_path: Path) -> None:
     """Headers count from 0 while the log has wall time; /clock itself is not needed."""
     log = make_part(tmp_path / "log.mcap", LogRecipe(), lambda m: [restamped(m, -START_NS)])
-    frames = frames_of(list(open_source(log).records()))
+    frames = frames_of(open_source(log))
     assert [f.stamp_ns for f in frames] == [i * FRAME_NS for i in range(5)]
     assert frames[3].T_world_camera[0, 3] == pytest.approx(camera_x(3))
 
 
 def test_times_of_logging_stand_in_for_headers_on_request(tmp_path: Path) -> None:
     log = make_part(tmp_path / "log.mcap", LogRecipe(), lambda m: [restamped(m, -START_NS)])
-    records = list(open_source(log, SourceOptions(stamps="log")).records())
-    frames = frames_of(records)
+    source = open_source(log, SourceOptions(stamps="log"))
+    frames = frames_of(source)
     assert [f.stamp_ns for f in frames] == [START_NS + i * FRAME_NS for i in range(5)]
     assert frames[3].T_world_camera[0, 3] == pytest.approx(camera_x(3))
-    assert [r.stamp_ns for r in records if isinstance(r, JointState)] == [START_NS + i * FRAME_NS for i in range(5)]
+    states = [record for record in source.records() if isinstance(record, JointState)]
+    assert [state.stamp_ns for state in states] == [START_NS + i * FRAME_NS for i in range(5)]
 
 
 def test_headers_without_stamps_ask_for_the_times_of_logging(tmp_path: Path) -> None:
@@ -132,7 +129,7 @@ def test_headers_without_stamps_ask_for_the_times_of_logging(tmp_path: Path) -> 
     log = make_part(tmp_path / "log.mcap", LogRecipe(), unset)
     with pytest.raises(InputError, match=r"expected stamps, got 0 in all 5 headers; give --stamps log"):
         open_source(log)
-    assert len(frames_of(list(open_source(log, SourceOptions(stamps="log")).records()))) == 5
+    assert len(frames_of(open_source(log, SourceOptions(stamps="log")))) == 5
 
 
 def looped(message: Message) -> list[Message]:
@@ -150,7 +147,7 @@ def test_a_clock_that_goes_back_is_refused_and_the_times_of_logging_taken_on_req
     assert "image_raw/compressed: the clock of its headers goes back by 1.350 s at 1700000001.500 s" in message
     assert "4 images in all; give --stamps log" in message  # the fifth is less than a second behind
     assert any("goes back by 1.350 s" in lack for lack in describe(log).missing)
-    frames = frames_of(list(open_source(log, SourceOptions(stamps="log")).records()))
+    frames = frames_of(open_source(log, SourceOptions(stamps="log")))
     assert [f.stamp_ns for f in frames] == [START_NS + i * FRAME_NS for i in range(20)]
     assert [f.T_world_camera[0, 3] for f in frames] == pytest.approx([camera_x(i) for i in range(20)])
 
@@ -167,7 +164,7 @@ def test_a_log_that_was_written_out_of_order_has_no_clock_that_goes_back() -> No
 def test_images_that_came_twice_are_taken_once_and_counted(tmp_path: Path) -> None:
     log = make_part(tmp_path / "log.mcap", LogRecipe(), lambda m: [m, m] if "image" in m[1] else [m])
     source = open_source(log)
-    frames = frames_of(list(source.records()))
+    frames = frames_of(source)
     assert [f.stamp_ns for f in frames] == [START_NS + i * FRAME_NS for i in range(5)]
     assert (source.loss.duplicate_images, source.loss.unpaired_color, source.loss.unpaired_depth) == (10, 0, 0)
 
@@ -178,9 +175,7 @@ def test_depth_of_half_the_rate_gives_as_many_frames(tmp_path: Path) -> None:
         return [] if "depth" in message[1] and index % 2 else [message]
 
     source = open_source(make_part(tmp_path / "log.mcap", LogRecipe(num_frames=9), slow))
-    assert [f.stamp_ns for f in frames_of(list(source.records()))] == [
-        START_NS + i * FRAME_NS for i in range(0, 9, 2)
-    ]
+    assert [f.stamp_ns for f in frames_of(source)] == [START_NS + i * FRAME_NS for i in range(0, 9, 2)]
     assert (source.loss.unpaired_color, source.loss.unpaired_depth) == (4, 0)
 
 
@@ -204,7 +199,7 @@ def test_images_that_did_not_come_are_counted(tmp_path: Path) -> None:
         return [] if "color/image" in message[1] and message[0] in missing else [message]
 
     source = open_source(make_part(tmp_path / "log.mcap", LogRecipe(num_frames=14), drop))
-    assert len(frames_of(list(source.records()))) == 11
+    assert len(frames_of(source)) == 11
     assert (source.loss.dropped_images, source.loss.unpaired_depth) == (3, 3)
     assert "about 3 images were dropped in 2 gaps of a period of 100 ms" in source.loss.notes[0]
 
@@ -244,4 +239,4 @@ def test_a_static_transform_that_changes_is_noted(tmp_path: Path) -> None:
 
     source = open_source(make_part(tmp_path / "log.mcap", LogRecipe(), moved))
     assert source.loss.notes == ["tf: cam0_link -> cam0_optical is static and changes; each holds from its stamp on"]
-    assert frames_of(list(source.records()))[0].T_world_camera[2, 3] == pytest.approx(0.7)
+    assert frames_of(source)[0].T_world_camera[2, 3] == pytest.approx(0.7)

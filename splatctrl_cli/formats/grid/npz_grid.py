@@ -1,7 +1,7 @@
 """Baked distance fields as ``.npz``, the file that programs of this project read back. Same grid, same bytes.
 
 Members: ``origin`` (3,) float64 [m], ``voxel`` () float64 [m], ``header`` () str (JSON), one array a channel
-(`grid_channels.CHANNELS`), uncompressed: floats hardly compress, and readers can map them.
+(`grid_format.CHANNELS`), uncompressed: floats hardly compress, and readers can map them.
 """
 
 import errno

@@ -6,19 +6,16 @@ import csv
 import hashlib
 import json
 import math
-import tempfile
-import weakref
 from array import array
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
-from splatctrl_cli.files.spilled_rows import scratch_folder
 from splatctrl_cli.recording.log.stored_frame import AGAIN
 from splatctrl_cli.records import LossReport
 
@@ -122,7 +119,6 @@ MASKS = ("human", "valid")  # further columns, where the recording has such mask
 ROBOT = "robot_description.urdf"  # the URDF that the log itself brings, where it does
 _FURTHER = ((), *((mask,) for mask in MASKS), MASKS)  # columns of frames.csv after COLUMNS
 _MOST_ROW = 1 << 16  # bytes of a row
-IN_MEMORY = 1 << 16  # [bytes] of the lines of one folder
 _UNREADABLE = (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError)
 
 
@@ -207,40 +203,3 @@ class FileSums:
 def _key(name: bytes) -> int:
     """64 bits of a name; two that share them would make a good file look damaged."""
     return int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little")
-
-
-class Checksums:
-    """SHA256SUMS to be written, by name. Lines of a folder wait in a file without a name, as they come in order."""
-
-    def __init__(self) -> None:
-        self._folders: dict[str, IO[bytes]] = {}
-        self._others: dict[str, str] = {}
-
-    def add(self, digest: str, name: str) -> None:
-        """Of a file in a folder, after those before it there."""
-        folder = name.rpartition("/")[0]
-        if folder not in self._folders:
-            self._folders[folder] = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
-            weakref.finalize(self, self._folders[folder].close)
-        self._folders[folder].write(_line(digest, name))
-
-    def add_other(self, digest: str, name: str) -> None:
-        """Of one of few files, in any order, any number of times; not in a folder of `add`."""
-        self._others[name] = digest
-
-    def write(self, path: Path) -> None:
-        """All lines, by name."""
-        blocks = sorted([*(f"{folder}/" for folder in self._folders), *self._others])
-        with path.open("wb") as stream:
-            for block in blocks:
-                if block in self._others:
-                    stream.write(_line(self._others[block], block))
-                    continue
-                lines = self._folders[block[:-1]]
-                lines.seek(0)
-                while piece := lines.read(1 << 20):
-                    stream.write(piece)
-
-
-def _line(digest: str, name: str) -> bytes:
-    return f"{digest}  {name}\n".encode()

@@ -21,7 +21,7 @@ from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
 from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.files.output import sha256, write_json
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.recording.capture.capture_header import COLUMNS, FORMAT, MASKS, ROBOT, VERSION, Checksums
+from splatctrl_cli.recording.capture.capture_header import COLUMNS, FORMAT, MASKS, ROBOT, SUMS, VERSION
 from splatctrl_cli.recording.log.messages import metres
 from splatctrl_cli.recording.log.state_columns import StateCollector, StateColumns
 from splatctrl_cli.recording.log.stored_frame import (
@@ -231,14 +231,27 @@ def _write_index(
         shutil.rmtree(folder / FOLDER, ignore_errors=True)  # what an interrupted run left
         header = header | {"joint_topics": write_topics(folder, topics, names.append)}
     write_json(folder / "capture.json", header)
-    sums = Checksums()
-    for entry in journal.entries():
-        for digest, name in entry.sums:
-            is_of_lens = name.startswith("valid/")  # not in the order of frames, which share it
-            (sums.add_other if is_of_lens else sums.add)(digest, name)
-    for name in [*names, "capture.json"]:
-        sums.add_other(sha256(folder / name), name)
-    sums.write(folder / "SHA256SUMS")
+    of_lenses = {name: digest for entry in journal.entries() for digest, name in entry.sums if _is_of_lens(name)}
+    others = {name: sha256(folder / name) for name in [*names, "capture.json"]}
+    _write_sums(folder / SUMS, journal, of_lenses | others)
+
+
+def _is_of_lens(name: str) -> bool:
+    """Whether a file is shared by the frames of a lens: it does not come in their order."""
+    return name.startswith("valid/")
+
+
+def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None:
+    """A line for every file, by name: those of a folder of images in the order of the journal, which is read again
+    for each folder, and `others`, few files with their sha256.
+    """
+    written = (name for entry in journal.entries() for _, name in entry.sums if not _is_of_lens(name))
+    folders = {f"{name.rpartition('/')[0]}/" for name in written}
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        for place in sorted([*folders, *others]):
+            images = (each for entry in journal.entries() for each in entry.sums)
+            its = [(others[place], place)] if place in others else (i for i in images if i[1].startswith(place))
+            stream.writelines(f"{digest}  {name}\n" for digest, name in its)
 
 
 def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> None:

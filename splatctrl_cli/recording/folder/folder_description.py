@@ -1,6 +1,5 @@
 """The TOML file that describes a folder of colour and depth images (docs/input.md)."""
 
-import difflib
 import tomllib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING, dataclass, field, fields
@@ -9,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, did_you_mean
 from splatctrl_cli.recording.folder.poses import AXES, CONVENTIONS, FORMATS, rigid
 from splatctrl_cli.recording.log.registration import DISTORTION_MODELS
 from splatctrl_cli.records import Float64, Intrinsics
@@ -352,8 +351,7 @@ def _typed(value: Any, hint: Any, where: str) -> Any:
 def _check_keys(table: dict[str, Any], known: set[str], where: str, prefix: str) -> None:
     for key in table:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
-            remedy = f"did you mean {prefix}{near[0]}?" if near else f"known here: {', '.join(sorted(known))}"
+            remedy = did_you_mean(key, known, f"known here: {', '.join(sorted(known))}", prefix=prefix, cutoff=0.4)
             raise InputError(f"{where}: unknown key {prefix}{key}", remedy=remedy)
 
 

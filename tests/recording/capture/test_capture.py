@@ -45,12 +45,22 @@ def frames_of(records: list[Record]) -> list[RgbdFrame]:
     return [record for record in records if isinstance(record, RgbdFrame)]
 
 
-@pytest.mark.parametrize("color_format", ["jpeg", "png", "rgb8", "bgra8", "mono8"])
-def test_a_capture_gives_the_same_records(tmp_path: Path, color_format: str) -> None:
-    before, folder = captured(tmp_path, LogRecipe(color_format=color_format, cameras=("cam0", "cam1")))
+WARPED = LogRecipe(depth_frame="cam0_depth", depth_size=(16, 12), depth_encoding="32FC1", depth_m=1.23457)
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        *(LogRecipe(color_format=f, cameras=("cam0", "cam1")) for f in ("jpeg", "png", "rgb8", "bgra8", "mono8")),
+        LogRecipe(has_joints=False),
+        WARPED,
+    ],
+)
+def test_a_capture_gives_the_same_records(tmp_path: Path, recipe: LogRecipe) -> None:
+    before, folder = captured(tmp_path, recipe)
     source = open_source(folder)
     assert_same(before, list(source.records()))
-    assert source.joint_names == ("joint_a", "joint_b")
+    assert source.joint_names == (("joint_a", "joint_b") if recipe.has_joints else ())
     assert source.has_clock
     assert source.loss.damaged == 0
 
@@ -81,9 +91,11 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
     assert all((first / name).read_bytes() == (second / name).read_bytes() for name in files)
 
 
-def test_every_file_stands_in_sha256sums(tmp_path: Path) -> None:
-    _, folder = captured(tmp_path, LogRecipe())
+def test_every_file_stands_in_sha256sums_by_name(tmp_path: Path) -> None:
+    lens = (0.4, 0.0, 0.0, 0.0, 0.0)  # with a mask of what it saw
+    _, folder = captured(tmp_path, LogRecipe(cameras=("cam", "cam-b", "cam0"), distortion=lens))
     sums = dict(reversed(line.split("  ")) for line in (folder / "SHA256SUMS").read_text().splitlines())
+    assert list(sums) == sorted(sums)
     files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} - {"SHA256SUMS"}
     assert set(sums) == files
     assert all(hashlib.sha256((folder / name).read_bytes()).hexdigest() == sums[name] for name in files)
@@ -141,19 +153,6 @@ def test_options_that_a_capture_cannot_honour_are_refused(tmp_path: Path) -> Non
             open_source(folder, replace(options, **change))
 
 
-def test_a_log_without_joints_is_captured_too(tmp_path: Path) -> None:
-    before, folder = captured(tmp_path, LogRecipe(has_joints=False))
-    source = open_source(folder)
-    assert source.joint_names == ()
-    assert_same(before, list(source.records()))
-
-
-def test_warped_depth_comes_back_as_the_same_floats(tmp_path: Path) -> None:
-    recipe = LogRecipe(depth_frame="cam0_depth", depth_size=(16, 12), depth_encoding="32FC1", depth_m=1.23457)
-    before, folder = captured(tmp_path, recipe)
-    assert_same(before, list(open_source(folder).records()))
-
-
 @pytest.mark.parametrize(
     ("example", "folder"),
     [
@@ -193,11 +192,8 @@ def test_an_index_that_was_changed_or_is_gone_is_refused(tmp_path: Path, name: s
 
 def test_masks_come_back_and_frames_without_one_stay_without(tmp_path: Path) -> None:
     before, folder = captured(tmp_path, LogRecipe(mask_every=2), options=MASKED)
-    after = list(open_source(folder).records())
-    assert_same(before, after)
-    masks = [(a.human, b.human) for a, b in zip(frames_of(before), frames_of(after), strict=True)]
-    assert [a is not None for a, _ in masks] == [True, False, True, False, True]
-    assert all((a is None and b is None) or np.array_equal(a, b) for a, b in masks)
+    assert_same(before, list(open_source(folder).records()))
+    assert [frame.human is not None for frame in frames_of(before)] == [True, False, True, False, True]
 
 
 PINCUSHION = LogRecipe(color_format="png", distortion=(0.4, 0.0, 0.0, 0.0, 0.0))
@@ -205,30 +201,30 @@ PINCUSHION = LogRecipe(color_format="png", distortion=(0.4, 0.0, 0.0, 0.0, 0.0))
 
 def test_what_the_lens_did_not_see_comes_back_and_is_stored_once(tmp_path: Path) -> None:
     before, folder = captured(tmp_path, PINCUSHION)
-    after = list(open_source(folder).records())
-    assert_same(before, after)
+    assert_same(before, list(open_source(folder).records()))
     valid = frames_of(before)[0].valid
     assert valid is not None and not valid.all()
-    assert all(frame.valid is not None and np.array_equal(frame.valid, valid) for frame in frames_of(after))
     assert len(list((folder / "valid/cam0").iterdir())) == 1
     sums = (folder / "SHA256SUMS").read_text().splitlines()
     assert sum("valid/cam0/" in line for line in sums) == 1 and len(set(sums)) == len(sums)
 
 
-def test_a_frame_whose_valid_pixels_are_not_known_is_left_out(tmp_path: Path) -> None:
-    _, folder = captured(tmp_path, PINCUSHION)
-    next((folder / "valid/cam0").iterdir()).write_bytes(b"no image")
-    source = open_source(folder)
-    assert frames_of(list(source.records())) == [] and source.loss.damaged == 5
-
-
-def test_a_damaged_mask_is_counted_and_its_frame_kept(tmp_path: Path) -> None:
-    _, folder = captured(tmp_path, LogRecipe(mask_every=1), options=MASKED)
-    (folder / "human/cam0/000001.png").write_bytes(b"no image")
+@pytest.mark.parametrize(
+    ("recipe", "mask", "num_frames", "damaged"),
+    [
+        (PINCUSHION, "valid/cam0/*", 0, 5),  # of every frame, which are left out
+        (LogRecipe(mask_every=1), "human/cam0/000001.png", 5, 1),  # its frame is kept
+    ],
+)
+def test_a_damaged_mask_is_counted(
+    tmp_path: Path, recipe: LogRecipe, mask: str, num_frames: int, damaged: int
+) -> None:
+    _, folder = captured(tmp_path, recipe, options=MASKED if recipe.mask_every else None)
+    next(folder.glob(mask)).write_bytes(b"no image")
     source = open_source(folder)
     frames = frames_of(list(source.records()))
-    assert [frame.human is not None for frame in frames] == [True, False, True, True, True]
-    assert source.loss.damaged == 1
+    assert (len(frames), source.loss.damaged) == (num_frames, damaged)
+    assert [frame.stamp_ns for frame in frames if frame.human is None] == [START_NS + FRAME_NS][:num_frames]
 
 
 def test_provenance_says_where_each_image_lies(tmp_path: Path) -> None:
@@ -246,14 +242,6 @@ def test_provenance_says_where_each_image_lies(tmp_path: Path) -> None:
         assert log[offset] == CHUNK
         first, last = (int.from_bytes(log[offset + at : offset + at + 8], "little") for at in (9, 17))
         assert first <= int(row["color_log_time_ns"]) <= last
-
-
-def test_a_capture_without_provenance_is_read_as_before(tmp_path: Path) -> None:
-    before, folder = captured(tmp_path, LogRecipe())
-    (folder / "provenance.csv").unlink()
-    sums = (folder / "SHA256SUMS").read_text().splitlines(keepends=True)
-    (folder / "SHA256SUMS").write_text("".join(line for line in sums if "provenance" not in line))
-    assert_same(before, list(open_source(folder).records()))
 
 
 PAGE = Path(__file__).parents[3] / "docs" / "capture.md"

@@ -98,6 +98,7 @@ def test_arrays_come_back_from_a_file(tmp_path_factory: pytest.TempPathFactory, 
     savez(path, arrays)
     found = read_arrays(path, most=sum(array.nbytes for array in arrays.values()))
     assert list(found) == list(arrays)
+    assert list(read_arrays(path, list(arrays)[:1], most=sum(a.nbytes for a in found.values()))) == list(arrays)[:1]
     for name, array in arrays.items():
         assert found[name].dtype == array.dtype and found[name].shape == array.shape
         assert np.array_equal(found[name], array)

@@ -52,10 +52,20 @@ def with_png_depth(
     return files
 
 
-@pytest.mark.parametrize("distortion", [(0.0,) * 5, (0.1, 0.0, 0.0, 0.0, 0.0)])
-def test_recorded_png_depth_is_kept_unless_the_lens_is_undone(tmp_path: Path, distortion: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(
+    ("distortion", "form", "head"),
+    [
+        ((0.0,) * 5, "16UC1; png compressed", b""),
+        ((0.1, 0.0, 0.0, 0.0, 0.0), "16UC1; png compressed", b""),
+        ((0.0,) * 5, "16UC1; compressedDepth", bytes(12)),
+        ((0.0,) * 5, "16UC1; compressedDepth png", bytes(12)),
+    ],
+)
+def test_recorded_png_depth_is_kept_without_its_head_unless_the_lens_is_undone(
+    tmp_path: Path, distortion: tuple[float, ...], form: str, head: bytes
+) -> None:
     log = make_log(tmp_path / "raw.mcap", LogRecipe(distortion=distortion))
-    files = with_png_depth(log, tmp_path / "png.mcap")
+    files = with_png_depth(log, tmp_path / "png.mcap", form=form, head=head)
     capture = tmp_path / "x.capture"
     capture.mkdir()
     write_capture(capture, open_source(tmp_path / "png.mcap"))
@@ -82,17 +92,6 @@ def test_what_a_capture_holds_as_it_is_stays_undecoded(tmp_path: Path, monkeypat
     monkeypatch.setattr(cv2, "imdecode", counting)
     write_capture(tmp_path / "x.capture", source)
     assert num_decoded == 2 * 2  # the first pair of each camera, for the scale of its depth
-
-
-@pytest.mark.parametrize("form", ["16UC1; compressedDepth", "16UC1; compressedDepth png"])
-def test_png_of_the_depth_transport_is_kept_without_its_head(tmp_path: Path, form: str) -> None:
-    make_log(tmp_path / "raw.mcap")
-    files = with_png_depth(tmp_path / "raw.mcap", tmp_path / "png.mcap", form=form, head=bytes(12))
-    write_capture(tmp_path / "x.capture", open_source(tmp_path / "png.mcap"))
-    kept = [path.read_bytes() for path in sorted((tmp_path / "x.capture" / "depth" / "cam0").iterdir())]
-    assert kept == files
-    depths = [r.depth[1, 1] for r in open_source(tmp_path / "x.capture").records() if isinstance(r, RgbdFrame)]
-    assert depths == [np.float32(1250) * np.float32(1e-3)] * 5
 
 
 @pytest.mark.parametrize("lazily", [True, False])

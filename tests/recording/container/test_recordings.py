@@ -9,7 +9,7 @@ import pytest
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.container.log_formats import is_bag_folder
 from splatctrl_cli.recording.log.stored_frame import StoredFrame
-from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source import describe, open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from tests.conftest import ROOT
 
@@ -107,7 +107,7 @@ def says_wrong(path: Path) -> bool:
     return "wrong_rmw_test" in path.as_posix() and path.suffix != ".db3"
 
 
-def test_every_bag_without_images_is_refused_for_that(real_data: Path) -> None:
+def test_every_bag_without_images_is_described_and_refused_for_that(real_data: Path) -> None:
     """Those in a format that ROS does not have say so; of the sqlite3 one only metadata.yaml does, not its file."""
     folder, num = real_data / "rosbag2_testbags", 0
     for path in sorted(folder.rglob("*")):
@@ -116,6 +116,7 @@ def test_every_bag_without_images_is_refused_for_that(real_data: Path) -> None:
             reason = "got wrong_format" if says_wrong(path) else "no image topics"
             with pytest.raises(InputError, match="holds no messages" if "empty_bag" in str(path) else reason):
                 open_source(path)
+            assert describe(path).kind.startswith("ROS 2 bag" if path.is_dir() or path.suffix == ".db3" else "MCAP")
             num += 1
     assert num >= 60
 

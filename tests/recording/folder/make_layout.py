@@ -18,7 +18,6 @@ from splatctrl_cli.geometry import invert_transform, look_at, quat_from_rotation
 from splatctrl_cli.recording.folder.dtu import DtuView
 from splatctrl_cli.recording.folder.dtu_source import shrunk
 from splatctrl_cli.recording.folder.poses import OPENGL_FROM_OPTICAL
-from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
 
@@ -53,10 +52,6 @@ def write_pair(color: Path, depth: Path, index: int, unit: float = 1e-3, invalid
 
 def matrix_text(T: Float64) -> str:
     return "\n".join(" ".join(repr(float(v)) for v in row) for row in T) + "\n"
-
-
-def frames_of(folder: Path, options: SourceOptions | None = None) -> list[RgbdFrame]:
-    return [record for record in open_source(folder, options).records() if isinstance(record, RgbdFrame)]
 
 
 def check(frames: list[RgbdFrame], unit: float = 1e-3, k: tuple[float, ...] = K) -> None:

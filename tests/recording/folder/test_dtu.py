@@ -1,7 +1,6 @@
 """DTU scans in MVSNet's and IDR's layouts: what is written reads back, damage is named, views become records."""
 
 import shutil
-import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +13,12 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, project
-from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, read_image, write_dtu
+from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.recording.folder.dtu_source import DtuSource, shrunk, view_numbers
 from splatctrl_cli.recording.folder.idr import decompose, projection, read_idr, write_idr
 from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.records import Intrinsics, RgbdFrame
+from splatctrl_cli.records import Intrinsics
+from tests.recording.log.make_log import frames_of
 
 K = Intrinsics(fx=61.0, fy=62.0, cx=32.5, cy=23.0, width=64, height=48)
 IMAGES, DEPTHS = "Rectified/scan7_train", "Depths_raw/scan7"
@@ -55,10 +55,6 @@ def scan(tmp_path: Path) -> Path:
 def idr(tmp_path: Path) -> Path:
     """The folder of a scan in IDR's layout, in a root of its own."""
     return write_idr(tmp_path / "idr", "scan7", VIEWS)
-
-
-def frames_of(source: DtuSource) -> list[RgbdFrame]:
-    return [record for record in source.records() if isinstance(record, RgbdFrame)]
 
 
 def places(source: DtuSource) -> list[tuple[str, int]]:
@@ -369,33 +365,3 @@ def test_a_protocol_makes_images_as_small_as_its_published_figures_are_of(tmp_pa
 def test_a_protocol_leaves_out_what_neither_trains_nor_scores(scan: Path) -> None:
     protocol = replace(score_protocol("holdout:1"), training=(3, 0))
     assert places(DtuSource(scan, protocol=protocol)) == [("camera", 0), ("holdout", 1), ("camera", 3)]
-
-
-def test_the_sample_scan_is_seen_the_same_from_two_views(sample_data: Path) -> None:
-    views = read_dtu(sample_data / "dtu").views
-    assert len(views) == 8
-    a, b = views[2], views[3]
-    v, u = np.mgrid[60:150:10, 60:200:10]
-    z = a.depth[v, u].astype(np.float64)
-    k = a.intrinsics
-    points = np.stack([(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z, np.ones_like(z)], -1)
-    in_b = points @ (invert_transform(b.T_world_camera) @ a.T_world_camera).T
-    ub, vb = in_b[..., 0] / in_b[..., 2] * k.fx + k.cx, in_b[..., 1] / in_b[..., 2] * k.fy + k.cy
-    inside = (ub > 0) & (ub < k.width - 1) & (vb > 0) & (vb < k.height - 1)
-    error = np.abs(b.depth[np.rint(vb[inside]).astype(int), np.rint(ub[inside]).astype(int)] - in_b[..., 2][inside])
-    assert inside.sum() > 80
-    assert np.median(error) < 0.003
-
-
-def test_a_cut_photograph_is_refused_and_a_turned_one_keeps_its_pixels(tmp_path: Path) -> None:
-    pixels = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
-    jpeg = bytes(cv2.imencode(".jpg", pixels)[1])
-    entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)  # EXIF: turn by 90 degrees
-    exif = b"Exif\x00\x00" + b"II*\x00" + struct.pack("<IH", 8, 1) + entry + bytes(4)
-    path = tmp_path / "rect_001.jpg"
-    path.write_bytes(jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:])
-    assert read_image(path).shape == (8, 12, 3)
-    assert np.array_equal(read_image(path), cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1])
-    path.write_bytes(jpeg[: len(jpeg) // 2])
-    with pytest.raises(InputError, match="not an image that can be read"):
-        read_image(path)

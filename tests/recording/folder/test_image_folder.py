@@ -12,8 +12,9 @@ from splatctrl_cli.recording.capture.capture import CaptureSource
 from splatctrl_cli.recording.capture.capture_writer import write_capture
 from splatctrl_cli.recording.folder.image_folder import open_image_folder
 from splatctrl_cli.recording.source import SourceOptions, open_source
-from splatctrl_cli.records import Record, RgbdFrame
+from splatctrl_cli.records import RgbdFrame
 from tests.cli.test_reconstruct import write_folder
+from tests.recording.log.make_log import frames_of
 from tests.scene.wall import frame
 
 EXAMPLES = Path(__file__).parents[3] / "docs" / "examples"
@@ -48,10 +49,6 @@ def described(
     return path
 
 
-def frames_of(records: list[Record]) -> list[RgbdFrame]:
-    return [record for record in records if isinstance(record, RgbdFrame)]
-
-
 def refusal(path: Path, options: SourceOptions | None = None) -> str:
     with pytest.raises(InputError) as caught:
         list(open_source(path, options).records())
@@ -60,7 +57,7 @@ def refusal(path: Path, options: SourceOptions | None = None) -> str:
 
 def test_frames_come_in_order_with_their_own_pose_depth_and_no_clock(tmp_path: Path) -> None:
     source = open_source(described(tmp_path))
-    frames = frames_of(list(source.records()))
+    frames = frames_of(source)
     assert [int(frame.color[0, 0, 0]) for frame in frames] == [12, 7, 8]  # by the text that * stood for
     assert all(frame.depth == pytest.approx(1.0) for frame in frames)
     assert frames[0].T_world_camera == pytest.approx(POSE, abs=1e-12)
@@ -77,9 +74,9 @@ def test_a_rate_gives_stamps_from_frame_numbers(tmp_path: Path) -> None:
 @pytest.mark.parametrize("entry", ["8", "2"])
 def test_held_out_frames_belong_to_another_camera(tmp_path: Path, entry: str) -> None:
     path = described(tmp_path)
-    frames = frames_of(list(open_source(path, SourceOptions(holdout=(entry,))).records()))
+    frames = frames_of(open_source(path, SourceOptions(holdout=(entry,))))
     assert [frame.camera for frame in frames] == ["camera", "camera", "holdout"]  # name 8 is at position 2
-    kept = frames_of(list(open_source(path, SourceOptions(holdout=(entry,), cameras=("camera",))).records()))
+    kept = frames_of(open_source(path, SourceOptions(holdout=(entry,), cameras=("camera",))))
     assert len(kept) == 2
 
 
@@ -93,7 +90,7 @@ def test_holding_every_view_out_is_refused(tmp_path: Path) -> None:
 def test_pixel_centres_at_a_half_move_the_principal_point(tmp_path: Path) -> None:
     path = described(tmp_path)
     path.write_text(path.read_text().replace("cy = 3.0\n", "cy = 3.0\npixel_center = 0.5\n"))
-    frame = frames_of(list(open_source(path).records()))[0]
+    frame = frames_of(open_source(path))[0]
     assert (frame.intrinsics.cx, frame.intrinsics.cy) == (3.5, 2.5)
 
 
@@ -102,7 +99,7 @@ def test_world_to_camera_and_opengl_poses_are_the_same_camera(tmp_path: Path) ->
     poses = '[poses]\nformat = "trajectory-log"\nfile = "t.log"\naxes = "opengl"\nconvention = "world_to_camera"\n'
     path = described(tmp_path, poses=poses)
     write_log(tmp_path / "images/t.log", dict.fromkeys((7, 8, 12), invert_transform(opengl)))
-    frame = frames_of(list(open_source(path).records()))[0]
+    frame = frames_of(open_source(path))[0]
     assert frame.T_world_camera == pytest.approx(POSE, abs=1e-12)
 
 
@@ -113,7 +110,7 @@ def test_tum_poses_are_matched_by_the_stamps_in_file_names(tmp_path: Path) -> No
     poses = '[poses]\nformat = "tum"\nfile = "gt.txt"\n[stamps]\nnames = true\n'
     path.write_text(f'root = "images"\n{CAMERA}{FRAMES}[depth]\nscale = 1e-4\n{poses}')
     source = open_source(path)
-    frames = frames_of(list(source.records()))
+    frames = frames_of(source)
     assert [frame.stamp_ns for frame in frames] == [100_250_000_000, 100_750_000_000]
     assert frames[1].T_world_camera[:3, 3] == pytest.approx([4, 5, 6])
     assert source.loss.without_pose == 1
@@ -124,7 +121,7 @@ def test_matrix_files_are_matched_by_name(tmp_path: Path) -> None:
     (tmp_path / "images/pose").mkdir()
     np.savetxt(tmp_path / "images/pose/8.txt", POSE)
     source = open_source(path)
-    assert [int(frame.color[0, 0, 0]) for frame in frames_of(list(source.records()))] == [8]
+    assert [int(frame.color[0, 0, 0]) for frame in frames_of(source)] == [8]
     assert source.loss.without_pose == 2
 
 
@@ -134,7 +131,7 @@ def test_rotated_depth_is_turned_back(tmp_path: Path) -> None:
     rotated = np.uint16(((8000 << 3) | (8000 >> 13)) & 0xFFFF)
     for name in ("7", "8", "12"):
         cv2.imwrite(str(tmp_path / f"images/depth/{name}.png"), np.full((6, 8), rotated, np.uint16))
-    assert frames_of(list(open_source(path).records()))[0].depth == pytest.approx(0.8)
+    assert frames_of(open_source(path))[0].depth == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize("suffix", ["npy", "tiff"])
@@ -154,27 +151,31 @@ def test_float_depth_files_are_read_in_their_unit(tmp_path: Path, suffix: str) -
         else:
             cv2.imwrite(str(file), values)
     source = open_source(path)
-    depth = frames_of(list(source.records()))[0].depth
+    depth = frames_of(source)[0].depth
     assert depth[0, :2].tolist() == [0, 0]
     assert depth[1, 1] == np.float32(12345.6) * np.float32(1e-4)
     assert source.loss.invalid_depth == 6
 
 
-def test_files_without_partner_are_counted(tmp_path: Path) -> None:
-    path = described(tmp_path)
-    (tmp_path / "images/depth/8.png").unlink()
+@pytest.mark.parametrize(
+    ("name", "content", "lost", "notes"),
+    [
+        ("depth/8.png", None, (1, 0), []),
+        ("rgb/8.png", b"\x89PNG nonsense", (0, 1), ["8.png: not an image that can be read"]),
+    ],
+)
+def test_an_image_without_partner_or_whose_file_is_broken_is_counted(
+    tmp_path: Path, name: str, content: bytes | None, lost: tuple[int, int], notes: list[str]
+) -> None:
+    path, file = described(tmp_path), tmp_path / "images" / name
+    if content is None:
+        file.unlink()
+    else:
+        file.write_bytes(content)
     source = open_source(path)
     assert len(list(source.records())) == 2
-    assert source.loss.unpaired_color == 1
-
-
-def test_a_broken_image_is_counted_as_damage(tmp_path: Path) -> None:
-    path = described(tmp_path)
-    (tmp_path / "images/rgb/8.png").write_bytes(b"\x89PNG nonsense")
-    source = open_source(path)
-    assert len(list(source.records())) == 2
-    assert source.loss.damaged == 1
-    assert "8.png: not an image" in source.loss.notes[0]
+    assert (source.loss.unpaired_color, source.loss.damaged) == lost
+    assert [note.rpartition("/")[2] for note in source.loss.notes] == notes
 
 
 MATRIX = CAMERA.replace("[camera]", "[depth_camera]") + "depth_to_color = "
@@ -185,6 +186,7 @@ MATRIX = CAMERA.replace("[camera]", "[depth_camera]") + "depth_to_color = "
     [
         (FRAMES, f"{FRAMES}[stamps]\nrat = 3\n", "unknown key stamps.rat; did you mean stamps.rate?"),
         ("fx = 10\n", "", "camera.fx is missing"),
+        ('"images"', '"~nobody-of-that-name/x"', "root: no home folder of ~nobody-of-that-name/x"),
         (FRAMES, "", "[frames] is missing"),
         ("trajectory-log", "trajectory", "poses.format: expected one of matrix-blocks"),
         ("width = 8", 'width = "8"', "camera.width: expected int, got '8'"),
@@ -205,13 +207,6 @@ def test_a_description_that_cannot_be_meant_is_refused(tmp_path: Path, good: str
     path.write_text(path.read_text().replace(good, bad))
     assert said in refusal(path)
     assert ("--depth-scale" in refusal(path)) == ("implausible" in said)
-
-
-def test_a_root_in_the_home_of_nobody_is_named(tmp_path: Path) -> None:
-    make_folder(tmp_path)
-    path = tmp_path / "x.toml"
-    path.write_text('root = "~nobody-of-that-name/x"\n')
-    assert "root: no home folder of ~nobody-of-that-name/x" in refusal(path)
 
 
 def test_a_missing_root_or_pose_file_is_named(tmp_path: Path) -> None:
@@ -241,7 +236,7 @@ def test_real_folders_open_and_their_views_agree(
     real_data: Path, example: str, folder: str, num_frames: int, num_held: int, agreement: float
 ) -> None:
     source = open_source(EXAMPLES / f"{example}.toml", SourceOptions(root=real_data / folder))
-    frames = frames_of(list(source.records()))
+    frames = frames_of(source)
     assert len(frames) == num_frames
     assert sum(frame.camera == "holdout" for frame in frames) == num_held
     assert vars(source.loss) == vars(type(source.loss)())
@@ -272,7 +267,7 @@ def test_masks_go_with_the_colour_image_of_the_same_name(tmp_path: Path) -> None
     mask = np.zeros((6, 8), np.uint8)
     mask[2:4, 5] = 9
     source = open_source(with_masks(tmp_path, ("7", "12"), mask))
-    frames = frames_of(list(source.records()))
+    frames = frames_of(source)
     found = {int(frame.color[0, 0, 0]): frame.human for frame in frames}
     assert found[8] is None
     assert found[7] is not None and found[7].tolist() == (mask > 0).tolist()
@@ -301,7 +296,7 @@ def test_png_depth_goes_into_a_capture_as_it_is_unless_its_counts_change(tmp_pat
     write_capture(tmp_path / "x.capture", open_source(path))
     kept = [file.read_bytes() for file in sorted((tmp_path / "x.capture/depth").rglob("*.png"))]
     assert len(kept) == 3 and (sorted(kept) == sorted(recorded)) == (not change)
-    of_folder, of_capture = (frames_of(list(open_source(p).records())) for p in (path, tmp_path / "x.capture"))
+    of_folder, of_capture = (frames_of(open_source(p)) for p in (path, tmp_path / "x.capture"))
     assert all(np.array_equal(a.depth, b.depth) for a, b in zip(of_folder, of_capture, strict=True))
 
 
@@ -312,13 +307,8 @@ def rig(tmp_path: Path) -> Path:
     return write_folder(tmp_path / "in", views)
 
 
-def frames(path: Path, options: SourceOptions | None = None) -> list[RgbdFrame]:
-    records = open_image_folder(path, options or SourceOptions()).records()
-    return [record for record in records if isinstance(record, RgbdFrame)]
-
-
 def test_each_camera_has_its_own_files_and_poses_by_stamp(rig: Path) -> None:
-    found = frames(rig)
+    found = frames_of(rig)
     assert [(f.camera, f.stamp_ns) for f in found] == [("a", 0), ("b", 0), ("a", 200_000_000), ("b", 200_000_000)]
     assert [f.T_world_camera[0, 3] for f in found] == [0.0, 0.2, 0.1, 0.3]
     source = open_image_folder(rig, SourceOptions())
@@ -328,22 +318,22 @@ def test_each_camera_has_its_own_files_and_poses_by_stamp(rig: Path) -> None:
 
 
 def test_one_camera_of_several_may_be_chosen(rig: Path) -> None:
-    assert {f.camera for f in frames(rig, SourceOptions(cameras=("b",)))} == {"b"}
+    assert {f.camera for f in frames_of(rig, SourceOptions(cameras=("b",)))} == {"b"}
     with pytest.raises(InputError, match="no camera 'c'; use one of: a, b"):
-        frames(rig, SourceOptions(cameras=("c",)))
+        frames_of(rig, SourceOptions(cameras=("c",)))
 
 
 def test_a_pose_file_without_a_star_is_that_of_every_view(rig: Path) -> None:
     rig.write_text(rig.read_text().replace('poses = "a-*.txt"', 'poses = "a-1.txt"'))
-    assert [f.T_world_camera[0, 3] for f in frames(rig) if f.camera == "a"] == [0.1, 0.1]
+    assert [f.T_world_camera[0, 3] for f in frames_of(rig) if f.camera == "a"] == [0.1, 0.1]
 
 
 def test_a_capture_keeps_the_cameras_apart(rig: Path, tmp_path: Path) -> None:
     (tmp_path / "x.capture").mkdir()
     write_capture(tmp_path / "x.capture", open_image_folder(rig, SourceOptions()))
     again = [r for r in CaptureSource(tmp_path / "x.capture", SourceOptions()).records() if isinstance(r, RgbdFrame)]
-    assert [(f.camera, f.stamp_ns) for f in again] == [(f.camera, f.stamp_ns) for f in frames(rig)]
-    assert np.allclose([f.T_world_camera for f in again], [f.T_world_camera for f in frames(rig)])
+    assert [(f.camera, f.stamp_ns) for f in again] == [(f.camera, f.stamp_ns) for f in frames_of(rig)]
+    assert np.allclose([f.T_world_camera for f in again], [f.T_world_camera for f in frames_of(rig)])
 
 
 @pytest.mark.parametrize(
@@ -360,4 +350,4 @@ def test_a_capture_keeps_the_cameras_apart(rig: Path, tmp_path: Path) -> None:
 def test_what_is_wrong_with_a_description_is_named(rig: Path, old: str, new: str, said: str) -> None:
     rig.write_text(rig.read_text().replace(old, new))
     with pytest.raises(InputError, match=said):
-        frames(rig)
+        frames_of(rig)

@@ -23,12 +23,12 @@ from tests.recording.folder.make_layout import (
     check,
     cloud_of,
     color_of,
-    frames_of,
     make_mvsnet,
     make_pcd,
     make_sens,
     pcd_bytes,
 )
+from tests.recording.log.make_log import frames_of
 
 SENS = "scene0000_00.sens"
 

@@ -23,7 +23,6 @@ from tests.recording.folder.make_layout import (
     K,
     check,
     color_of,
-    frames_of,
     make_bop,
     make_frames,
     make_mvsnet,
@@ -33,6 +32,7 @@ from tests.recording.folder.make_layout import (
     make_tum,
     matrix_text,
 )
+from tests.recording.log.make_log import frames_of
 
 
 @pytest.fixture(params=[layout for layout in LAYOUTS if layout.name in EXAMPLES], ids=lambda layout: layout.name)

@@ -13,12 +13,15 @@ import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Bag1Writer
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.records import RecordSource, RgbdFrame
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 SCHEMAS = {"cdr": "ros2msg", "ros1": "ros1msg", "protobuf": "protobuf", "json": "jsonschema"}  # by encoding
@@ -60,10 +63,17 @@ def write_raw(path: Path, messages: Iterable[RawMessage], **options: Any) -> Pat
 
 
 def write_bag(
-    path: Path, messages: Iterable[RawMessage], store: Any = STORE, plugin: StoragePlugin | None = None
+    path: Path,
+    messages: Iterable[RawMessage],
+    store: Any = STORE,
+    plugin: StoragePlugin | None = None,
+    mode: CompressionMode = CompressionMode.NONE,
 ) -> Path:
     """A bag of the messages by rosbags: of ROS 2 in a folder, kept by `plugin`, or without one a file of ROS 1."""
-    with Bag1Writer(path) if plugin is None else Bag2Writer(path, version=9, storage_plugin=plugin) as writer:
+    writer = Bag1Writer(path) if plugin is None else Bag2Writer(path, version=9, storage_plugin=plugin)
+    if isinstance(writer, Bag2Writer) and mode != CompressionMode.NONE:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
         connections: dict[str, Any] = {}
         for message in messages:
             name, kind = message.topic.name, message.topic.type_name
@@ -71,6 +81,12 @@ def write_bag(
                 connections[name] = writer.add_connection(name, kind, typestore=store)
             writer.write(connections[name], message.log_time_ns, message.data)
     return path
+
+
+def frames_of(source: Path | RecordSource, options: SourceOptions | None = None) -> list[RgbdFrame]:
+    """The frames of a recording that is open, or at a path."""
+    opened = open_source(source, options) if isinstance(source, Path) else source
+    return [record for record in opened.records() if isinstance(record, RgbdFrame)]
 
 
 def messages_of(log: Path) -> Iterator[RawMessage]:

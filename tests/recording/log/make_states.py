@@ -6,9 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.state.state_source import open_states
+from splatctrl_cli.records import JointState, RecordSource
 from tests.recording.log.make_log import STORE, encoded, write_bag, write_raw
 
 START_NS = 1_700_000_000_000_000_000
@@ -113,3 +118,26 @@ def write_bag2(path: Path, messages: Sequence[Message], store: Any = STORE) -> P
 def write_bag1(path: Path, messages: Sequence[Message], store: Any) -> Path:
     """A ROS 1 bag."""
     return write_bag(path, [encoded(m.log_ns, m.topic, m.content, store, ros=1) for m in messages], store)
+
+
+AB = ("a", "b")
+
+
+def opened(path: Path, joints: tuple[str, ...] = AB, **options: Any) -> RecordSource:
+    """The joint states at a path."""
+    return open_states(path, SourceOptions(**options), joints)
+
+
+def states(source: Path | RecordSource) -> list[JointState]:
+    """In the order of the source's joint names."""
+    records = (opened(source) if isinstance(source, Path) else source).records()
+    return [record for record in records if isinstance(record, JointState)]
+
+
+def refusal(path: Path, joints: tuple[str, ...] = AB, **options: Any) -> str:
+    """Why there are none, which comes with a remedy."""
+    with pytest.raises(InputError) as caught:
+        opened(path, joints, **options)
+    assert caught.value.exit_code == 4
+    assert caught.value.remedy
+    return str(caught.value)

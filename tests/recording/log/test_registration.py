@@ -78,21 +78,6 @@ def test_a_distorted_point_lands_where_the_pinhole_puts_it(model: str) -> None:
     assert found == pytest.approx([400 * x + 199.5, 400 * y + 149.5], abs=0.5)
 
 
-def test_a_pincushion_keeps_its_focal_length_and_marks_the_corners_that_it_did_not_see() -> None:
-    lens = Undistortion(LARGE, "plumb_bob", np.array([0.4, 0, 0, 0, 0]))
-    assert lens.intrinsics == LARGE and lens.valid is not None
-    u, v = np.meshgrid(np.arange(64), np.arange(48))
-    x, y = (u - LARGE.cx) / LARGE.fx, (v - LARGE.cy) / LARGE.fy
-    r2 = x * x + y * y
-    column, row = LARGE.fx * x * (1 + 0.4 * r2) + LARGE.cx, LARGE.fy * y * (1 + 0.4 * r2) + LARGE.cy
-    seen = (column >= 0) & (column <= 63) & (row >= 0) & (row <= 47)
-    assert np.array_equal(lens.valid, seen) and not seen[0, 0] and seen[24, 32]
-    depth = lens.depth(np.full((48, 64), 2.0, np.float32))
-    color = lens.color(np.full((48, 64, 3), 200, np.uint8))
-    assert (depth[seen] == 2.0).all() and not depth[~seen].any()
-    assert (color[seen] == 200).all() and not color[~seen].any()
-
-
 def test_a_turned_and_zoomed_result_shows_what_the_lens_saw_there() -> None:
     """As a stereo pair is rectified: the result's axes are turned from the lens's, its focal length is shorter."""
     R = rpyToMatrix(0.02, -0.1, 0.05)

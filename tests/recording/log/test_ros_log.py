@@ -19,7 +19,6 @@ from splatctrl_cli.recording.log.survey import survey
 from splatctrl_cli.recording.source import CameraTopics, SourceOptions, describe, open_source
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from splatctrl_cli.scene.keyframes import make_view
-from tests.recording.container.test_log_formats import as_ros1_bag, assert_same
 from tests.recording.log.make_log import (
     FRAME_NS,
     HEIGHT,
@@ -29,19 +28,14 @@ from tests.recording.log.make_log import (
     broken_log,
     camera_x,
     color_pixels,
+    frames_of,
     make_log,
     mask_pixels,
-    messages_of,
-    write_raw,
 )
 
 
 def records_of(path: Path, options: SourceOptions | None = None) -> list[Record]:
     return list(open_source(path, options).records())
-
-
-def frames_of(path: Path, options: SourceOptions | None = None) -> list[RgbdFrame]:
-    return [record for record in records_of(path, options) if isinstance(record, RgbdFrame)]
 
 
 def refusal(path: Path, options: SourceOptions | None = None) -> str:
@@ -52,9 +46,13 @@ def refusal(path: Path, options: SourceOptions | None = None) -> str:
     return str(caught.value)
 
 
-def test_a_good_log_gives_every_frame_with_color_depth_pose_and_intrinsics(tmp_path: Path) -> None:
+def test_a_good_log_gives_every_frame_and_joint_state_whole(tmp_path: Path) -> None:
     source = open_source(make_log(tmp_path / "good.mcap", LogRecipe(color_format="png")))
     frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
+    joints = [record for record in source.records() if isinstance(record, JointState)]
+    assert source.joint_names == ("joint_a", "joint_b")
+    assert joints[3].position == pytest.approx([0.3, -0.3])
+    assert joints[3].velocity == pytest.approx([1.0, -1.0])
     assert source.cameras == ("cam0",)
     assert source.has_clock
     assert [f.stamp_ns for f in frames] == [START_NS + i * FRAME_NS for i in range(5)]
@@ -76,14 +74,6 @@ def test_joint_states_come_before_frames_of_the_same_stamp(tmp_path: Path) -> No
     assert stamps == sorted(stamps)
 
 
-def test_joints_keep_names_positions_and_velocities(tmp_path: Path) -> None:
-    source = open_source(make_log(tmp_path / "log.mcap"))
-    joints = [record for record in source.records() if isinstance(record, JointState)]
-    assert source.joint_names == ("joint_a", "joint_b")
-    assert joints[3].position == pytest.approx([0.3, -0.3])
-    assert joints[3].velocity == pytest.approx([1.0, -1.0])
-
-
 def test_transforms_recorded_after_the_images_still_place_them(tmp_path: Path) -> None:
     early = frames_of(make_log(tmp_path / "early.mcap"))
     late = frames_of(make_log(tmp_path / "late.mcap", LogRecipe(tf_last=True)))
@@ -95,19 +85,20 @@ def test_a_world_frame_inside_the_tree_is_honoured(tmp_path: Path) -> None:
     assert frame.T_world_camera[:3, 3] == pytest.approx([0, 0, 0.5])
 
 
-def test_images_without_partner_are_counted(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "log.mcap", LogRecipe(depth_delay_ns=50_000_000 + 30_000_000))
-    source = open_source(log)  # 80 ms late: 20 ms before the next colour image
-    frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
-    assert len(frames) == 4
-    assert (source.loss.unpaired_color, source.loss.unpaired_depth, source.loss.damaged) == (1, 1, 0)
-
-
-def test_images_outside_the_time_of_tf_are_counted(tmp_path: Path) -> None:
-    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(tf_frames=3)))
-    frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
-    assert len(frames) == 3
-    assert source.loss.without_pose == 2
+@pytest.mark.parametrize(
+    ("recipe", "num_frames", "lost"),
+    [
+        (LogRecipe(depth_delay_ns=80_000_000), 4, (1, 1, 0)),  # 20 ms before the next colour image
+        (LogRecipe(tf_frames=3), 3, (0, 0, 2)),
+    ],
+)
+def test_images_without_partner_or_outside_the_time_of_tf_are_counted(
+    tmp_path: Path, recipe: LogRecipe, num_frames: int, lost: tuple[int, int, int]
+) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap", recipe))
+    assert sum(isinstance(record, RgbdFrame) for record in source.records()) == num_frames
+    assert (source.loss.unpaired_color, source.loss.unpaired_depth, source.loss.without_pose) == lost
+    assert source.loss.damaged == 0
 
 
 def test_byte_order_and_row_step_do_not_change_the_images(tmp_path: Path) -> None:
@@ -292,8 +283,7 @@ def test_images_without_a_mask_are_kept_and_noted(tmp_path: Path) -> None:
 def test_a_mask_is_not_taken_for_the_colour_of_a_grey_camera(tmp_path: Path) -> None:
     recipe = LogRecipe(mask_every=1, color_format="mono8", color_name="zz_image")
     path = make_log(tmp_path / "log.mcap", recipe)
-    options = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
-    assert frames_of(path, options)[0].color[0].tolist() == [[g, g, g] for g in color_pixels(0)[0, :, 1].tolist()]
+    assert frames_of(path, MASKED)[0].color[0].tolist() == [[g, g, g] for g in color_pixels(0)[0, :, 1].tolist()]
 
 
 def test_a_distorted_lens_is_undone_on_masks_without_new_values(tmp_path: Path) -> None:
@@ -302,13 +292,6 @@ def test_a_distorted_lens_is_undone_on_masks_without_new_values(tmp_path: Path) 
     assert human is not None
     assert set(np.unique(human)) == {0, 1}
     assert not np.array_equal(human, mask_pixels(0) > 0)
-
-
-def test_ros1_messages_in_an_mcap_give_the_same_records(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "log.mcap")
-    bag = as_ros1_bag(log, tmp_path / "log.bag")
-    converted = write_raw(tmp_path / "ros1.mcap", messages_of(bag))
-    assert_same(records_of(log), records_of(converted))
 
 
 def test_a_lens_that_a_person_gives_stands_in_for_camera_info(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from tests.recording.log.make_log import (
     WIDTH,
     LogRecipe,
     color_pixels,
+    frames_of,
     header,
     make_log,
     messages_of,
@@ -116,10 +117,6 @@ def video_log(
     return write_raw(path, written)
 
 
-def frames_of(source: Any) -> list[RgbdFrame]:
-    return [record for record in source.records() if isinstance(record, RgbdFrame)]
-
-
 def numbers_of(frames: list[RgbdFrame]) -> list[int]:
     """Of the images, by what is in them; it must be what their stamps say."""
     for frame in frames:
@@ -160,35 +157,32 @@ def test_info_and_check_take_video_for_the_colour_that_it_is(tmp_path: Path) -> 
     assert [finding.code for finding in report.findings] == [finding.code for finding in images.findings]
 
 
-def test_images_before_the_first_key_frame_are_left_out_and_counted(tmp_path: Path) -> None:
-    source = open_source(video_log(tmp_path / "video.mcap", change=lambda numbered: numbered[2:]))
-    assert numbers_of(frames_of(source)) == list(range(GOP, NUM))
-    assert source.loss.damaged == GOP - 2
-    said = "3 images of video before its first key frame left out: record a key frame every second, or cut the log"
-    assert said in source.loss.notes[0]
+def cut_key_frame(numbered: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    return [(i, data[: len(data) // 2] if i == GOP else data) for i, data in numbered]
 
 
-@pytest.mark.parametrize(("codec", "form"), [("libx264", "h264"), ("libx265", "h265")])
-def test_images_after_one_that_is_missing_are_left_out_up_to_the_next_key_frame(
-    tmp_path: Path, codec: str, form: str
+BEFORE = "3 images of video before its first key frame left out: record a key frame every second, or cut the log"
+BEHIND = "2 images of video that follow missing or damaged ones, up to the next key frame"
+
+
+@pytest.mark.parametrize(
+    ("form", "codec", "change", "numbers", "said"),
+    [
+        ("h264", "libx264", lambda numbered: numbered[2:], [*range(GOP, NUM)], BEFORE),
+        # FFmpeg shows those of H.264, with the blocks of the wrong image
+        ("h264", "libx264", lambda numbered: numbered[:2] + numbered[3:], [0, 1, *range(GOP, NUM)], BEHIND),
+        ("h265", "libx265", lambda numbered: numbered[:2] + numbered[3:], [0, 1, *range(GOP, NUM)], BEHIND),
+        ("h264", "libx264", cut_key_frame, [*range(GOP), *range(2 * GOP, NUM)], ""),
+    ],
+)
+def test_images_that_lack_one_before_them_are_left_out_up_to_the_next_key_frame_and_counted(
+    tmp_path: Path, form: str, codec: str, change: Change, numbers: list[int], said: str
 ) -> None:
-    """FFmpeg shows those of H.264, with the blocks of the wrong image."""
-    log = video_log(
-        tmp_path / "video.mcap", form=form, codec=codec, change=lambda numbered: numbered[:2] + numbered[3:]
-    )
-    source = open_source(log)
-    assert numbers_of(frames_of(source)) == [0, 1, *range(GOP, NUM)]
-    assert source.loss.damaged == 2
-    assert "2 images of video that follow missing or damaged ones, up to the next key frame" in source.loss.notes[0]
-
-
-def test_a_damaged_key_frame_takes_its_images_with_it(tmp_path: Path) -> None:
-    def cut(numbered: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
-        return [(i, data[: len(data) // 2] if i == GOP else data) for i, data in numbered]
-
-    source = open_source(video_log(tmp_path / "video.mcap", change=cut))
-    assert numbers_of(frames_of(source)) == [*range(GOP), *range(2 * GOP, NUM)]
-    assert source.loss.damaged == GOP
+    source = open_source(video_log(tmp_path / "video.mcap", form=form, codec=codec, change=change))
+    assert numbers_of(frames_of(source)) == numbers
+    num_missing = 0 if change is cut_key_frame else 2 if said == BEFORE else 1  # these leave no message
+    assert source.loss.damaged == NUM - num_missing - len(numbers)
+    assert said in source.loss.notes[0]
 
 
 def test_video_without_any_key_frame_is_refused(tmp_path: Path) -> None:

@@ -11,30 +11,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from splatctrl_cli import libraries
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.recording.state.state_source import open_states
-from splatctrl_cli.records import JointState, RecordSource
+from splatctrl_cli.errors import UsageError
+from tests.recording.log.make_states import AB, opened, refusal, states
 
-AB = ("a", "b")
 NUM = 5000  # rows, more than a block
 T = np.arange(NUM) * 0.01
 Q = np.stack([np.linspace(0, 1, NUM), np.linspace(1, -1, NUM)], axis=1)
-
-
-def opened(path: Path, joints: tuple[str, ...] = AB) -> RecordSource:
-    return open_states(path, SourceOptions(), joints)
-
-
-def states(path: Path) -> list[JointState]:
-    return [record for record in opened(path).records() if isinstance(record, JointState)]
-
-
-def refusal(path: Path) -> str:
-    with pytest.raises(InputError) as caught:
-        opened(path)
-    assert caught.value.remedy
-    return str(caught.value)
 
 
 def described(folder: Path, **table: Any) -> Path:

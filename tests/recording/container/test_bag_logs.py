@@ -1,41 +1,179 @@
-"""ROS 2 sqlite3 bags: of any distribution, damaged, compressed, split, without metadata.yaml, and hostile."""
+"""Bags of ROS 1 and of ROS 2's sqlite3: whole ones give what rosbags gives, of any distribution; damaged, compressed,
+split and hostile ones give what precedes or follows the damage.
+"""
 
 import os
 import sqlite3
+import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import yaml
 import zstandard
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag1 import Reader
+from rosbags.rosbag1 import Writer as Bag1Writer
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Reader as Bag2Reader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.recording.container.bag_logs import Db3Log
+from splatctrl_cli.formats.unpacking import MAX_BLOCK
+from splatctrl_cli.recording.container.bag_logs import Bag1Log, BagFile, Db3Log
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage
 from tests.cases.container_cases import kill_recorder
-from tests.recording.log.make_log import STORE, T
+from tests.recording.log.make_log import T, encoded, write_bag
+
+STORE1 = get_typestore(Stores.ROS1_NOETIC)
+COMPRESSIONS = [None, Bag1Writer.CompressionFormat.BZ2, Bag1Writer.CompressionFormat.LZ4]
+
+
+def make_bag1(path: Path, compression: Bag1Writer.CompressionFormat | None = None, num: int = 60) -> Path:
+    """Texts of 400 bytes on two topics, in chunks of about 2 kB."""
+    text = STORE1.types["std_msgs/msg/String"]
+    writer = Bag1Writer(path)
+    writer.chunk_threshold = 2000
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        topics = [writer.add_connection(name, "std_msgs/msg/String", typestore=STORE1) for name in ("/a", "/b")]
+        for index in range(num):
+            message = text(data=" ".join(str(index * k % 97) for k in range(150))[:400])
+            content = STORE1.serialize_ros1(message, "std_msgs/msg/String")
+            writer.write(topics[index % 2], 1_000_000_000 + index, content)
+    return path
+
+
+def read1(path: Path) -> tuple[list[RawMessage], Damage]:
+    damage = Damage()
+    return list(Bag1Log(path).messages(damage)), damage
+
+
+def by_rosbags(path: Path) -> list[tuple[str, str, str, int, bytes]]:
+    with Reader(path) as reader:
+        return [(c.topic, c.msgtype, c.msgdef.data, stamp, data) for c, stamp, data in reader.messages()]
+
+
+def plain(messages: list[RawMessage]) -> list[tuple[str, str, str, int, bytes]]:
+    return [(m.topic.name, m.topic.type_name, m.topic.definition, m.log_time_ns, m.data) for m in messages]
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_a_whole_bag_gives_what_rosbags_gives(
+    tmp_path: Path, compression: Bag1Writer.CompressionFormat | None
+) -> None:
+    bag = make_bag1(tmp_path / "x.bag", compression)
+    found, damage = read1(bag)
+    assert plain(found) == by_rosbags(bag)
+    assert len(found) == 60
+    assert damage.notes == []
+    assert {topic.name for topic in Bag1Log(bag).topics()} == {"/a", "/b"}
+    assert [m.log_time_ns for m in Bag1Log(bag).messages(Damage(), {"/b"})] == [m.log_time_ns for m in found[1::2]]
+
+
+def test_a_real_bag_gives_what_rosbags_gives(real_data: Path) -> None:
+    for bag in sorted((real_data / "realsense_bag").glob("*.bag")):
+        found, damage = read1(bag)
+        assert sorted(plain(found)) == sorted(by_rosbags(bag))
+        assert damage.notes == []
+
+
+def test_an_uncompressed_chunk_gives_what_precedes_the_cut_in_it(tmp_path: Path) -> None:
+    bag = make_bag1(tmp_path / "x.bag")
+    chunk = [record for record in BagFile(bag).records(Damage()) if record.kind == 5][2]
+    before = len(_messages(bag, up_to=chunk.offset))
+    bag.write_bytes(bag.read_bytes()[: chunk.offset + 1500])
+    found, damage = read1(bag)
+    assert len(found) >= before + 2
+    assert damage.notes[0] == f"x.bag: cut or damaged after byte {chunk.offset}"
+
+
+def _messages(bag: Path, up_to: int) -> list[RawMessage]:
+    cut = bag.with_name("before.bag")
+    cut.write_bytes(bag.read_bytes()[:up_to])
+    return read1(cut)[0]
+
+
+def test_a_bag_that_is_still_written_says_that_it_has_no_index(tmp_path: Path) -> None:
+    bag = make_bag1(tmp_path / "x.bag")
+    data = bytearray(bag.read_bytes())
+    at = data.index(b"index_pos=") + len("index_pos=")
+    end = struct.unpack_from("<Q", data, at)[0]
+    data[at : at + 8] = bytes(8)
+    bag.write_bytes(data[:end])
+    found, damage = read1(bag)
+    assert len(found) == 60
+    assert damage.notes == ["x.bag: has no index: cut, or still being written"]
+
+
+def test_a_bag_that_ends_between_two_entries_of_its_index_is_not_whole(tmp_path: Path) -> None:
+    bag = make_bag1(tmp_path / "x.bag")
+    infos = [record for record in BagFile(bag).records(Damage()) if record.kind == 6]
+    bag.write_bytes(bag.read_bytes()[: infos[-1].offset])
+    found, damage = read1(bag)
+    assert len(found) == 60
+    assert damage.notes == ["x.bag: its index is not whole"]
+
+
+def announcing_gigabytes(data: bytes, at: int) -> bytes:
+    """With another size in the header of the chunk whose body begins at a byte."""
+    place = data.rindex(b"size=", 0, at) + 5
+    return data[:place] + b"\xff" * 4 + data[place + 4 :]
+
+
+LEFT_OUT = "the chunk at byte {} was left out: "
+
+
+@pytest.mark.parametrize(
+    ("compression", "change", "note"),
+    [
+        *(
+            (
+                kind,
+                lambda data, at: data[: at + 40] + bytes(40) + data[at + 80 :],
+                f"{LEFT_OUT}cannot be decompressed",
+            )
+            for kind in COMPRESSIONS[1:]
+        ),
+        (
+            None,
+            lambda data, at: data[: at - 4] + b"\xff" * 4 + data[at:],
+            "bytes {} to {} are damaged and were left out",
+        ),
+        (
+            Bag1Writer.CompressionFormat.LZ4,
+            announcing_gigabytes,
+            f"{LEFT_OUT}announces {0xFFFFFFFF} bytes unpacked, at most {MAX_BLOCK} are read",
+        ),
+    ],
+)
+def test_a_damaged_chunk_costs_itself_alone(
+    tmp_path: Path,
+    compression: Bag1Writer.CompressionFormat | None,
+    change: Callable[[bytes, int], bytes],
+    note: str,
+) -> None:
+    bag = make_bag1(tmp_path / "x.bag", compression)
+    chunks = [record for record in BagFile(bag).records(Damage()) if record.kind == 5]
+    data = bag.read_bytes()
+    bag.write_bytes(change(data, data.index(chunks[1].body)))
+    found, damage = read1(bag)
+    assert 40 < len(found) < 60
+    assert damage.notes == [f"x.bag: {note.format(chunks[1].offset, chunks[2].offset)}"]
 
 
 def make_bag(
     folder: Path,
     num: int = 400,
     mode: CompressionMode = CompressionMode.NONE,
-    version: int = 9,
     plugin: StoragePlugin = StoragePlugin.SQLITE3,
 ) -> Path:
     """Texts of 700 bytes on one topic, message i at time i + 1."""
-    writer = Writer(folder, version=version, storage_plugin=plugin)
-    if mode != CompressionMode.NONE:
-        writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        topic = writer.add_connection("/text", "std_msgs/msg/String", typestore=STORE)
-        for index in range(num):
-            message = T["std_msgs/msg/String"](data=f"{index:7d}" * 100)
-            writer.write(topic, index + 1, bytes(STORE.serialize_cdr(message, "std_msgs/msg/String")))
-    return folder
+    texts = (T["std_msgs/msg/String"](data=f"{index:7d}" * 100) for index in range(num))
+    messages = [encoded(index + 1, "/text", text) for index, text in enumerate(texts)]
+    return write_bag(folder, messages, plugin=plugin, mode=mode)
 
 
 def read(path: Path) -> tuple[list[RawMessage], Damage]:
@@ -58,16 +196,19 @@ def test_every_real_bag_gives_what_rosbags_gives(real_data: Path) -> None:
         assert damage.notes == []
 
 
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
 @pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
-def test_a_compressed_bag_gives_what_the_plain_one_gives(tmp_path: Path, mode: CompressionMode) -> None:
-    plain, damage = read(make_bag(tmp_path / "plain"))
-    bag = make_bag(tmp_path / "packed", mode=mode)
-    packed, damage = read(bag)
-    assert [(m.log_time_ns, m.data) for m in packed] == [(m.log_time_ns, m.data) for m in plain]
-    assert len(packed) == 400
-    assert damage.notes == []
+def test_a_compressed_bag_and_its_file_alone_give_what_the_plain_one_gives(
+    tmp_path: Path, mode: CompressionMode, plugin: StoragePlugin
+) -> None:
+    plain = [(m.log_time_ns, m.data) for m in read(make_bag(tmp_path / "plain", num=40))[0]]
+    bag = make_bag(tmp_path / "packed", num=40, mode=mode, plugin=plugin)
+    for path in (bag, next(file for file in bag.iterdir() if file.suffix != ".yaml")):
+        packed, damage = read(path)
+        assert [(m.log_time_ns, m.data) for m in packed] == plain
+        assert damage.all_notes == []
     with Bag2Reader(bag) as reader:
-        assert [bytes(data) for *_, data in reader.messages()] == [m.data for m in packed]
+        assert [(stamp, bytes(data)) for _, stamp, data in reader.messages()] == plain
 
 
 @pytest.mark.parametrize("version", range(1, 10))
@@ -164,26 +305,6 @@ def test_a_missing_journal_is_named_where_the_bag_is_empty_without_it(tmp_path: 
     with pytest.raises(InputError, match=r"bag\.db3-wal is not beside it") as caught:
         read(file)
     assert caught.value.remedy.startswith("copy bag.db3-wal from where the bag was recorded")
-
-
-@pytest.mark.parametrize("plugin", list(StoragePlugin))
-def test_the_file_alone_of_a_bag_with_compressed_messages_gives_what_its_folder_gives(
-    tmp_path: Path, plugin: StoragePlugin
-) -> None:
-    plain, _ = read(make_bag(tmp_path / "plain", num=9))
-    bag = make_bag(tmp_path / "packed", num=9, mode=CompressionMode.MESSAGE, plugin=plugin)
-    file = next(path for path in bag.iterdir() if path.suffix in {".db3", ".mcap"})
-    alone, damage = read(file)
-    assert [m.data for m in alone] == [m.data for m in read(bag)[0]] == [m.data for m in plain]
-    assert damage.all_notes == []
-
-
-def test_the_compressed_file_alone_of_a_bag_gives_what_its_folder_gives(tmp_path: Path) -> None:
-    bag = make_bag(tmp_path / "packed", num=9, mode=CompressionMode.FILE)
-    alone, damage = read(next(bag.glob("*.zstd")))
-    assert [m.data for m in alone] == [m.data for m in read(bag)[0]]
-    assert len(alone) == 9
-    assert damage.all_notes == []
 
 
 def test_a_view_in_the_place_of_a_table_is_refused(tmp_path: Path) -> None:
