@@ -19,7 +19,7 @@ from splatctrl_cli.cli.commands import build_parser, function_of, judges
 from splatctrl_cli.cli.reports import enveloped, tell_of_failure
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
-from splatctrl_cli.report.suites import check_replaceable
+from splatctrl_cli.report.junit import check_replaceable
 
 INTERRUPTED = 130  # exit code
 RESUME = "--resume"  # the option of what can be gone on with

@@ -13,7 +13,7 @@ from typing import Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import SplatCtrlError
-from splatctrl_cli.report.suites import Case, Suite, cases_of, error_case, notes_of, tell_github, write_junit
+from splatctrl_cli.report.junit import Case, Suite, cases_of, error_case, notes_of, tell_github, write_junit
 
 RECORDINGS = ("log", "source", "reference", "dtu", "scene", "data", "output", "urdf")  # logs before maps
 JUNIT = "--junit"

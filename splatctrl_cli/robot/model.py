@@ -179,7 +179,7 @@ class RobotModel:
 
     @property
     def changes(self) -> list[int]:
-        """Stamps [ns], in order, from each of which on the robot has another surface."""
+        """Stamps [ns], in order, at which the robot's surface changes."""
         return [] if self.self_model is None else self.self_model.changes()
 
     def surface_at(self, stamp_ns: int) -> RobotSurface:
@@ -211,7 +211,7 @@ class RobotModel:
 
     @property
     def self_allowance(self) -> Float64:
-        """How much less (P,) [m] than the margin asked for each of `self_pairs` keeps (robot.self_margins)."""
+        """By how much (P,) [m] each of `self_pairs` falls short of the margin asked for (robot.self_margins)."""
         return np.zeros(len(self.self_pairs())) if self._allowance is None else self._allowance
 
     def _changed(self, **attributes: object) -> "RobotModel":

@@ -173,7 +173,7 @@ class SceneFitter:
         return replace(self._audit(views, filled, removed, terms), **audited(masks))
 
     def plant(self, cloud: PointCloud) -> Filled:
-        """Start from coloured points instead of depth: seeds as dense as uses `fill` of the budget."""
+        """Start from coloured points instead of depth: seeds so dense that they use a share `fill` of the budget."""
         source = Candidates(points=cloud.points, colors=cloud.colors, pixels=np.zeros(len(cloud), np.float32))
         count = max(int(self.config.fill * self.config.max_splats), 1)
         self.density = density_for([source], count, self.config)
@@ -267,7 +267,7 @@ class SceneFitter:
                 self.window.newest = [self.view(view.frame) for view in self.window.newest]
 
     def _behind(self, views: Sequence[View]) -> Color:
-        """The background: what has no depth, or where no view has any, what no planted splat covers."""
+        """The background: pixels without depth; if no view has depth, pixels that no planted splat covers."""
         if self.config.background == "black":
             return BLACK
         counted = [view.target.counted > 0 for view in views]
@@ -361,7 +361,7 @@ class SceneFitter:
     def _fill_gaps(
         self, views: Sequence[View], masks: Sequence[SelfMask], removed: dict[str, int], half: int | None = None
     ) -> Filled:
-        """Put splats where a measured surface is far from every sphere; half of it a time step, in turn.
+        """Put splats where a measured surface is far from every sphere: in one half of it a time step, by turns.
 
         The robot's surface and everything else have spheres of their own. Where slots are missing, splats are evicted
         for the latter every EVICT_EVERY time steps; counts in `removed`.
@@ -436,7 +436,7 @@ class SceneFitter:
         self.buffer.set_radius(slots, np.where(is_hidden, np.minimum(radii, np.float32(least)), radii))
 
     def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
-        """Put dead slots, beyond the reserve for gaps, to use where nothing asks for them; counts in `removed`."""
+        """Use dead slots that no seed needs, but for the reserve for gaps; counts in `removed`."""
         filled, num_weak = use_idle(self.buffer, lambda: self.descent.misfits(views), self.config, rng)
         removed["weak"] += num_weak
         return filled
@@ -444,8 +444,8 @@ class SceneFitter:
     def _is_grounded(
         self, points: Float32, views: Sequence[View], label: Label = Label.OBJECT, *, least: float = np.inf
     ) -> Bool:
-        """Points (K,) of a label that no view sees through by `see_through`, or by `least` [m] where that is less:
-        what one sensor measured and another looks past was noise.
+        """Points (K,) of a label behind which no view sees by the smaller of `see_through` and `least` [m]: what one
+        sensor measured and another looks past was noise.
         """
         gap = min(self.occupancy.config.see_through, least or np.inf)
         return ~seen_through(points, views, gap, self.num_threads, label)

@@ -33,7 +33,7 @@ from splatctrl_cli.jobs.batch.suite import read_suite
 from splatctrl_cli.jobs.batch.task import last_lines
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.libraries import distributed
-from splatctrl_cli.report.suites import Case, Kind, Suite, cases_of, damage_case, error_case, skipped_case
+from splatctrl_cli.report.junit import Case, Kind, Suite, cases_of, damage_case, error_case, skipped_case
 
 CONNECT_S = 10.0  # to a scheduler
 

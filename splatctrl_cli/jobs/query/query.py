@@ -49,10 +49,10 @@ _DECIMALS = 7  # of a length [m]: finer than float32
 class Answers:
     """Answers at Q points, world frame: None where no point has one, NaN or -1 where a single point has none.
 
-    in_box (Q,): in the box that was asked; distance (Q,) [m] and its gradient (Q, 3); bound (Q,) [m]: the exact
-    distance to the splats is not less; probability (Q,) of collision; label (Q,) `Label` and splat (Q,), the index in
-    the scene's file, of the nearest sphere; observed (Q,) `VoxelState`; surface (Q, 3) [m], where sphere marching
-    ended, and rest (Q,) [m], what the field reads there.
+    in_box (Q,): in the box that was asked; distance (Q,) [m] and its gradient (Q, 3); bound (Q,) [m]: a lower
+    bound on the exact distance to the splats; probability (Q,) of collision; label (Q,) `Label` and splat (Q,), the
+    index in the scene's file, of the nearest sphere; observed (Q,) `VoxelState`; surface (Q, 3) [m], where sphere
+    marching ended, and rest (Q,) [m], what the field reads there.
     """
 
     in_box: Bool | None = None
@@ -68,7 +68,7 @@ class Answers:
 
 
 class SceneAnswers:
-    """The splats of a scene, and the balls around its occupied voxels without one, as a field by `config`."""
+    """The splats of a scene, and balls around occupied voxels that have no splat, as a field by `config`."""
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class SceneAnswers:
         device: Memory | None = None,
     ) -> None:
         """device: a card that computes the distances. Raises UsageError where unknown space is to count as something:
-        that is a matter of grids.
+        only a grid knows it.
         """
         if config.field.unknown != "free":
             raise UsageError(

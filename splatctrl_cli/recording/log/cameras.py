@@ -335,8 +335,8 @@ def join_pose_topics(
 ) -> None:
     """Add to the tf tree of a survey what pose topics say of its cameras; what is used without being asked is noted.
 
-    A person names topics by camera. Else an odometry is taken whose child is a camera's frame that tf does not know,
-    or whose parent is the world frame asked for. only_first: the first pose alone, enough to see what joins what.
+    A person names topics by camera. Otherwise an odometry is used if tf lacks its child, a camera's frame, or if
+    its parent is the world frame asked for. only_first: the first pose alone, enough to see what joins what.
     Raises InputError where a topic cannot place its camera, and where several odometries could.
     """
     frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
@@ -378,7 +378,7 @@ def _child_of(log: RawLog, survey: Survey, camera: str, given: PoseTopic, frame:
 
 
 def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set[str]) -> dict[str, str]:
-    """The frame that each odometry poses that nothing else places."""
+    """By odometry, the frame that it places, if nothing else places that frame."""
     known = set(survey.tf.frames)
     found: dict[str, str] = {}
     for topic in survey.of_type(ODOMETRY):

@@ -166,7 +166,7 @@ def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> Im
 
     A CameraInfo may describe the rectified images beside the raw ones (image_proc): by a P that is not K, or a topic
     of raw images in the same folder. RealSense's ``image_rect_raw`` is as the lens sees it. Depth is computed in
-    rectified images. Otherwise the two contradict each other.
+    rectified images. Otherwise name and CameraInfo contradict each other.
     """
     says_rectified = not _RECTIFIED.isdisjoint(re.split("[/_]", image_topic.lower()))
     if not is_distorted(calibration.distortion_model, calibration.distortion):
@@ -325,7 +325,7 @@ class _Builder:
             )
 
     def _check_clock(self) -> None:
-        """Raise InputError where a clock went back: one stamp stands for two times then, of images and of tf."""
+        """Raise InputError where a clock went back: then a stamp of images and tf is ambiguous."""
         for name in (self._topics.color, self._topics.depth):
             clock = self._survey.topics[name].clock
             if clock.went_back:

@@ -14,7 +14,7 @@ from junitparser import Error, Failure, JUnitXml, Skipped
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
-from splatctrl_cli.report.suites import (
+from splatctrl_cli.report.junit import (
     Case,
     Kind,
     Suite,
@@ -224,7 +224,7 @@ def test_steps_of_one_summary_share_its_room(tmp_path: Path, monkeypatch: pytest
     file, suites = tmp_path / "summary.md", [suite_of(*[case_of(Kind.FAILED)] * 30)]
     monkeypatch.setenv("GITHUB_ACTIONS", "true")
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(file))
-    monkeypatch.setattr("splatctrl_cli.report.suites.SUMMARY_BYTES", 4000)
+    monkeypatch.setattr("splatctrl_cli.report.junit.SUMMARY_BYTES", 4000)
     file.write_text("what another step wrote\n")
     for _ in range(3):
         tell_github(suites, io.StringIO(), is_fatal=True)
