@@ -9,9 +9,9 @@ import pytest
 
 import splatctrl_cli
 from splatctrl_cli import api
-from tests.cli.conftest import coverage_once, short_sample
+from tests.cli.conftest import short_sample
 
-__all__ = ["coverage_once", "short_sample"]
+__all__ = ["short_sample"]
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "api.md"

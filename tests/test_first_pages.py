@@ -15,11 +15,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from splatctrl_cli.cli.main import main
-from tests.cli.conftest import coverage_once
 from tests.conftest import ROOT
 from tests.test_docs import EXAMPLE, commands_on, shown_after
 
-__all__ = ["coverage_once"]
 README = ROOT / "README.md"
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 

@@ -125,7 +125,7 @@ def coverage_of_solids(
     return _measured(pickle.dumps((bodies, dict(solids), spheres, resolution)))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _measured(packed: bytes) -> CoverageReport:
     """The coverage of rigid bodies, solids and spheres to a resolution, which only bytes make hashable."""
     bodies, solids, spheres, resolution = pickle.loads(packed)

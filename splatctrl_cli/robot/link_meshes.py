@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -129,7 +130,8 @@ def _primitive(shape: Shape) -> Solid:
         vertices, faces = _prism(*shape.size)
         slack = shape.size[0] * (1 - np.cos(np.pi / CYLINDER_SIDES))
     else:
-        vertices, faces, slack = _ball(shape.size[0])
+        corners, faces, gap = _unit_ball()
+        vertices, slack = shape.size[0] * corners, shape.size[0] * gap + 1e-12
     mesh = TriangleMesh(vertices=transform_points(shape.T_link_shape, vertices), faces=faces, is_closed=True)
     ball = (shape.T_link_shape[:3, 3].copy(), shape.size[0]) if shape.kind == "sphere" else None
     return Solid(link=shape.link, surface=mesh, slack=float(slack), body=mesh, ball=ball)
@@ -234,8 +236,9 @@ def _prism(radius: float, length: float) -> tuple[Float64, Index]:
     return vertices, faces.astype(np.int64)
 
 
-def _ball(radius: float) -> tuple[Float64, Index, float]:
-    """A polyhedron with its corners on a sphere, and how far the sphere is from it at most."""
+@cache
+def _unit_ball() -> tuple[Float64, Index, float]:
+    """A polyhedron with its corners on a sphere of radius 1, and how far the sphere is from it at most."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
     corners = axes[np.array(faces)]
@@ -249,4 +252,4 @@ def _ball(radius: float) -> tuple[Float64, Index, float]:
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     height = np.einsum("fa,fa->f", normal, corners[:, 0])  # of each face's plane above the centre
     vertices, inverse = np.unique(corners.reshape(-1, 3).round(12), axis=0, return_inverse=True)
-    return radius * vertices, inverse.reshape(-1, 3).astype(np.int64), radius * float(1 - height.min()) + 1e-12
+    return vertices, inverse.reshape(-1, 3).astype(np.int64), float(1 - height.min())

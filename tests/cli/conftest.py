@@ -1,8 +1,6 @@
 """What replays share."""
 
-from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 from matplotlib.figure import Figure
@@ -10,43 +8,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from splatctrl_cli.jobs.replay import files, inputs, lockstep
 from splatctrl_cli.recording.state import state_source
-from splatctrl_cli.records import SphereSet
-from splatctrl_cli.robot.coverage import CoverageReport
-from splatctrl_cli.robot.link_meshes import Solid
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.urdf import UrdfFile
 from tests.cli.replay_desk import Desk, FakeSource, logged
 from tests.recording.log.make_log import messages_of, write_raw
-
-Solids = dict[str, tuple[Solid, ...]]
-
-
-@pytest.fixture(scope="session", autouse=True)
-def coverage_once() -> Iterator[None]:
-    """Make the solids of each robot of primitive shapes, and measure the coverage of each one's spheres, once for all
-    replays: it takes longer than most of them.
-    """
-    measure, measured = inputs.coverage_of_solids, dict[object, CoverageReport]()
-    read, made = inputs.read_solids, dict[str, Solids]()
-
-    def known(
-        urdf: UrdfFile, solids: Mapping[str, Sequence[Solid]], spheres: SphereSet, **how: Any
-    ) -> CoverageReport:
-        meshes = [(s.link, s.slack, s.surface.corners.tobytes()) for parts in solids.values() for s in parts]
-        key = (urdf.text, repr((how, spheres.links)), spheres.centers.tobytes(), spheres.radii.tobytes(), *meshes)
-        if key not in measured:
-            measured[key] = measure(urdf, solids, spheres, **how)
-        return measured[key]
-
-    def solids(urdf: UrdfFile, folders: Sequence[Path]) -> Solids:
-        if urdf.meshes:
-            return read(urdf, folders)
-        return made.get(urdf.text) or made.setdefault(urdf.text, read(urdf, folders))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(inputs, "coverage_of_solids", known)
-        patch.setattr(inputs, "read_solids", solids)
-        yield
 
 
 @pytest.fixture(scope="session")

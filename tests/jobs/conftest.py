@@ -3,11 +3,11 @@
 import pytest
 
 from splatctrl_cli.robot.model import RobotModel
-from tests.cli.conftest import arm, coverage_once, desk, unpainted, without_plots
+from tests.cli.conftest import arm, desk, unpainted, without_plots
 from tests.cli.replay_desk import Desk
 from tests.jobs.stage import Stage, run
 
-__all__ = ["arm", "coverage_once", "desk", "run", "unpainted", "without_plots"]
+__all__ = ["arm", "desk", "run", "unpainted", "without_plots"]
 
 
 @pytest.fixture
