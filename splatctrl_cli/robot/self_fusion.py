@@ -198,12 +198,10 @@ def _learn_link(
         distance, seen, free = fused.within(run)
         solid = np.where(owner == index, np.maximum(distance, VOXEL - gap), TRUNCATION)
         is_solid = solid < 0
-        its, shown = (
-            (cells[is_solid], seen[:, is_solid]),
-            [(v, k - run.start) for v, k in used if run.start <= k < run.stop],
-        )
+        its = (cells[is_solid], seen[:, is_solid])
+        shown = [(view, k - run.start) for view, k in used if run.start <= k < run.stop]
         stays, moves, is_other = np.zeros((3, len(cells)), bool)
-        stays[is_solid], moves[is_solid] = _stays_in_world(*its, shown, number, poses[run, number])
+        stays[is_solid], moves[is_solid] = _stays_in_world(*its, shown, poses[run, number])
         is_other[is_solid] = _is_on_other_link(surface, number, *its, gap[is_solid], poses[run], reach)
         grid = _without_scene(spread_cells(mask, solid, TRUNCATION), spread_cells(mask, stays, 0) > 0)
         is_elsewhere = spread_cells(mask, is_other | (stays & moves), 0) > 0
@@ -256,12 +254,12 @@ def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: i
 
 
 def _stays_in_world(
-    cells: Float64, seen: Bool, shown: Sequence[tuple[_View, int]], number: int, poses: Float64
+    cells: Float64, seen: Bool, shown: Sequence[tuple[_View, int]], poses: Float64
 ) -> tuple[Bool, Bool]:
-    """Cells (N,) that stay in the world: where they were a surface in one of their configurations (K, N), views of
-    others (`shown`, each with its configuration) show one still, and at least as often as they see through it once
-    the cell is `AWAY`. And cells (N,) that move by `STEP` at all: beside a joint's axis no cell does.
-    T_world_link (K, 4, 4), of the link with that number.
+    """Cells (N,) that stay in the world: once the link has taken a cell `AWAY`, views show a surface where it was at
+    least as often as they see through that place. And cells (N,) that go so far: beside a joint's axis none does.
+    seen (K, N): in which configurations a cell is a surface; shown: each view with its configuration; T_world_link
+    (K, 4, 4).
     """
     places, votes = _moved(poses, cells), np.zeros(len(cells), np.int64)
     for view, k in shown:
@@ -272,7 +270,7 @@ def _stays_in_world(
             is_unexplained = view.links[v // view.stride, u // view.stride] == UNEXPLAINED
             is_surface = is_unexplained & (np.abs(before) <= TRUNCATION)
             votes[asked] += is_surface.astype(np.int64) - (before > TRUNCATION)
-    return votes >= 0, _span(places, seen) >= STEP
+    return votes >= 0, _span(places, seen) >= AWAY
 
 
 def _landing(view: _View, points: Float64, numbers: Index) -> tuple[Index, Index, Index, Float64]:
