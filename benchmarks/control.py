@@ -14,7 +14,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import audit
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.field.distance import make_field
-from splatctrl_cli.field.grid_cells import GridField
+from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.field.unknown import field_splats
 from splatctrl_cli.records import DistanceField, Float64, SplatSet

@@ -12,7 +12,8 @@ from benchmarks.scenes import surface_splats
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.distance import GpdfField, SphereField, make_field
-from splatctrl_cli.field.grid_cells import GridField, GridLayout
+from splatctrl_cli.field.grid_cells import GridLayout
+from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, Float64, SplatSet
 

@@ -27,7 +27,7 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.fixed import BANDS
 from splatctrl_cli.evaluate.field_accuracy import BandAccuracy, band_accuracy
 from splatctrl_cli.field.distance import GpdfField, LogSumExpField, SafeField, SeField, SphereField
-from splatctrl_cli.field.header import median_spacing
+from splatctrl_cli.field.health import median_spacing
 from splatctrl_cli.field.weights import METHODS
 from splatctrl_cli.records import Float64
 

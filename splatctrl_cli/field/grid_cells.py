@@ -1,6 +1,4 @@
-"""Where the cells of a distance grid stand, whether there is room for them, what cameras saw there; and a baked grid
-as a distance field again.
-"""
+"""Where the cells of a distance grid stand, whether there is room for them, and what cameras saw there."""
 
 import math
 from dataclasses import dataclass
@@ -9,10 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.field.clusters import checked_points
-from splatctrl_cli.kernels import field as native
-from splatctrl_cli.records import Bool, Box, DistanceGrid, Float32, Float64, SplatSet, UInt8
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.records import Box, Float64, SplatSet, UInt8
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
 PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
@@ -141,67 +137,3 @@ def observed_planes(
         inside.append(np.flatnonzero(is_inside))
     observed[np.ix_(*inside)] = states[np.ix_(*nodes)]
     return observed
-
-
-class GridField:
-    """Trilinear interpolation between cell centres, and the gradient of that very interpolant.
-
-    Outside the box of the cell centres it reads the value at the nearest point of the box less the distance to it:
-    a lower bound of a distance, so that a robot that leaves the grid reads less clearance, never more.
-    Beside a cell that is NaN (never-seen space under the policy ``nan``) it is NaN, and so is the certified distance.
-    """
-
-    def __init__(self, grid: DistanceGrid, channel: str = "sdf") -> None:
-        """Raises InputError where the channel is not there or the grid has a single cell along an axis."""
-        if channel not in grid.channels:
-            raise InputError(f"distance grid: no channel {channel!r}", remedy=f"it has: {', '.join(grid.channels)}")
-        self._values = np.ascontiguousarray(grid.channels[channel], dtype=np.float32)
-        if self._values.ndim != 3 or min(self._values.shape) < 2:
-            raise InputError(
-                f"distance grid: expected at least 2 cells along each axis, got {self._values.shape}",
-                remedy="bake a larger box or a smaller voxel",
-            )
-        self._has_blank = bool(np.isnan(self._values).any())
-        bound = grid.channels.get("bound")
-        self._bound = None if bound is None else np.ascontiguousarray(bound, dtype=np.float32)
-        self._origin = np.ascontiguousarray(grid.origin, dtype=np.float64)
-        self._voxel = grid.voxel
-        upper = self._origin + grid.voxel * (np.array(self._values.shape) - 1)
-        self.box = Box(lower=self._origin, upper=upper)
-
-    def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m], world -> distance (Q,) [m], gradient (Q, 3), not normalised; NaN beside a NaN cell."""
-        return native.interpolate(self._values, self._origin, self._voxel, checked_points(points))
-
-    def certified(self, points: Float64) -> Float64:
-        """A distance (Q,) [m] that the exact distance to the splats is not below.
-
-        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding: hard is 1-Lipschitz, so this holds
-        whatever interpolation does in between. It certifies the distance to the splats (and to never-seen cells that
-        are obstacles), not to objects. NaN where `query` is. Raises InputError for a grid without the channel bound.
-        """
-        if self._bound is None:
-            raise InputError("distance grid: no channel 'bound'", remedy="bake it with --channels sdf,bound")
-        # The channel holds for a whole cell: at its centre the exact distance is half a diagonal more.
-        lowest = native.lipschitz_bound(self._bound, self._origin, self._voxel, checked_points(points))
-        certified = np.asarray(lowest + HALF_DIAGONAL * self._voxel)
-        if self._has_blank:
-            certified[np.isnan(self.query(points)[0])] = np.nan
-        return certified
-
-    def contains(self, points: Float64) -> Bool:
-        """(Q,) True where a point lies in the box of the cell centres."""
-        return self.box.contains(points)
-
-
-def exact_channel(grid: DistanceGrid) -> Float32:
-    """The exact distance (X, Y, Z) [m] at the cell centres: the channel hard, or bound and its margin together.
-
-    Raises InputError for a grid with neither.
-    """
-    if "hard" in grid.channels:
-        return np.asarray(grid.channels["hard"], dtype=np.float32)
-    margin = grid.header.get("bound_margin")
-    if "bound" not in grid.channels or not isinstance(margin, float):
-        raise InputError("distance grid: no channel 'hard' or 'bound'", remedy="bake it with --channels sdf,bound")
-    return np.asarray(grid.channels["bound"], dtype=np.float32) + np.float32(margin)

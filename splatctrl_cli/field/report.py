@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import NEAR_ONE
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.field.grid_cells import RESOLUTION, exact_channel
+from splatctrl_cli.field.grid_cells import RESOLUTION
+from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.records import DistanceGrid, Float32
 from splatctrl_cli.voxels import VoxelState
 

@@ -13,7 +13,7 @@ from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_names
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.grid_cells import exact_channel
+from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.formats.grid import grid_formats
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter

@@ -16,7 +16,7 @@ from splatctrl_cli.field.distance import (
     march,
     normalised,
 )
-from splatctrl_cli.field.header import planar_zero_level
+from splatctrl_cli.field.health import planar_zero_level
 from splatctrl_cli.records import DistanceField
 from tests.field.scenes import cloud, queries
 from tests.reference import field as reference

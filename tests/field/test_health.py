@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.field.header import FieldHealth, median_spacing
-from splatctrl_cli.field.header import field_health as health_of
+from splatctrl_cli.field.health import FieldHealth, median_spacing
+from splatctrl_cli.field.health import field_health as health_of
 from splatctrl_cli.field.unknown import NO_SPLAT, obstacle_spheres
 from splatctrl_cli.records import Label
 from splatctrl_cli.voxels import Balls

@@ -19,7 +19,8 @@ from splatctrl_cli.control.audit import observed_at
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField, field_over, march
-from splatctrl_cli.field.grid_cells import GridField, check_room
+from splatctrl_cli.field.grid_cells import check_room
+from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.on_device import OnDevice
 from splatctrl_cli.field.probability import make_probability
 from splatctrl_cli.field.unknown import DEFAULT_LABELS, ObstacleSpheres, obstacle_spheres

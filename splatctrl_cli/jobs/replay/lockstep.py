@@ -18,8 +18,8 @@ from splatctrl_cli.files.output import Stopwatch, write_run
 from splatctrl_cli.formats.scene.voxel_file import read_seen, read_unrepresented
 from splatctrl_cli.formats.splat.splats import read_ply
 from splatctrl_cli.jobs.check import refuse_errors
-from splatctrl_cli.jobs.reconstruct.reconstruct import arm_seen
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest
+from splatctrl_cli.jobs.reconstruct.self_model import arm_seen
 from splatctrl_cli.jobs.recordings.open_recording import check_pose_jumps
 from splatctrl_cli.jobs.replay.evidence import EVERY, every_of, trained, training_options
 from splatctrl_cli.jobs.replay.known_scene import (

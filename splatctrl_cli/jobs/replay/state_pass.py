@@ -20,10 +20,10 @@ from splatctrl_cli.control.events import (
     stale_signal,
     step_signals,
 )
+from splatctrl_cli.control.fixed_parts import FixedParts
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
 from splatctrl_cli.control.limits import MotionLimits
 from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace, Seen
-from splatctrl_cli.control.preconditions import FixedParts
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.jobs.replay.hindsight import Hindsight, NewerDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene

@@ -12,7 +12,7 @@ import pytest
 from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.field.distance import SphereField, make_field, march
-from splatctrl_cli.field.grid_cells import GridField
+from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.formats import ply
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.splat.splats import write_ply

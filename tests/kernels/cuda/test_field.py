@@ -9,7 +9,8 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField, SphereField, make_field
-from splatctrl_cli.field.grid_cells import RESOLUTION, GridField, GridLayout
+from splatctrl_cli.field.grid_cells import RESOLUTION, GridLayout
+from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.on_device import OnDevice
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.cuda.field import Choice, DeviceField
