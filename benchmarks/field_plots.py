@@ -23,7 +23,7 @@ SPACING = 0.01  # [m]
 
 @dataclass(frozen=True, kw_only=True)
 class PlanarBias:
-    """What gpdf reads over a dense plane of centres: at heights (40,), beside ``z - l log(1 + z / l)`` [m]."""
+    """Readings of gpdf over a dense plane of centres, at heights (40,), beside ``z - l log(1 + z / l)`` [m]."""
 
     length: float
     heights: list[float]

@@ -341,7 +341,7 @@ class PlannerConfig(Section, section="planner"):
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictConfig(Section, section="verdict"):
-    """What evidence a verdict asks for."""
+    """The evidence that a verdict needs."""
 
     confidence: Annotated[
         float, Within(0.5, 0.999999, "", "of the bound on the map's error, where there is enough evidence for it")

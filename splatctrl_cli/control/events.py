@@ -256,9 +256,7 @@ def first_intervention(events: Sequence[Event]) -> Event | None:
 def audit_signals(
     audit: AuditTrace, margin: float, spheres: Sequence[str], joints: Sequence[str], pairs: Sequence[str] = ()
 ) -> list[Signal]:
-    """What the clearances, limits and known space of T states amount to; pairs: names of what may
-    collide with each other.
-    """
+    """Signals of T audited states: clearance, limits, known space. pairs: names of what may collide."""
     signals = []
     for source, clearance in audit.clearance.items():
         signals += clearance_signals(source, clearance.distance, clearance.sphere, margin, spheres)
@@ -298,7 +296,7 @@ def clearance_signals(
 
 
 def limit_signals(strain: Strain, joints: Sequence[str]) -> list[Signal]:
-    """Where a motion is faster, or changes more suddenly, than its joints may."""
+    """Signals of joint velocity and acceleration above their limits."""
     return [
         Signal(kind=kind, is_on=value > 1, value=value, names_at=OneEach(names=joints, index=joint))
         for kind, value, joint in (
@@ -318,12 +316,12 @@ def interval_signals(lower: Float64, unbounded: Float64, margin: float) -> list[
 
 
 def stale_signal(age_s: Float64, max_age_s: float) -> Signal:
-    """Where the scene in use is older than allowed; age_s (T,) [s], NaN where a scene has no time."""
+    """Signal of a scene older than allowed; age_s (T,) [s], NaN where a scene has no time."""
     return Signal(kind=EventKind.STALE_MAP, is_on=age_s > max_age_s, value=np.nan_to_num(age_s), names_at=_nobody)
 
 
 def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
-    """What the controller did at T states; None where it was not asked."""
+    """Signals of the controller's steps at T states; None where it was not asked."""
 
     def relaxed(i: int) -> Sequence[str]:
         return [row.name for row in sorted(_asked(steps, i).relaxed, key=lambda row: -row.slack)]

@@ -168,7 +168,7 @@ def unsolved(num_variables: int, num_rows: int, status: str) -> QpSolution:
 
 
 class Rung(StrEnum):
-    """How a step came about."""
+    """The program that gave a step, from the best to the last resort."""
 
     SOLVED = "solved"
     RELAXED = "relaxed"
@@ -242,7 +242,7 @@ def descend(
 
 
 def held(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: int) -> Choice:
-    """To hold still, because no solution is usable."""
+    """Hold still: no solution is usable."""
     return Choice(
         velocity=np.zeros(num_joints),
         rung=Rung.HOLD,

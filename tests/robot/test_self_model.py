@@ -12,6 +12,7 @@ from splatctrl_cli.formats.arrays import read_arrays, savez
 from splatctrl_cli.geometry import look_at, pose_at, turn_about_z
 from splatctrl_cli.kernels.triangles import TriangleTree
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
+from splatctrl_cli.robot import self_fusion
 from splatctrl_cli.robot.self_fusion import VOXEL, choose_moments, learn
 from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.surface import RobotSurface
@@ -118,6 +119,18 @@ def test_a_bracket_that_the_urdf_lacks_is_found_within_a_voxel_and_nothing_else_
 @pytest.mark.parametrize("noise", [0.0, 0.003])
 def test_an_arm_as_its_urdf_draws_it_gets_no_parts(noise: float) -> None:
     assert learned(has_bracket=False, noise=noise).pieces() == []
+
+
+def test_a_cable_narrower_than_a_thinned_pixel_is_found_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each fourth pixel says which link is seen; depth is read at each."""
+    monkeypatch.setattr(self_fusion, "WIDE", 80)
+    along = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])
+    cable = Shape(link="arm", kind="capsule", size=(0.005, 0.2), T_link_shape=pose_at((0.2, 0.0, 0.065), along))
+    truth = RobotSurface.from_parts([*shapes(has_bracket=False), cable])
+    ((link, triangles),) = learn(ROBOT, LINKS, *recorded(MOVES, truth)).pieces()
+    assert link == "arm"
+    assert RobotSurface.from_parts([cable]).distance(np.eye(4)[None], triangles.reshape(-1, 3)).max() < 2 * VOXEL
+    assert np.ptp(triangles[..., 0]) > 0.19
 
 
 def test_what_two_fingers_hold_between_them_is_robot() -> None:

@@ -10,6 +10,7 @@ from splatctrl_cli.calibration.displacement import displaced_cameras, placed
 from splatctrl_cli.calibration.evidence import Arm
 from splatctrl_cli.config.fixed import STATES_CLOSE_NS
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.evaluate.verdict import counted
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.formats.arrays import savez
 from splatctrl_cli.geometry import transform_from
@@ -109,5 +110,5 @@ def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> lis
         for item in source.stored()
         if isinstance(item, StoredFrame) and (item.camera, item.stamp_ns) in chosen and arm.is_posed(item.stamp_ns)
     ]
-    progress.log(f"the robot is looked at in {len(frames)} frames of {len(order)} moments")
+    progress.log(f"the robot is looked at in {counted(len(frames), 'frame')} of {counted(len(order), 'moment')}")
     return frames
