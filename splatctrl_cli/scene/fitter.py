@@ -123,7 +123,7 @@ class SceneFitter:
         rays = list(contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn))
         masks = list(map(without_contradicted, masks, rays))
         frames = [without(frame, mask, PixelKind.MIXED) for frame, mask in zip(frames, masks, strict=True)]
-        before = {view.frame.camera: view.frame for view in self.window.newest}
+        before = {frame.camera: (frame, mask.kinds == PixelKind.OBJECT) for frame, mask in self.seen}
         frames, steady = zip(
             *(
                 steadied(frame, before.get(frame.camera), mask.kinds == PixelKind.OBJECT, config)

@@ -1,8 +1,9 @@
 """Whether a recording agrees with itself: cameras on where the surfaces are, and each camera's poses on a path."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
+from math import inf
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from splatctrl_cli.scene.seeding import world_points_at
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
     """How far apart two cameras place the surfaces that both see: median and lower quartile of |dz| [m], at `depth`
-    [m], over `num_pixels`.
+    [m], over `num_pixels`. detour [m]: the least sum of medians by way of a third camera.
     """
 
     cameras: tuple[str, str]
@@ -23,6 +24,7 @@ class Agreement:
     quartile: float
     depth: float
     num_pixels: int
+    detour: float = inf
 
     @property
     def limit(self) -> float:
@@ -31,12 +33,13 @@ class Agreement:
 
     @property
     def holds(self) -> bool:
-        """False where the median is above the limit and the quartile above half of it.
+        """False where the median and the detour are above the limit, and the quartile above half of it.
 
-        The quartile keeps good cameras from failing on what only looks like one surface, front and back of a thin
-        thing seen from both sides: where poses are off, no share of the pixels agrees.
+        Quartile and detour keep good cameras from failing on what only looks like one surface, front and back of a
+        thin thing seen from both sides: where poses are off, no share of the pixels agrees, and no third camera
+        agrees with both.
         """
-        return self.median <= self.limit or self.quartile <= 0.5 * self.limit
+        return min(self.median, self.detour) <= self.limit or self.quartile <= 0.5 * self.limit
 
 
 CAUSES = (
@@ -50,14 +53,21 @@ def agreements(frames: Sequence[RgbdFrame], min_range: float, max_range: float) 
 
     Views of one and the same camera are compared, too. Depth counts from `min_range` to `max_range` [m].
     """
-    pairs = spread(list(combinations(range(len(frames)), 2)), fixed.PAIR_MOST)
+    chosen = spread(list(combinations(range(len(frames)), 2)), fixed.PAIR_MOST)
     found: dict[tuple[str, str], list[Float64]] = {}
-    for i, j in pairs:
+    for i, j in chosen:
         a, b = sorted((frames[i], frames[j]), key=lambda frame: frame.camera)
         both = [differences(a, b, min_range, max_range), differences(b, a, min_range, max_range)]
         found.setdefault((a.camera, b.camera), []).extend(both)
     rows = {cameras: np.concatenate(parts) for cameras, parts in sorted(found.items())}
-    return [_agreement(cameras, row) for cameras, row in rows.items() if len(row) >= fixed.PAIR_MIN_PIXELS]
+    pairs = [_agreement(cameras, row) for cameras, row in rows.items() if len(row) >= fixed.PAIR_MIN_PIXELS]
+    return [replace(pair, detour=_detour(pair.cameras, pairs)) for pair in pairs]
+
+
+def _detour(ends: tuple[str, str], pairs: Sequence[Agreement]) -> float:
+    medians = {frozenset(pair.cameras): pair.median for pair in pairs}
+    others = {camera for pair in pairs for camera in pair.cameras} - {*ends}
+    return min((sum(medians.get(frozenset({end, other}), inf) for end in ends) for other in others), default=inf)
 
 
 def _agreement(cameras: tuple[str, str], rows: Float64) -> Agreement:

@@ -47,6 +47,20 @@ def test_what_only_some_pixels_disagree_on_is_no_wrong_pose() -> None:
     assert Agreement(median=0.08, quartile=0.06, depth=3.0, **values).holds
 
 
+def test_cameras_that_agree_with_a_third_see_two_sides_of_things_of_each_other() -> None:
+    values = {"cameras": ("a", "b"), "num_pixels": 900, "depth": 0.8, "median": 0.1, "quartile": 0.1}
+    assert Agreement(detour=0.9 * PAIR_LIMIT, **values).holds
+    assert not Agreement(detour=1.1 * PAIR_LIMIT, **values).holds
+    three = [*views(z=0.02), moved(frame(block=0.2, x=0.0, camera="cam2"), z=0.012)]
+    detours = {pair.cameras: pair.detour for pair in agreements(three, *RANGE)}
+    assert detours == {
+        ("cam0", "cam1"): pytest.approx(0.02, abs=1e-6),
+        ("cam0", "cam2"): pytest.approx(0.028, abs=1e-6),
+        ("cam1", "cam2"): pytest.approx(0.032, abs=1e-6),
+    }
+    assert [pair.detour for pair in agreements(views(), *RANGE)] == [np.inf]
+
+
 def test_too_few_common_pixels_say_nothing() -> None:
     assert agreements(views(x=5.0, z=0.5), *RANGE) == []
     assert agreements(views()[:1], *RANGE) == []

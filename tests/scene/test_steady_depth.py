@@ -32,11 +32,12 @@ def noisy(z: float, rng: np.random.Generator) -> Float32:
 
 
 def after(depths: list[Float32]) -> Float32:
-    before = None
+    shown = None
     for depth in depths:
-        before, _ = steadied(frame_of(depth), before, EVERYWHERE, SENSOR)
-    assert before is not None
-    return before.depth
+        before = None if shown is None else (shown, EVERYWHERE)
+        shown, _ = steadied(frame_of(depth), before, EVERYWHERE, SENSOR)
+    assert shown is not None
+    return shown.depth
 
 
 def test_noise_of_what_stands_still_falls_to_the_gains_share() -> None:
@@ -64,19 +65,30 @@ def test_a_thing_that_comes_is_there_in_its_first_frame() -> None:
 
 def test_a_camera_that_moved_and_a_robots_pixels_keep_what_they_measured() -> None:
     still, now = np.full((120, 160), 1.0, np.float32), np.full((120, 160), 1.002, np.float32)
-    moved, steady = steadied(frame_of(now, x=0.001), frame_of(still), EVERYWHERE, SENSOR)
+    moved, steady = steadied(frame_of(now, x=0.001), (frame_of(still), EVERYWHERE), EVERYWHERE, SENSOR)
     np.testing.assert_array_equal(moved.depth, now)
     assert steady.all()  # nobody can say, and its measurements count
-    of_robot, steady = steadied(frame_of(now), frame_of(still), ~EVERYWHERE, SENSOR)
+    of_robot, steady = steadied(frame_of(now), (frame_of(still), EVERYWHERE), ~EVERYWHERE, SENSOR)
     np.testing.assert_array_equal(of_robot.depth, now)
     assert not steady.any()
     small = replace(frame_of(still), depth=np.zeros((60, 80), np.float32))
-    np.testing.assert_array_equal(steadied(frame_of(now), small, EVERYWHERE, SENSOR)[0].depth, now)
+    np.testing.assert_array_equal(
+        steadied(frame_of(now), (small, EVERYWHERE[::2, ::2]), EVERYWHERE, SENSOR)[0].depth, now
+    )
+
+
+def test_a_surface_that_the_robot_bares_is_where_it_is_measured_not_halfway_to_the_robot() -> None:
+    robot, table = np.full((120, 160), 1.0, np.float32), np.full((120, 160), 1.004, np.float32)
+    was_object = EVERYWHERE.copy()
+    was_object[:, 80:] = False
+    shown, steady = steadied(frame_of(table), (frame_of(robot), was_object), EVERYWHERE, SENSOR)
+    np.testing.assert_array_equal(shown.depth[:, 80:], table[:, 80:])
+    np.testing.assert_array_equal(steady, was_object)
 
 
 def test_what_had_no_depth_before_keeps_what_is_measured_now() -> None:
     before, now = np.zeros((120, 160), np.float32), np.full((120, 160), 0.002, np.float32)
-    shown, steady = steadied(frame_of(now), frame_of(before), EVERYWHERE, SENSOR)
+    shown, steady = steadied(frame_of(now), (frame_of(before), EVERYWHERE), EVERYWHERE, SENSOR)
     np.testing.assert_array_equal(shown.depth, now)
     assert not steady.any()
 
@@ -86,6 +98,6 @@ def test_what_a_camera_measures_first_is_not_steady_and_what_stays_is() -> None:
     now[40:60, 60:90] = 0.95
     first, steady = steadied(frame_of(still), None, EVERYWHERE, SENSOR)
     assert not steady.any()
-    second, steady = steadied(frame_of(now), first, EVERYWHERE, SENSOR)
+    second, steady = steadied(frame_of(now), (first, EVERYWHERE), EVERYWHERE, SENSOR)
     np.testing.assert_array_equal(steady, now == 1.0)
-    assert steadied(frame_of(now), second, EVERYWHERE, SENSOR)[1].all()
+    assert steadied(frame_of(now), (second, EVERYWHERE), EVERYWHERE, SENSOR)[1].all()
