@@ -17,8 +17,8 @@ def steadied(
 
     A pixel of objects (H, W) is steady where it shows the same surface as before, and its depth is the mean. That is
     where it was an object's before, where its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2, and
-    the depths about it by at most `STEADY_MOVED` `depth_error` z^2 on average. A surface that moves along the ray lags
-    by no more than the latter. The mean of the robot's surface and of what it bares would lie in the air between them.
+    the depths about it by at most `STEADY_MOVED` `depth_error` z^2 on average. A surface that moves along the ray
+    lags by no more than the latter. The mean of the robot's surface and of what it bares would lie in mid-air.
 
     before: the camera's last frame, averaged in the same way, and its pixels of objects; without it no pixel is
     steady. Once the camera has moved its frames cannot be compared: the depth stays as it is, and all pixels count as
