@@ -28,7 +28,7 @@ from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_con
 from splatctrl_cli.scene.contradicted import contradicted, without_contradicted
 from splatctrl_cli.scene.depth_holes import lost_edges, unanswered_points
 from splatctrl_cli.scene.descent import Descent
-from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, seen_through
+from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, on_surface, seen_through
 from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
@@ -420,14 +420,15 @@ class SceneFitter:
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _keep_to_surface(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> None:
-        """Shrink objects' splats near the robot until they stay within what depth shows, down to half of
-        `contact_radius`; splats that no pixel shows get that radius at once.
+        """Put objects' splats near the robot on what depth shows, and shrink them until they stay within it, down to
+        half of `contact_radius`; splats that no pixel shows get that radius at once.
         """
         if robot is None:
             return
         config, least = self.occupancy.config, 0.5 * self.config.contact_radius
         slots = np.flatnonzero(self._standing_for(Label.OBJECT))
         slots = slots[robot.distance(self.buffer.centers[slots]) < ROBOT_REACH]
+        self.buffer.centers[slots] = on_surface(self.buffer.centers[slots], views, config.see_through)
         error = max((mask.reach - config.self_mask_tolerance for _, mask in seen if mask.reach), default=0.0)
         radii = kept_radii(
             self.buffer.centers[slots], self.buffer.radii[slots], views, error, least, self.num_threads

@@ -13,6 +13,7 @@ from splatctrl_cli.kernels.raster import TargetView
 from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame
 from splatctrl_cli.scene.removal import least_around, nearest_depth
 from splatctrl_cli.scene.render import camera_array
+from splatctrl_cli.scene.self_mask import pixels_at
 
 _STEPS = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)], np.float32) - 1
 DIRECTIONS = _STEPS / np.linalg.norm(_STEPS, axis=1, keepdims=True)  # (26, 3), of the points of a sphere's edge
@@ -77,6 +78,23 @@ def seen_through(
     cameras = [view.camera for view in views]
     nearest = [view.nearest if label == Label.ROBOT else view.nearest_object for view in views]
     return points.seen_through(centers, cameras, nearest, tolerance, num_threads)
+
+
+def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
+    """Centres (N, 3) [m] without those that float: one goes back along a ray to the least depth of the next pixels,
+    where every view that it is not hidden from sees it before that, by up to `most` [m]; by the smallest such step.
+    """
+    least, towards = np.full(len(centers), np.inf, np.float32), np.zeros_like(centers)
+    for view in views:
+        pixel, z = pixels_at(view.frame, centers)
+        depth = least_around(np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)), 1).ravel()[pixel]
+        step = np.where((pixel >= 0) & (depth >= z - most), depth - z, np.inf).astype(np.float32)
+        is_less = step < least
+        least[is_less] = step[is_less]
+        ray = centers[is_less] - view.frame.T_world_camera[:3, 3]
+        towards[is_less] = ray / z[is_less, None]
+    is_off = (least > 0) & (least <= most)
+    return np.asarray(centers + np.where(is_off, least, np.float32(0.0))[:, None] * towards, np.float32)
 
 
 def kept_radii(

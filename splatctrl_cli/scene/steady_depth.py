@@ -15,10 +15,10 @@ def steadied(
 ) -> tuple[RgbdFrame, Bool]:
     """The frame with a running mean of its depth, and its steady pixels (H, W).
 
-    A pixel of objects (H, W) is steady where it shows the same surface as before, and its depth is the mean. That is
-    where it was an object's before, where its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2, and
-    the depths about it by at most `STEADY_MOVED` `depth_error` z^2 on average. A surface that moves along the ray
-    lags by no more than the latter. The mean of the robot's surface and of what it bares would lie in mid-air.
+    A pixel of objects (H, W) is steady where it shows the same surface as before: where its depth z [m] changed by at
+    most `STEADY_SIGMAS` `depth_error` z^2, and the depths about it by at most `STEADY_MOVED` `depth_error` z^2 on
+    average. A surface that moves along the ray lags by no more than the latter. Its depth becomes the mean if it was
+    an object's before, too: the mean of the robot's surface and of what it bares would lie in mid-air.
 
     before: the camera's last frame, averaged in the same way, and its pixels of objects; without it no pixel is
     steady. Once the camera has moved its frames cannot be compared: the depth stays as it is, and all pixels count as
@@ -31,10 +31,10 @@ def steadied(
         return frame, np.ones(frame.depth.shape, bool)
     offset = frame.depth - earlier.depth
     error = config.depth_error * frame.depth**2
-    is_same = is_object & was_object & (earlier.depth > 0) & (np.abs(offset) <= STEADY_SIGMAS * error)
+    is_same = is_object & (earlier.depth > 0) & (np.abs(offset) <= STEADY_SIGMAS * error)
     side = 2 * round(frame.intrinsics.width / MASK_EDGE) + 1
     weight = is_same.astype(np.float32)
     total, num = (cv2.boxFilter(image, -1, (side, side), normalize=False) for image in (weight * offset, weight))
     is_same &= np.abs(total) <= STEADY_MOVED * error * num
-    depth = np.where(is_same, earlier.depth + np.float32(STEADY_GAIN) * offset, frame.depth)
+    depth = np.where(is_same & was_object, earlier.depth + np.float32(STEADY_GAIN) * offset, frame.depth)
     return replace(frame, depth=depth), np.asarray(is_same)

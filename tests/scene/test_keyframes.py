@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view
+from splatctrl_cli.scene.keyframes import View, Window, kept_radii, make_view, on_surface
+from splatctrl_cli.scene.self_mask import pixels_at
 from tests.scene.wall import frame
 
 CONFIG = SceneConfig(window=3)
@@ -86,3 +87,31 @@ def test_a_sphere_sticks_out_of_what_depth_shows_by_the_sensors_error_at_most() 
     assert 0.01 < kept[2] < 0.028  # at its side, where the next pixel is 1 cm away
     assert kept[3] == kept[4] == np.float32(0.03)
     assert (kept_radii(centers, np.full(5, 0.003, np.float32), [view], 0.004, 0.005) == np.float32(0.003)).all()
+
+
+def test_a_centre_in_the_air_goes_back_onto_what_every_camera_sees_behind_it() -> None:
+    """Above the floor, beneath it, far out in the air, and where no camera looks."""
+    views = [view(0, x=x) for x in (-0.1, 0.15)]
+    centers = np.float32([[0.2, 0.1, 0.012], [0.2, 0.1, -0.012], [0.2, 0.1, 0.05], [9.0, 0.0, 0.012]])
+    put = on_surface(centers, views, 0.02)
+    assert abs(put[0, 2]) < 1e-4
+    np.testing.assert_array_equal(put[1:], centers[1:])
+    np.testing.assert_allclose(put[0, :2], centers[0, :2], atol=0.012)
+
+
+def test_a_centre_that_one_camera_sees_on_a_surface_stays() -> None:
+    """A post's side is before the floor for the camera above it, and on the post for the one beside it."""
+    above, beside = view(0), view(0, x=0.1)
+    center = np.float32([[0.2, 0.1, 0.012]])
+    beside.frame.depth[:] = pixels_at(beside.frame, center)[1]
+    np.testing.assert_array_equal(on_surface(center, [above, beside], 0.02), center)
+    beside.frame.depth[:] = pixels_at(beside.frame, center)[1] - 0.03  # hidden: it does not see the place
+    assert abs(on_surface(center, [above, beside], 0.02)[0, 2]) < 1e-4
+
+
+def test_a_centre_beside_a_step_of_depth_stays_with_the_nearer_surface() -> None:
+    seen = view(0)
+    center = np.float32([[0.2, 0.1, 0.012]])
+    pixel, z = pixels_at(seen.frame, center)
+    seen.frame.depth.reshape(-1)[pixel + 1] = z
+    np.testing.assert_array_equal(on_surface(center, [seen], 0.02), center)

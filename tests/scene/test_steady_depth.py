@@ -83,7 +83,8 @@ def test_a_surface_that_the_robot_bares_is_where_it_is_measured_not_halfway_to_t
     was_object[:, 80:] = False
     shown, steady = steadied(frame_of(table), (frame_of(robot), was_object), EVERYWHERE, SENSOR)
     np.testing.assert_array_equal(shown.depth[:, 80:], table[:, 80:])
-    np.testing.assert_array_equal(steady, was_object)
+    assert (shown.depth[:, :80] < 1.002).all()
+    assert steady.all()  # it may be what touches the robot
 
 
 def test_what_had_no_depth_before_keeps_what_is_measured_now() -> None:
