@@ -41,6 +41,7 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
     for camera, edges in fitter.occupancy.edges.items():
         arrays[f"edges/{camera}"] = np.column_stack([edges.centers, edges.radii])
     arrays["refined"] = _refined_array(fitter.refined)
+    arrays |= {f"objects/{camera}": pixels for camera, pixels in fitter.objects.items()}
     arrays |= {f"mounted/{camera}": mask for camera, mask in fitter.mounted.items()}
     if fitter.shell is not None:
         arrays |= {f"shell/{name}": array for name, array in fitter.shell.arrays().items()}
@@ -78,8 +79,10 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
         if name.startswith("edges/")
     }
     fitter.refined = _refined(arrays["refined"])
-    masks = {name.removeprefix("mounted/"): array for name, array in arrays.items() if name.startswith("mounted/")}
-    fitter.mounted = {camera: np.asarray(mask, bool) for camera, mask in masks.items()}
+    fitter.mounted, fitter.objects = (
+        {name.removeprefix(kind): np.asarray(mask, bool) for name, mask in arrays.items() if name.startswith(kind)}
+        for kind in ("mounted/", "objects/")
+    )
     if fitter.shell is not None:
         fitter.shell.restore({name.removeprefix("shell/"): a for name, a in arrays.items() if name[:6] == "shell/"})
     if "background" in arrays:

@@ -106,6 +106,7 @@ class SceneFitter:
         self._unrepresented: Balls | None = None
         self.bare: Balls | None = None  # of the last time step, before some were left out
         self.seen: Seen = ()  # frames of the last time step, as its newest views have them, with their masks
+        self.objects: dict[str, Bool] = {}  # by camera, pixels (H, W) of its newest frame that show objects
 
     def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
         """Take in the frames of one time step: integrate, remove, add or relocate, optimise, label."""
@@ -123,11 +124,14 @@ class SceneFitter:
         rays = list(contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn))
         masks = list(map(without_contradicted, masks, rays))
         frames = [without(frame, mask, PixelKind.MIXED) for frame, mask in zip(frames, masks, strict=True)]
-        before = {frame.camera: (frame, mask.kinds == PixelKind.OBJECT) for frame, mask in self.seen}
+        known = {view.frame.camera: view.frame for view in self.window.newest if view.frame.camera in self.objects}
+        before = {camera: (frame, self.objects[camera]) for camera, frame in known.items()}
+        objects = [mask.kinds == PixelKind.OBJECT for mask in masks]
+        self.objects |= {frame.camera: pixels for frame, pixels in zip(frames, objects, strict=True)}
         frames, steady = zip(
             *(
-                steadied(frame, before.get(frame.camera), mask.kinds == PixelKind.OBJECT, config)
-                for frame, mask in zip(frames, masks, strict=True)
+                steadied(frame, before.get(frame.camera), pixels, config)
+                for frame, pixels in zip(frames, objects, strict=True)
             ),
             strict=True,
         )

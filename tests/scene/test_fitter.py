@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import SEED_ASKED_VIEWS
+from splatctrl_cli.config.fixed import SEED_ASKED_VIEWS, STEADY_GAIN
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.records import Label, PointCloud, SplatSet, spread
@@ -85,6 +85,22 @@ def test_a_restored_fitter_goes_on_to_the_same_bytes() -> None:
     a, b = fitter_state(straight), fitter_state(second)
     assert a.keys() == b.keys()
     assert all(a[name].tobytes() == b[name].tobytes() for name in a)
+
+
+def test_depth_is_averaged_for_cameras_that_take_turns_and_after_a_restart() -> None:
+    """Each time step has one camera's frame; the second of each camera is 1 mm farther than its first."""
+    target, resumed = fitter(), fitter()
+    for k in range(4):
+        seen = frame(50_000_000 * k, x=0.1 * (-1) ** k, camera=f"cam{k % 2}")
+        seen.depth[:] += 0.001 * (k // 2)
+        if k == 3:
+            restore_fitter(resumed, fitter_state(target))
+            resumed.step([seen])
+        target.step([seen])
+    for one in (target, resumed):
+        newest = {view.frame.camera: view.frame.depth for view in one.window.newest}
+        for depth in (newest["cam0"], newest["cam1"]):
+            np.testing.assert_allclose(depth, 1.0 + STEADY_GAIN * 0.001, atol=1e-6)
 
 
 def test_the_budget_is_never_exceeded_and_the_audit_adds_up() -> None:
