@@ -18,6 +18,7 @@ from splatctrl_cli.scene.keyframes import kept_radii
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.seeding import world_points
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask
+from splatctrl_cli.scene.steady_depth import steadied
 from tests.scene.test_labels import VISITOR, ball, seen_with, splats_at
 from tests.scene.wall import WORKSPACE, frame
 
@@ -104,6 +105,43 @@ def test_near_the_robot_no_splat_reaches_past_the_surface_that_depth_shows() -> 
     assert (radii > least).any() and (radii == np.float32(least)).sum() > 5
     error = self_mask(view, robot, config).reach - config.self_mask_tolerance
     assert (kept_radii(centers, radii, [target.view(view)], error, least) == radii).all()
+
+
+def test_splats_that_the_descent_lifts_near_the_robot_go_back_onto_the_surface(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    target, robot, view = robot_over_the_floor()
+    own = target.descent.run
+    lifted: list[int] = []
+
+    def lifting(*given: Any, **named: Any) -> Any:
+        terms = own(*given, **named)
+        lifted.extend(np.flatnonzero(target.buffer.is_alive & (np.hypot(*target.buffer.centers[:, :2].T) > 0.2)))
+        target.buffer.centers[lifted, 2] = 0.01
+        return terms
+
+    monkeypatch.setattr(target.descent, "run", lifting)
+    target.step([view], robot)
+    centers = target.buffer.centers[lifted][target.buffer.is_alive[lifted]]
+    is_near = robot.distance(centers) < ROBOT_REACH - 0.02
+    assert is_near.any() and np.abs(centers[is_near, 2]).max() < 1e-4
+    assert np.median(centers[robot.distance(centers) > ROBOT_REACH, 2]) == np.float32(0.01)
+
+
+def test_what_was_the_robots_before_is_told_to_the_running_mean_of_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    target, robot, view = robot_over_the_floor()
+    target.step([view], robot)
+    shown = target.seen[0][1].kinds
+    assert (shown == PixelKind.ROBOT).any()
+    before: list[Any] = []
+
+    def spy(now: RgbdFrame, last: Any, *rest: Any) -> Any:
+        before.append(last)
+        return steadied(now, last, *rest)
+
+    monkeypatch.setattr(fitter_module, "steadied", spy)
+    target.step([view], robot)
+    np.testing.assert_array_equal(before[0][1], shown == PixelKind.OBJECT)
 
 
 def test_a_splat_that_the_descent_moves_behind_the_robot_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
