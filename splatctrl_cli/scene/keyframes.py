@@ -81,8 +81,11 @@ def seen_through(
 
 
 def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
-    """Centres (N, 3) [m] without those that float: one goes back along a ray to the least depth of the next pixels,
-    where every view that it is not hidden from sees it before that, by up to `most` [m]; by the smallest such step.
+    """Centres (N, 3) [m], world, of which those that float up to `most` [m] lie on the measured surface.
+
+    A centre floats where every view that sees its place measures a greater depth at its pixel and the next ones. It
+    goes back along the ray of the view with the smallest step, to the least of these depths. A view that measures a
+    depth more than `most` before the centre does not see its place.
     """
     least, towards = np.full(len(centers), np.inf, np.float32), np.zeros_like(centers)
     for view in views:
