@@ -156,7 +156,7 @@ class SceneFitter:
             self.occupancy.label_robot(robot.centers, robot.radii, pixels)
             self.occupancy.forget_hidden(robot.centers, robot.radii, robot.distance)
             explain_unseen(self.occupancy, seen, robot)
-        removed = self._remove(relabel(self.buffer, self.occupancy, robot, seen), self._floating(views))
+        removed = self._remove(self._relabel(robot, seen), self._floating(views))
         filled = self._seed(views, masks)
         is_first = self.descent.num_iterations == 0 and bool(self.buffer.is_alive.any())
         self.window.advance(views)
@@ -296,9 +296,13 @@ class SceneFitter:
             is_floating[slots] = ~self._is_grounded(self.buffer.centers[slots], views, label)
         return is_floating
 
+    def _relabel(self, robot: RobotPosture | None, seen: Seen) -> Bool:
+        """Label all splats anew; returns trails (M,). One that turns from robot to object gets the least radius."""
+        return relabel(self.buffer, self.occupancy, robot, seen, 0.5 * self.config.contact_radius)
+
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
         """Remove what the optimiser moved off the robot, into the air or out, or made faint; counts in `removed`."""
-        drifted = relabel(self.buffer, self.occupancy, robot, seen)
+        drifted = self._relabel(robot, seen)
         self.buffer.kill(drifted)
         floating = self._floating(views)
         self.buffer.kill(floating)

@@ -16,11 +16,14 @@ from splatctrl_cli.voxels import SOLID
 Seen = Sequence[tuple[RgbdFrame, SelfMask]]
 
 
-def relabel(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture | None, seen: Seen = ()) -> Bool:
+def relabel(
+    buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture | None, seen: Seen = (), least: float = np.inf
+) -> Bool:
     """Label the splats anew; returns those (M,) that were robot or human and now are objects: trails.
 
     Without a posture the robot's splats keep their label. A splat that the robot's pixels show is the robot's,
-    whatever a mask of people says. One of the robot's that measured depth shows to be an object stays: no trail.
+    whatever a mask of people says. One of the robot's that measured depth shows to be an object stays: no trail. Its
+    radius becomes `least` [m] at most, because no object's depth has bounded it.
     """
     labels = np.where(human_splats(buffer, occupancy), np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
     if robot is None:
@@ -31,6 +34,8 @@ def relabel(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture | 
         labels[is_robot] = Label.ROBOT
     was_robot = buffer.labels == Label.ROBOT
     is_trail: Bool = (buffer.labels != Label.OBJECT) & (labels == Label.OBJECT) & ~(was_robot & is_shown)
+    turned = np.flatnonzero(was_robot & is_shown & (labels != Label.ROBOT))
+    buffer.set_radius(turned, np.minimum(buffer.radii[turned], np.float32(least)))
     buffer.labels[:] = labels
     return is_trail
 

@@ -107,6 +107,26 @@ def test_near_the_robot_no_splat_reaches_past_the_surface_that_depth_shows() -> 
     assert (kept_radii(centers, radii, [target.view(view)], error, least) == radii).all()
 
 
+def test_a_splat_of_the_robot_that_depth_shows_to_be_the_floor_is_small_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    target, robot, view = robot_over_the_floor()
+    target.step([view], robot)
+    buffer, own = target.buffer, target.descent.run
+    turned = np.flatnonzero(buffer.is_alive & (np.abs(np.hypot(*buffer.centers[:, :2].T) - 0.2) < 0.02))
+    buffer.labels[turned] = Label.ROBOT
+    buffer.set_radius(turned, 0.02)
+    radii: list[float] = []
+
+    def noting(*given: Any, **named: Any) -> Any:
+        radii.extend(buffer.radii[turned[buffer.labels[turned] == Label.OBJECT]])
+        return own(*given, **named)
+
+    monkeypatch.setattr(target.descent, "run", noting)
+    target.step([view], robot)
+    assert len(radii) > 3 and np.allclose(radii, 0.5 * CONFIG.contact_radius)
+
+
 def test_splats_that_the_descent_lifts_near_the_robot_go_back_onto_the_surface(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -255,9 +255,12 @@ def test_an_object_that_arrives_before_the_robot_takes_its_splats_with_measured_
     view = seen_with(robot, lift=0.03)
     slots = splats_at((0.0, 0.0, 0.43), (0.0, 0.0, 0.4))
     slots.labels[:2] = Label.ROBOT
-    is_trail = relabel(slots, grid_of(view), robot, [(view, self_mask(view, robot, OccupancyConfig()))])
+    slots.set_radius(np.arange(2), 0.02)
+    seen = [(view, self_mask(view, robot, OccupancyConfig()))]
+    is_trail = relabel(slots, grid_of(view), robot, seen, 0.005)
     assert slots.labels[:2].tolist() == [Label.OBJECT, Label.ROBOT]
     assert not is_trail.any()
+    np.testing.assert_allclose(slots.radii[:2], [0.005, 0.02], rtol=1e-6)
 
 
 def labelled(grid: OccupancyMap, robot: RobotPosture, view: RgbdFrame) -> None:
