@@ -53,6 +53,18 @@ def distance_to(primitives: Sequence[Primitive], points_world: Float64, stamp_ns
     return closest_of(primitives, points_world, stamp_ns)[0]
 
 
+def distance_along(primitives: Sequence[Primitive], points_world: Float64, stamps: Stamps) -> Float64:
+    """Signed distance (T, Q) [m] of points (T, Q, 3) to what is present at each of stamps (T,) [ns]."""
+    distance = np.full(points_world.shape[:2], np.inf)
+    for primitive in primitives:
+        present = np.flatnonzero([primitive.is_present(int(stamp)) for stamp in stamps])
+        for at in np.split(present, len(present)) if primitive.track is not None and len(present) else [present]:
+            if len(at):
+                near, _ = closest_point(primitive.at(int(stamps[at[0]])), points_world[at].reshape(-1, 3))
+                distance[at] = np.minimum(distance[at], near.reshape(len(at), -1))
+    return distance
+
+
 def closest_of(primitives: Sequence[Primitive], points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
     """Signed distance (Q,) [m] and surface point (Q, 3) of the nearest present primitive (inf, NaN where none)."""
     points = np.asarray(points_world, dtype=np.float64)

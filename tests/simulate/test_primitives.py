@@ -1,13 +1,27 @@
 """Primitives: distances with known answers, and against each other (rays, surface points, dense sampling)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import look_at, transform_points
+from splatctrl_cli.geometry import look_at, pose_at, transform_points
 from splatctrl_cli.records import Float64
-from splatctrl_cli.simulate.primitives import Primitive, Texture, Track, closest_point, hit, normals, signed_distance
+from splatctrl_cli.simulate import tabletop
+from splatctrl_cli.simulate.primitives import (
+    ALWAYS,
+    Primitive,
+    Texture,
+    Track,
+    closest_point,
+    hit,
+    normals,
+    signed_distance,
+)
+from splatctrl_cli.simulate.recording import START_NS
+from splatctrl_cli.simulate.truth import distance_along, distance_to
 
 PLAIN = Texture(pattern="noise", feature=0.1, dark=(0, 0, 0), bright=(1, 1, 1))
 TILTED = look_at([0.3, -0.2, 0.5], [1.0, 0.4, 0.1])
@@ -187,3 +201,15 @@ def test_a_track_without_order_is_refused() -> None:
         Track(stamp_ns=np.array([5, 5], dtype=np.int64), T_world_shape=np.stack([np.eye(4)] * 2))
     with pytest.raises(InputError, match="a pose for every stamp, got 1 for 2"):
         Track(stamp_ns=np.array([5, 6], dtype=np.int64), T_world_shape=np.eye(4)[None])
+
+
+def test_distance_along_a_motion_is_that_at_each_of_its_stamps() -> None:
+    stamps = START_NS + np.linspace(0, 7e9, 15).astype(np.int64)
+    points = np.random.default_rng(0).uniform(-0.5, 1.0, (15, 40, 3))
+    visitor = tabletop.visitor(int(stamps[5]), int(stamps[9]), (0.4, 0.2, 0.06))
+    poses = np.stack([visitor.T_world_shape, pose_at([0.8, 0.0, 0.1])])
+    moved = replace(visitor, from_ns=ALWAYS[0], track=Track(stamp_ns=stamps[[3, 12]], T_world_shape=poses))
+    primitives = [*tabletop.things(), visitor, moved]
+    expected = [distance_to(primitives, *at) for at in zip(points, stamps.tolist(), strict=True)]
+    np.testing.assert_array_equal(distance_along(primitives, points, stamps), expected)
+    assert np.isinf(distance_along([visitor], points, stamps)[[0, -1]]).all()

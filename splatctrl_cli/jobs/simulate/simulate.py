@@ -36,7 +36,7 @@ from splatctrl_cli.simulate.arm import SHAPES, SLIM, Motion, arm_spheres_yaml, a
 from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, luminance_std
 from splatctrl_cli.simulate.recording import START_NS, Recording, RecordingOptions, Scene
 from splatctrl_cli.simulate.tabletop import object_mask, turntable_views
-from splatctrl_cli.simulate.truth import Truth, distance_to, truth_document
+from splatctrl_cli.simulate.truth import Truth, distance_along, truth_document
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -354,10 +354,8 @@ def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) 
     positions = np.array([leg.at(second)[0] for second in seconds])
     centers = model.sphere_centers_batch(positions)
     moving = model.moving_spheres
-    radii, least = model.sphere_set.radii[moving], np.inf
-    for second, points in zip(seconds, centers[:, moving], strict=True):
-        gap = distance_to(solids, points, START_NS + round(second * 1e9)) - radii
-        least = min(least, float(gap.min()))
+    stamps = START_NS + np.rint(seconds * 1e9).astype(np.int64)
+    least = float((distance_along(solids, centers[:, moving], stamps) - model.sphere_set.radii[moving]).min())
     if least <= 0 or np.any(surfaces.gaps(positions, centers, 0.0) < 0):
         return np.inf
     shortfall = max(0.0, fixed.SIMULATED_CLEARANCE - least) / fixed.SIMULATED_CLEARANCE
