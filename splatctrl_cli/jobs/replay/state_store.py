@@ -1,4 +1,4 @@
-"""What a replay keeps of its states: columns and objects in files, read whole, one at a time, or by blocks."""
+"""States of a replay in files: columns and objects, read whole, singly, or by blocks."""
 
 import pickle
 import tempfile
@@ -28,25 +28,23 @@ T = TypeVar("T")
 
 
 class StampColumn:
-    """Stamps [ns], in memory: eight bytes for each state."""
+    """Stamps [ns] in memory, eight bytes each."""
 
     def __init__(self) -> None:
         self._parts: list[Stamps] = []
 
     def append(self, stamp_ns: Stamps) -> None:
-        """Add the next (T,)."""
         self._parts.append(stamp_ns)
 
     @property
     def all(self) -> Stamps:
-        """(T,)."""
         if len(self._parts) != 1:
             self._parts = [np.concatenate([np.zeros(0, dtype=np.int64), *self._parts])]
         return self._parts[0]
 
 
 class StoredObjects(Sequence[T], Generic[T]):
-    """Objects in a file without a name, read a block at a time."""
+    """Objects in an unnamed file, read by blocks."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
@@ -92,27 +90,25 @@ class StoredObjects(Sequence[T], Generic[T]):
 
 
 class Figures:
-    """Columns of one number, or one row of them, per state, by name; NaN where a state has none."""
+    """Named columns of a number or row per state; NaN without a value."""
 
     def __init__(self) -> None:
         self._files: dict[str, RowFile] = {}
 
     def append(self, **columns: Float64) -> None:
-        """Add the next states' (T,)."""
         for name, values in columns.items():
             self._files.setdefault(name, RowFile(values.shape[1:])).append(values)
 
     def __getitem__(self, name: str) -> Float64:
-        """A whole column (T,)."""
         return self._files[name].read(0, len(self._files[name]))
 
     def rows(self, name: str) -> Rows:
-        """A column (T,) that is read as it is asked for."""
+        """Lazily read column (T,)."""
         return Rows(self._files[name])
 
 
 class StoredClearance:
-    """As `Clearance`, a column read each time it is asked for."""
+    """A `Clearance` whose columns are read on each access."""
 
     def __init__(self, figures: Figures, name: str) -> None:
         self._figures, self._name = figures, name
@@ -124,19 +120,16 @@ class StoredClearance:
 
     @property
     def rows(self) -> Rows:
-        """The distance (T,) [m], read as it is asked for."""
+        """Lazily read distance (T,) [m]."""
         return self._figures.rows(f"distance {self._name}")
 
     @property
     def sphere(self) -> Index:
-        """(T,)."""
         return self._figures[f"sphere {self._name}"].astype(np.int64)
 
 
 class StoredAudit:
-    """As `AuditTrace`, in files: position is read by rows, clearances each time they are asked for; figures (T,): the
-    other columns, as `AuditTrace` has them.
-    """
+    """An `AuditTrace` in files; clearances are read on each access, positions by row."""
 
     def __init__(self) -> None:
         self._stamps, self.figures = StampColumn(), Figures()
@@ -152,17 +145,14 @@ class StoredAudit:
 
     @property
     def stamp_ns(self) -> Stamps:
-        """(T,)."""
         return self._stamps.all
 
     @property
     def position(self) -> Rows:
-        """(T, J)."""
         return self.figures.rows("position")
 
     @property
     def clearance(self) -> Mapping[str, StoredClearance]:
-        """By field name."""
         return {name: StoredClearance(self.figures, name) for name in self._names}
 
     def block(self, first: int, last: int) -> AuditTrace:
@@ -185,9 +175,9 @@ class StoredAudit:
 
 
 class StoredSteps:
-    """Steps of a controller, None where it was not asked, with the figures (T,) that are asked for over all of them:
-    clearance, residual, scale, rung (its number), refused, shaped, and shaped by each kind of row; and the velocity
-    (T, J) [rad/s], NaN without a step.
+    """Steps of a controller, None where it had none, with `STEP_FIGURES` (T,) over all.
+
+    Also the velocity (T, J) [rad/s], NaN without a step.
     """
 
     def __init__(self) -> None:
@@ -205,7 +195,6 @@ class StoredSteps:
 
 
 def _figures_of(step: ControlStep) -> tuple[float, ...]:
-    """`STEP_FIGURES` of a step."""
     shaped: tuple[float, ...] = (is_shaped(step), *(is_shaped(step, kind) for kind in RowKind))
     if step.rung is Rung.OUTSIDE:
         shaped = (np.nan,) * len(shaped)
@@ -222,19 +211,16 @@ class StoredLoop:
 
     @property
     def stamp_ns(self) -> Stamps:
-        """(T,)."""
         self._flush()
         return self._stamps.all
 
     @property
     def position(self) -> Rows:
-        """(T, J)."""
         self._flush()
         return Rows(self._position)
 
     @property
     def steps(self) -> Sequence[ControlStep]:
-        """The steps; none is None."""
         self._flush()
         return self.kept.stored  # type: ignore[return-value]
 
@@ -254,8 +240,10 @@ class StoredLoop:
 
 
 class StoredOpenLoop:
-    """As `OpenLoopTrace`, in files; figures (T,): size and largest of the difference, and by how much the logged
-    velocity keeps the tightest barrier row and limit; (T, J) [rad/s]: logged, and difference: commanded less logged.
+    """An `OpenLoopTrace` in files.
+
+    figures (T,): size and largest of the difference; slack of the logged velocity to the tightest barrier row and
+    limit; logged and difference (commanded less logged) (T, J) [rad/s].
     """
 
     def __init__(self) -> None:
@@ -264,7 +252,6 @@ class StoredOpenLoop:
 
     @property
     def steps(self) -> Sequence[ControlStep | None]:
-        """None where the controller was not asked."""
         return self.kept.stored
 
     def add(self, part: OpenLoopTrace) -> None:
