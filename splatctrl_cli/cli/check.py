@@ -1,4 +1,4 @@
-"""``splatctrl check``, ``info``, ``ingest``: what is wrong with a recording, what a file holds, its capture."""
+"""``splatctrl check``, ``info``, ``ingest``: faults of a recording, file contents, captures."""
 
 import argparse
 import textwrap
@@ -67,7 +67,6 @@ def _lines(report: CheckReport) -> Iterator[str]:
 
 
 def _needs(report: CheckReport) -> Iterator[str]:
-    """Commands that can start, those that errors keep from it, then what each lacks beside."""
     ready = [need.command for need in report.needs if not report.lacks(need)]
     if ready:
         yield f"can start: {', '.join(ready)}"
@@ -88,7 +87,7 @@ def run_info(args: argparse.Namespace) -> int:
 
 
 def show_described(console: Console, summary: Summary, *, is_long: bool = False) -> int:
-    """Facts and tables, and what a reconstruction lacks."""
+    """Print facts and tables, and what a reconstruction lacks."""
     code = DAMAGED if summary.damaged else 0
     return console.result(summary.as_dict(), _described(summary, is_long=is_long), code=code)
 

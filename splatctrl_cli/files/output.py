@@ -188,7 +188,7 @@ def output_path(
     A failure removes it; an interrupted run leaves it. `checkpoint`: a file in it to continue from; with that file, a
     failure to write or of a card also leaves it. `resume` yields such a folder unchanged, and no failure removes it.
     A link `path` stays, and its target is written. Raises UsageError if `path` has no name, exists without `force`,
-    is of the wrong kind, is a folder of no command, has another writer, or has an unwritable parent. Raises
+    or is of the wrong kind. Likewise for a folder of no command, another writer, or an unwritable parent. Raises
     WriteError if `is_write_failure`; other errors pass unchanged.
     """
     try:

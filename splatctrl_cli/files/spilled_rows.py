@@ -46,6 +46,7 @@ class RowFile:
         return self._num
 
     def append(self, rows: Float64) -> None:
+        """Add rows (T, ...)."""
         block = np.ascontiguousarray(rows, dtype=np.float64)
         if block.shape[1:] != self.row_shape:
             raise ValueError(f"rows: expected {self.row_shape}, got {block.shape[1:]}")
@@ -55,6 +56,7 @@ class RowFile:
             self._flush()
 
     def read(self, first: int, last: int) -> Float64:
+        """Rows (last - first, ...)."""
         self._flush()
         num = max(min(last, self._num) - first, 0)
         self._file.seek(first * self._row_bytes)
@@ -115,6 +117,7 @@ class Rows:
         return Rows(self._file, index if self._index is None else self._index[index], self._columns)
 
     def of_columns(self, order: Index) -> "Rows":
+        """Rows with these columns, in that order."""
         return Rows(self._file, self._index, order if self._columns is None else self._columns[order])
 
     def _read(self, first: int, last: int) -> Float64:
@@ -144,6 +147,7 @@ def blocks_of(table: Table) -> Iterator[Float64]:
 
 
 def absent(num: int, width: int) -> Rows:
+    """(num, width) NaN."""
     return Rows(RowFile((width,), (np.full((last - first, width), np.nan) for first, last in ranges(num))))
 
 

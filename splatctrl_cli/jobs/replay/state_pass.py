@@ -50,11 +50,13 @@ NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # of what was known about the a
 class ReplayRecord:
     """Audit of T states in the scenes known at their times, with what happened.
 
-    obstacles: nearest to the nearest sphere. between: clearance bound since the state before (`lower` [m], NaN at the
-    first), 1 if a posture on the way has it (`met`), time without a bound (`unbounded` [s]), clearance of the body
-    (`surface` [m]), and of the spheres to splats alone (`represented` [m]). near: `NEAR_COLUMNS`, NaN where
-    unevaluated. hindsight: later depth about unwatched times. newer_depth: states judged by a late map. strain:
-    shares of the velocity and acceleration limits. closest: of link pairs below their margin, gap [m] and stamp.
+    obstacles: nearest to the nearest sphere.
+    between: `lower` [m], clearance bound since the state before, NaN at the first; `met`, 1 if a posture on the way
+    has it; `unbounded` [s], time without a bound; `surface` [m], clearance of the body; `represented` [m], of the
+    spheres to splats alone.
+    near: `NEAR_COLUMNS`, NaN where not evaluated.
+    hindsight: later depth about unwatched times. newer_depth: states judged by a late map. strain: shares of the
+    velocity and acceleration limits. closest: of link pairs below their margin, gap [m] and stamp.
     """
 
     def __init__(

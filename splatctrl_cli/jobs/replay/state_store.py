@@ -34,10 +34,12 @@ class StampColumn:
         self._parts: list[Stamps] = []
 
     def append(self, stamp_ns: Stamps) -> None:
+        """Add the next (T,)."""
         self._parts.append(stamp_ns)
 
     @property
     def all(self) -> Stamps:
+        """(T,)."""
         if len(self._parts) != 1:
             self._parts = [np.concatenate([np.zeros(0, dtype=np.int64), *self._parts])]
         return self._parts[0]
@@ -96,10 +98,12 @@ class Figures:
         self._files: dict[str, RowFile] = {}
 
     def append(self, **columns: Float64) -> None:
+        """Add the next (T,) of each."""
         for name, values in columns.items():
             self._files.setdefault(name, RowFile(values.shape[1:])).append(values)
 
     def __getitem__(self, name: str) -> Float64:
+        """A whole column (T,)."""
         return self._files[name].read(0, len(self._files[name]))
 
     def rows(self, name: str) -> Rows:
@@ -125,6 +129,7 @@ class StoredClearance:
 
     @property
     def sphere(self) -> Index:
+        """(T,)."""
         return self._figures[f"sphere {self._name}"].astype(np.int64)
 
 
@@ -145,10 +150,12 @@ class StoredAudit:
 
     @property
     def stamp_ns(self) -> Stamps:
+        """(T,)."""
         return self._stamps.all
 
     @property
     def position(self) -> Rows:
+        """(T, J)."""
         return self.figures.rows("position")
 
     @property
@@ -211,11 +218,13 @@ class StoredLoop:
 
     @property
     def stamp_ns(self) -> Stamps:
+        """(T,)."""
         self._flush()
         return self._stamps.all
 
     @property
     def position(self) -> Rows:
+        """(T, J)."""
         self._flush()
         return Rows(self._position)
 
@@ -243,7 +252,7 @@ class StoredOpenLoop:
     """An `OpenLoopTrace` in files.
 
     figures (T,): size and largest of the difference; slack of the logged velocity to the tightest barrier row and
-    limit; logged and difference (commanded less logged) (T, J) [rad/s].
+    limit. Also logged and difference (commanded less logged) (T, J) [rad/s].
     """
 
     def __init__(self) -> None:
@@ -252,6 +261,7 @@ class StoredOpenLoop:
 
     @property
     def steps(self) -> Sequence[ControlStep | None]:
+        """None where the controller did not run."""
         return self.kept.stored
 
     def add(self, part: OpenLoopTrace) -> None:

@@ -226,10 +226,10 @@ def copied_arm(
 
 
 def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Motion:
-    """Adapt the scene's motion to another arm, whose tip follows the hand of the simulated one.
+    """Adapt the scene's motion to another arm, whose tip follows the simulated arm's hand.
 
-    The tip is the last link of the URDF, its z pointing away from the arm; it goes as far as it reaches, at any turn
-    about z. The shortest clear way through the postures found is taken, or the least slowed one if none keeps the
+    The tip is the last link of the URDF, its z pointing away from the arm. It goes as far as it reaches, turned any
+    way about z. The shortest clear way through the postures found is taken, or the least slowed one if none keeps the
     velocity limits. An arm that fits the original postures keeps the original motion. Raises InputError if no posture
     reaches a waypoint, or every way collides.
     """
@@ -322,7 +322,7 @@ def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
 
 
 def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
-    """Yield the pose turned about its z, its place at `nearer` times the distance from the base axis."""
+    """Yield poses turned about z, their place at `nearer` times the distance from the base axis."""
     for angle in 2 * np.pi * np.arange(fixed.SIMULATED_TURNS) / fixed.SIMULATED_TURNS:
         T = T_base_hand.copy()
         c, s = np.cos(angle), np.sin(angle)
