@@ -167,7 +167,6 @@ def _text(value: Any) -> str:
 
 
 def _lines(result: BatchResult, *, is_long: bool) -> Iterator[str]:
-    """A row for each recording, a column for each job; of many recordings the unexpected."""
     runs = {(run.recording, run.column): run for run in result.runs}
     columns = columns_of(((run.job, column) for (_, column), run in runs.items()), result.jobs)
     recordings = list(dict.fromkeys(recording for recording, _ in runs))

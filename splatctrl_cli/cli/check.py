@@ -119,7 +119,7 @@ def _facts(facts: Mapping[str, object], indent: str) -> Iterator[str]:
 
 
 def _fact(value: object) -> str:
-    """A float with up to six decimals, more digits where it is small; a dash for nothing."""
+    """Text of a float with up to six decimals, more if small; a dash for None."""
     if not isinstance(value, float):
         return "-" if value is None else str(value)
     return f"{value:.6f}".rstrip("0").rstrip(".") if value == 0 or abs(value) >= 1e-3 else f"{value:.6g}"
@@ -132,7 +132,6 @@ def run_ingest(args: argparse.Namespace) -> int:
 
 
 def show_ingested(console: Console, result: IngestResult) -> int:
-    """Frames by camera, and what was lost."""
     lost = asdict(result.summary.loss)
     lines = table(["camera", "frames"], sorted(result.summary.num_frames.items()))
     lines += [f"{name.replace('_', ' ')}: {value}" for name, value in lost.items() if value and name != "notes"]

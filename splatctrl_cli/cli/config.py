@@ -46,7 +46,6 @@ def run_help(args: argparse.Namespace) -> int:
 
 
 def _complete_files(parser: Parser) -> None:
-    """Complete file names for paths."""
     for action in parser._actions:
         if action.type is Path:
             action.complete = shtab.FILE  # type: ignore[attr-defined]

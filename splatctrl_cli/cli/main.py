@@ -84,7 +84,6 @@ def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbo
 
 
 def _told(error: BaseException) -> tuple[str, str, int]:
-    """Message, remedy and exit code of an error."""
     match error:
         case SplatCtrlError():
             return error.message, error.remedy, error.exit_code
@@ -153,7 +152,7 @@ def _check_outputs(args: argparse.Namespace) -> None:
 
 
 def _check_output(out: Path, inputs: Sequence[Path], option: str) -> None:
-    """Refuse an unwritable output, or one that is or contains an input, as itself or partial."""
+    """Refuse an output that is unwritable, or that is or contains an input."""
     check_can_be_written(out)
     targets = _places(out)
     for given in inputs:
@@ -170,10 +169,10 @@ def _places(output: Path) -> set[Path]:
 
 @cache
 def refuse_endless_files() -> None:
-    """Make opening anything but a file raise OSError from now on, anywhere.
+    """Make reading a FIFO, socket or device raise OSError from now on, anywhere.
 
     A FIFO among images would wait for its writer; a link to /dev/zero would fill the memory. Files are opened in many
-    places, so the interpreter checks, once for each file.
+    places, so the interpreter checks each one.
     """
     sys.addaudithook(_look)
 

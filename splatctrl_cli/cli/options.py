@@ -169,7 +169,7 @@ def output(what: str, *, default: str) -> tuple[Adds, ...]:
 
 
 def settings(example: str = "") -> tuple[Adds, ...]:
-    """``--set`` and ``--preset``, which is the first of the settings."""
+    """``--set`` and ``--preset``, the first of the settings."""
     paper = "paper: as printed (splatctrl help paper has our departures)"
     return (
         option("--set SECTION.KEY=VALUE ...", f"one setting{example}"),

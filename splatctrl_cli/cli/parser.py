@@ -87,7 +87,6 @@ class Parser(argparse.ArgumentParser):
 
     @property
     def actions(self) -> "argparse._SubParsersAction[Parser] | None":
-        """Subparsers, None without any."""
         return next((action for action in self._actions if isinstance(action, argparse._SubParsersAction)), None)
 
     @property
@@ -190,16 +189,12 @@ def add_all(container: Any, options: Iterable[Adds]) -> None:
 
 
 class _HelpAll(argparse.Action):
-    """Action that prints everything and exits."""
-
     def __call__(self, parser: Any, *_: object) -> None:
         print(parser.format_full_help(), end="")
         parser.exit()
 
 
 class _Formatter(argparse.HelpFormatter):
-    """At most MOST_WIDTH columns, with room for option names."""
-
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=28, width=min(shutil.get_terminal_size().columns - 2, MOST_WIDTH))
 

@@ -41,7 +41,6 @@ def show_replayed(
 
 
 def _lines(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator[str]:
-    """Lines after the verdict: events, headline figures (all with `is_long`), notes, and steps."""
     replay, metrics = result.replay, result.metrics
     shown = metrics if is_long else {name: metrics[name] for name in HEADLINE if metrics.get(name) is not None}
     lines = when_and_why(replay)

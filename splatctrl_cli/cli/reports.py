@@ -94,7 +94,6 @@ def tell_of_failure(
 
 
 def _junit_in(words: Sequence[str]) -> Path | None:
-    """File of --junit in words argparse refused."""
     for word, following in zip(words, [*words[1:], ""], strict=True):
         if word == "--":
             break

@@ -220,7 +220,6 @@ STEP_LIMIT = 10.0  # [s]
 
 
 def _start(text: str) -> float | str:
-    """Non-negative seconds, or the first map's time, for argparse."""
     return text if text == "first-map" else real(0, MAX_SECONDS, "s or first-map")(text)
 
 

@@ -52,7 +52,7 @@ def _request(args: argparse.Namespace) -> ScoreRequest:
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:
-    """Settings of --cloud, if given. Raises UsageError for its options alone."""
+    """Raises UsageError for options of --cloud alone."""
     if args.cloud is None:
         for name in ("unit", "masks"):
             if getattr(args, f"cloud_{name}") is not None:

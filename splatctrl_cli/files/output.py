@@ -171,7 +171,7 @@ NO_PARTS = ("run.json", "checkpoint")  # what holds the digests, and what only a
 
 
 def is_write_failure(error: OSError, output: Path | None = None) -> bool:
-    """True if writing failed: a full or broken disk, or a file in `output`; False if reading did."""
+    """True if writing failed: a full or broken disk, or a file in `output`."""
     if error.errno in _WRITE_FAILURES:
         return True
     if output is None or not isinstance(error.filename, str):
@@ -240,7 +240,7 @@ def followed(path: Path) -> Path:
 
 
 def partial_path(path: Path) -> Path:
-    """``NAME.partial`` beside the link-free path, where an output is written."""
+    """``NAME.partial`` next to the path, or to a link's target, where an output is written."""
     target = followed(path)
     return target.with_name(target.name + PARTIAL)
 
@@ -355,8 +355,8 @@ def write_run(
 ) -> None:
     """Write ``run.json``: command, settings, sha256 of inputs by name, times, metrics and verdict.
 
-    Write it last: for WITH_PARTS it has the sha256 of every file, checked when one is opened. It omits ``--resume``,
-    as an interrupted run must leave what an uninterrupted one does.
+    Write it last: for WITH_PARTS it has the sha256 of every file, checked on opening. It omits ``--resume``, so that
+    an interrupted run leaves what an uninterrupted one does.
     """
     run = {
         "command": command,

@@ -80,7 +80,7 @@ class RowFile:
 
 
 class Rows:
-    """View of rows (T, ...) of a file, of an index (T,) and `columns` if given.
+    """Rows (T, ...) of a file, optionally of an index (T,) and some `columns`.
 
     ``rows[first:last]``, ``rows[index]`` and ``rows[number]`` read them like an array's.
     """

@@ -21,7 +21,7 @@ class Grid:
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """A described file: facts, tables, lacking input, remarks; `damaged` counts unreadable parts."""
+    """A described file: facts, tables, missing input, notes; `damaged` counts unreadable parts."""
 
     path: str
     kind: str

@@ -250,7 +250,6 @@ def _recorded_as(words: Sequence[str]) -> Iterator[None]:
 
 
 def _label(result: StepResult) -> str:
-    """Label of the verdict, "done", or the exit code for damaged input."""
     if isinstance(result, Summary):
         return f"exit code {DAMAGED}" if result.damaged else "done"
     if isinstance(result, IngestResult):

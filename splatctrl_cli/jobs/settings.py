@@ -82,7 +82,6 @@ def toml_value(value: Value) -> str:
 
 
 def _with_sections(settings: Sequence[Setting]) -> Iterator[tuple[list[str], Setting]]:
-    """Settings, each section's first with its heading."""
     before = ""
     for setting in settings:
         blank = [""] if before else []

@@ -57,7 +57,7 @@ class Accuracy:
 
 
 def accuracy_of(grid: DistanceGrid, spheres: Spheres, source: BakeSource, request: BakeRequest) -> Accuracy:
-    """Compare the field with the request's references. Raises NotEvaluableError without overlap."""
+    """Compare the field with its references. Raises NotEvaluableError without overlap."""
     mesh, held_out = request.reference_mesh, request.held_out
     return Accuracy(
         truth=None if request.truth is None else _beside_truth(grid, spheres, source, request),
@@ -115,7 +115,7 @@ def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
 
 
 def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator[RgbdFrame]:
-    """Frames of the training cameras (without known ones: of all) up to a stamp."""
+    """Frames of training cameras (of all if unknown) up to a stamp."""
     for record in open_source(log).records():
         if record.stamp_ns > until_ns:
             return
@@ -211,7 +211,7 @@ class FieldReport:
         }
 
     def summary(self) -> dict[str, Any]:
-        """Printed figures; --json adds the accuracy."""
+        """Printed figures, without accuracy."""
         header: Mapping[str, Any] = self.grid.header
         num_used, health = sum(header["splats_used"].values()), header["health"]
         # cells where the kernel field of sdf, alone, exceeds the exact distance

@@ -338,7 +338,7 @@ def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence
 
 
 def _middle(job: _Job) -> list[float]:
-    """Point [m] of the pictured slices: the middle of the splats without outliers."""
+    """Point [m] where slices are drawn: the middle of the splats without outliers."""
     box, centers = job.baker.layout.box, job.obstacles.splats.centers
     inside = centers[box.contains(centers)]
     lower, upper = np.percentile(inside, (5, 95), axis=0) if len(inside) else (box.lower, box.upper)

@@ -33,10 +33,10 @@ class BakeRequest(RunOptions):
     """One bake of `scene` (reconstruct's folder, or a splat file) into the folder `out`.
 
     at: time after the scene's start [s], None for its end. labels: of the splats in the field. The grid covers `box`,
-    or the reach of the robot, or the splats. channels: beside sdf, None for the usual ones or those of `update`.
+    or the robot's reach, or the splats. channels: besides sdf, None for the usual ones or those of `update`.
     References: `truth`, where cameras of `seen_by` looked; `reference_mesh`; depth in the log `held_out`
     (`held_out_cameras`, by default all that did not train). update: a field baked from `previous_scene` (None:
-    `scene`), of which only changes are baked anew. resume: continue an interrupted bake.
+    `scene`), to bake only changes. resume: continue an interrupted bake.
     """
 
     scene: Path

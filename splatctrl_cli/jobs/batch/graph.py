@@ -100,7 +100,6 @@ def columns_of(columns: Iterable[tuple[str, str]], jobs: Sequence[str]) -> list[
 
 
 def _with_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
-    """Add the options that follow from the other jobs."""
     given = {*job.options, *job.matrix}
     given |= {"field", "lockstep"} & given and {"scene"}  # either stands for its scene
     roles = {option: role for option, role in ROLES[job.command].items() if option not in given}

@@ -330,7 +330,7 @@ def _digest(path: Path, ledger: Ledger) -> str:
 
 
 def _meshes(urdf: Path) -> Iterator[Path]:
-    """Possible places of a URDF's meshes: beside it, or below a folder above."""
+    """Possible places of a URDF's meshes: next to it, or below a folder above."""
     for name in dict.fromkeys(_MESH.findall(urdf.read_text(encoding="utf-8", errors="replace"))):
         if "://" not in name:
             yield urdf.parent / name

@@ -32,7 +32,7 @@ PRINTED = "printed"  # stands for the stamp of an output that there is none of
 
 @dataclass(kw_only=True)
 class Scheduler:
-    """Runs nodes on an executor of `slots` places, and keeps the ledger; hint: cause of a wait."""
+    """A runner of nodes on an executor of `slots` places; hint: cause of a wait."""
 
     ledger: Ledger
     entry: str
@@ -186,7 +186,6 @@ def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
 
 
 def _judged_again(run: Run, node: Node) -> Run:
-    """Set the state by the node's expectation."""
     if run.cause:
         return replace(run, state=ERROR)
     is_expected = node.expect in {run.label, run.outcome, f"exit {run.exit_code}"}

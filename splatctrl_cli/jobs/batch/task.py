@@ -215,7 +215,7 @@ def _run(function: Entry, task: Task) -> End:
 
 
 def _clear(task: Task) -> None:
-    """Remove outputs of another key, so nobody mistakes them for this run's."""
+    """Remove outputs of another key, lest they be taken for this run's."""
     begun = Path(task.end).with_suffix(".begun")
     if begun.is_file() and begun.read_text() != task.key and task.out:
         remove(Path(task.out))
@@ -224,7 +224,7 @@ def _clear(task: Task) -> None:
 
 
 def _be_child(function: Entry, task: Task) -> NoReturn:
-    """Run the words in a session of this process, and exit."""
+    """Run the words in a session of their own, and exit."""
     code = 70
     try:
         os.setsid()

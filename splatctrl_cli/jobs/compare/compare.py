@@ -315,7 +315,6 @@ def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
 
 
 def _of_verdicts(verdicts: Sequence[VerdictChange], after: Judged) -> Iterator[Reason]:
-    """A regression for each verdict that was right, a note for other changes."""
     for one in verdicts:
         words = f"{one.run}: the verdict went from '{one.before}' to '{one.after}'"
         if one.change is not Change.WORSE:
@@ -368,7 +367,6 @@ def _of_job(one: JobChange) -> Reason:
 
 
 def _of_single(jobs: Sequence[JobChange]) -> Iterator[Reason]:
-    """A note if recordings lost more than their tolerance while the mean did not."""
     single = [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]
     if single:
         first = single[0]
@@ -377,7 +375,7 @@ def _of_single(jobs: Sequence[JobChange]) -> Iterator[Reason]:
 
 
 def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tuple[str, str]]:
-    """Differing settings, versions and inputs by name: before and after, in the first run."""
+    """Differing settings, versions and inputs of the first run: before and after."""
     found: dict[str, tuple[str, str]] = {}
     for old, new in pairs:
         for name in [name for name in old.settings if name in new.settings]:

@@ -159,7 +159,6 @@ def _nodes_of(batch: BatchFolder) -> Iterator[JudgedRun]:
 
 
 def _settings(document: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
-    """Configuration, seed, versions and short input digests, by flat name."""
     for section, values in (document.get("config") or {}).items():
         if isinstance(values, dict):
             yield from ((f"{section}.{key}", value) for key, value in values.items())
@@ -242,7 +241,7 @@ def _toml(value: object) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class WorstState:
-    """A state by row (from 0) and time [s] in ``steps.csv``, with nearest sphere and obstacle."""
+    """A state by row (from 0) and time [s] in ``steps.csv``."""
 
     state: int
     time_s: float

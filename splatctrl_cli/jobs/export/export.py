@@ -51,9 +51,9 @@ Splats = SplatSet | GaussianSet
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRequest:
-    """One export of a scene folder or splat file to `out`, whose suffix is the format.
+    """One export of a scene folder or splat file; the suffix of `out` is the format.
 
-    out: None for a PLY beside the scene. labels: None for all. layout: of a PLY, "short" or "full", None for the
+    out: None for a PLY next to the scene. labels: None for all. layout: of a PLY, "short" or "full", None for the
     lossless one. isotropic: make anisotropic Gaussians round.
     """
 
@@ -335,7 +335,6 @@ def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> It
 
 
 def _known_parts(known: Sequence[tuple[int, Snapshot]]) -> Iterator[Later]:
-    """Splats of every snapshot at a stamp [ns], and known space of a few."""
     few = {known[i][0] for i in spread([1e-9 * (stamp - known[0][0]) for stamp, _ in known], math.inf)}
     for stamp, snapshot in known:
         yield stamp, 0, partial(_cloud, stamp, snapshot)

@@ -211,9 +211,9 @@ OF_GRID = {  # settings of the field by the name that a grid's header gives them
 class QueryRequest(RunOptions):
     """One table of points for `source`: a field folder, ``field.npz``, scene folder or splat file.
 
-    points: a CSV with columns x, y, z [m], world, or an open text. out: None for figures alone. scene: what the field
-    was baked from; it knows what the grid does not. at: time after the scene's start [s], None for its end. labels:
-    of the splats that count; a field has its own. device: for a scene's distances.
+    points: a CSV with columns x, y, z [m], world, or an open text. out: None for figures alone. scene: source of the
+    field, for what the grid lacks. at: time after the scene's start [s], None for its end. labels: of the splats that
+    count; a field has its own. device: for a scene's distances.
     """
 
     source: Path

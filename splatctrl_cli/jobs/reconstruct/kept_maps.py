@@ -22,7 +22,7 @@ from splatctrl_cli.voxels import Balls, OccupancyGrid
 
 
 class KeptMaps:
-    """Decides on snapshots from written files alone, so a resumed run decides the same."""
+    """Decisions on snapshots by written files alone, so a resumed run decides the same."""
 
     def __init__(self, writer: SceneWriter, config: Config) -> None:
         self._writer, self._config = writer, config

@@ -220,7 +220,7 @@ class Reconstruction:
         return fitter
 
     def _grow_budget(self, row: AuditRow, console: Progress) -> bool:
-        """Enlarge a default budget the first step exceeded beside a robot; return True if so.
+        """Enlarge a default budget that the first step exceeded next to a robot; True if so.
 
         Without a splat, a whole voxel counts as occupied.
         """

@@ -147,9 +147,10 @@ def check_pose_jumps(source: FrameSource, limit: float) -> None:
 
 
 class CameraAgreement:
-    """Checks that cameras agree; disagreement [m]: of each pair with enough shared view.
+    """Agreement of cameras; disagreement [m]: of each pair with enough shared view.
 
-    is_allowed: warn, not refuse. is_still: views of a step show the same scene. guess: a guessed unit, in words.
+    is_allowed: warn instead of refusing. is_still: views of a step show the same scene. guess: a guessed unit, in
+    words.
     """
 
     def __init__(self, source: RecordSource, *, is_allowed: bool, is_still: bool, guess: str = "") -> None:

@@ -1,4 +1,4 @@
-"""Matches a scene or field, a log, a truth and a robot by content.
+"""Matches of a scene or field, a log, a truth and a robot by content.
 
 Camera names are alike on every rig and prove nothing.
 """
@@ -258,7 +258,6 @@ def _map_mismatches(scene: SceneFolder) -> Iterator[Mismatch]:
 
 
 def _used(section: type[S], values: object) -> S:
-    """Section of ``run.json``'s configuration, by default the default."""
     known = {field.name for field in fields(section)}
     given = values if isinstance(values, dict) else {}
     return section(**{name: value for name, value in given.items() if name in known})

@@ -179,10 +179,11 @@ class Misses:
 
 
 def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: StoredAudit, reach: float) -> Misses:
-    """Largest miss of each held-out frame set on non-robot surface within `reach` [m] of the motion.
+    """Largest miss of each held-out frame set near the motion, without the robot.
 
-    Only sets within the audited time count; one at a time is in memory. Each is compared with the map that judged the
-    states just before it, when that map is oldest. A newer map may already contain other cameras of the same moment.
+    Near is within `reach` [m]; sets count within the audited time, and one at a time is in memory. Each is compared
+    with the map that judged the states just before it, when that map is oldest. A newer map may already contain other
+    cameras of the same moment.
     """
     swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
@@ -211,13 +212,16 @@ def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: Store
 
 
 def surface_points(frame: RgbdFrame) -> Float64:
-    """Back-project a frame to points (Q, 3) [m], world, without depth edges, whose pixels may be mixed."""
+    """Back-project a frame to points (Q, 3) [m], world, without mixed pixels at depth edges."""
     is_chosen = (frame.depth > 0) & ~depth_edges(frame.depth)
     return transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[is_chosen])
 
 
 def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
-    """Keep points (Q, 3) [m] more than ROBOT_MARGIN from the robot at q (J,), uncovered parts included."""
+    """Keep points (Q, 3) [m] that cannot be the robot at q (J,).
+
+    They are farther than ROBOT_MARGIN from its spheres and what these leave uncovered.
+    """
     if not len(points):
         return points
     deficit = np.maximum(np.nan_to_num(np.asarray(model.sphere_deficit, np.float64)), 0.0)
@@ -235,7 +239,7 @@ def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
 
 
 class Swept:
-    """Space within `reach` [m] of the path of an arm's moving spheres, up to SPHERE_CELL more."""
+    """Space within `reach` [m] of an arm's moving spheres, up to SPHERE_CELL more."""
 
     def __init__(self, cells: Float64, radii: Float64, reach: float) -> None:
         """cells (K, 3): whole numbers of SPHERE_CELL; radii (K,) [m]: the largest sphere in each."""
@@ -267,7 +271,7 @@ class Swept:
 
 
 class TrueSurfaces:
-    """The true surface points (T, 3) [m] nearest to each state; `seen` marks those cameras saw."""
+    """True surface points (T, 3) [m] nearest to each state; `seen` by a camera so far."""
 
     def __init__(self, points: Rows, stamp_ns: Stamps, inputs: ReplayInputs) -> None:
         self._points, self._stamp_ns = points, stamp_ns

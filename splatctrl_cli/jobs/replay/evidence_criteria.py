@@ -159,7 +159,7 @@ def known_space(judged: Judged) -> Iterator[Reason]:
 
 
 def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
-    """Yield that a limit is kept, or its worst state as a reason of kind `broken`."""
+    """Yield that a limit is kept, or its worst state as `broken`."""
     near = judged.replay.near
     values = limit.values(near)
     if limit is PROOF and np.isnan(near["assumed"]).all():
@@ -329,7 +329,7 @@ def calibration(judged: Judged) -> Iterator[Reason]:
 
 def map_resolution(judged: Judged) -> Iterator[Reason]:
     """The map's voxels are at most 25 mm, since an obstacle without a splat may be that large. The robot's mask
-    reaches less than the margin, since an obstacle touching it may go unseen that far.
+    reaches at most the margin, since an obstacle touching the robot may go unseen that far.
     """
     figures, margin = judged.inputs.scene.figures(), judged.replay.margin
     voxel, by_link = figures.get("voxel"), figures.get("self_mask")

@@ -1,4 +1,4 @@
-"""The goal of a replay's controller (pose, configuration, waypoints or logged twists), and the controller."""
+"""The controller of a replay, and its goal: pose, configuration, waypoints or logged twists."""
 
 import csv
 import math
@@ -84,9 +84,10 @@ def _posture(model: RobotModel, values: Float64, logged_end: Float64) -> Float64
 
 
 def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint, ...]:
-    """Read poses (columns or keys x, y, z, qx, qy, qz, qw) or postures (one per joint name).
+    """Read poses or postures from a file.
 
-    CSV has a header; TOML tables ``[[waypoint]]`` with ``pose = [...]`` or ``joints = [...]``. Raises InputError.
+    Columns or keys: x, y, z, qx, qy, qz, qw, or one per joint name. CSV has a header; TOML tables ``[[waypoint]]``
+    with ``pose = [...]`` or ``joints = [...]``. Raises InputError.
     """
     try:
         text = path.read_text(encoding="utf-8")

@@ -19,9 +19,10 @@ ClearanceIn = Callable[[int, Stamps, Float64], Float64]
 
 @dataclass(frozen=True, kw_only=True)
 class LaterDepth:
-    """A state clear in the map known at `stamp_ns`, but at `clearance` [m] below the margin by later depth.
+    """A state that kept the margin in the map known then, but not by later depth.
 
-    depth_ns: of that depth. since_ns: start of a stretch without depth about the arm that this depth ends, 0 without.
+    stamp_ns: of the state. clearance [m]: by the depth of `depth_ns`. since_ns: start of a stretch without depth
+    about the arm that this depth ends, 0 without.
     """
 
     depth_ns: int
@@ -31,7 +32,7 @@ class LaterDepth:
 
 
 class NewerDepth:
-    """Compares states with depth of their own time if maps are late, the last with the next."""
+    """Comparison of states with their own depth if maps are late, the last with the next."""
 
     def __init__(self, scene: KnownScene, margin: float, clearance_in: ClearanceIn) -> None:
         self._scene, self._margin, self._clearance_in = scene, margin, clearance_in
@@ -81,7 +82,7 @@ class NewerDepth:
 
 
 class Hindsight:
-    """Compares postures since the last depth about the arm with the map after the next."""
+    """Comparison of postures since the last depth about the arm with a later map."""
 
     def __init__(self, scene: KnownScene, near: NearSpace, margin: float, clearance_in: ClearanceIn) -> None:
         self._scene, self._near, self._margin, self._clearance_in = scene, near, margin, clearance_in
@@ -127,7 +128,7 @@ class Hindsight:
                 yield later_ns
 
     def _hold_against(self, since_ns: int, until_ns: int, num: int) -> None:
-        """Compare the first `num` postures, where clear in the map of their time, with a later one."""
+        """Compare the first `num` postures, if clear in their own map, with a later one."""
         stamps, q = np.array(self._stamps[:num]), np.asarray(self._postures[:num])
         after = self._clearance_in(until_ns, stamps, q)
         near = np.flatnonzero(after < self._margin)

@@ -81,7 +81,7 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredRobot:
-    """A robot with measured sphere coverage, link surfaces (None if unreadable), and pairs with lowered margins."""
+    """A robot with measured coverage, link surfaces (None if unreadable), and lowered pair margins."""
 
     model: RobotModel
     surfaces: SelfSurfaces | None

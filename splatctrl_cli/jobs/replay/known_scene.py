@@ -60,7 +60,8 @@ class KnownScene:
     stamps_ns: of consecutive scenes, each known `latency_ns` after its stamp; empty for one scene for all times.
     `advance` to a stamp makes the scenes up to it; call `finish` after the replay. box: of a grid's cell centres.
     moment_ns: the time of a baked field. seen_at: when space was last seen, as known at a stamp; without
-    has_seen_times only if it ever was. has_people_margin: people keep another margin than objects.
+    has_seen_times only if it ever was. figures: of the reconstruction, complete after the replay. has_people_margin:
+    people keep another margin than objects.
     """
 
     at: Callable[[int], KnownFields]

@@ -84,7 +84,7 @@ def _latency_ns(request: ReplayRequest) -> int:
 
 
 def reads_whole_log(request: ReplayRequest, source: RecordSource) -> bool:
-    """True if a lockstep reads all frames of the opened log, none left out as evidence."""
+    """True if a lockstep reads every frame of the log, none left out as evidence."""
     return request.lockstep and request.evidence not in source.cameras
 
 
@@ -268,7 +268,6 @@ class Lockstep:
 
 
 def _training_source(request: ReplayRequest, model: RobotModel, source: RecordSource | None) -> FrameSource:
-    """Open the log to train on, again if one of its cameras is evidence."""
     source = open_states(request.log, request.options, model.joint_names) if source is None else source
     if not source.cameras:
         raise InputError(

@@ -77,7 +77,6 @@ def _clearance(field: str) -> Metric[Replay]:
 
 
 def _of(columns: str, name: str, part: int | None = None) -> Callable[[Replay], Float64]:
-    """Reader of a column of the replay's figures `columns`, or a part of it."""
     figures = attrgetter(columns)
     return lambda replay: figures(replay)[name] if part is None else figures(replay)[name][:, part]
 
@@ -329,7 +328,10 @@ def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> Counts:
 
 
 def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> float | None:
-    """First time [s] at which a metric over the states so far breaks; None for other metrics."""
+    """First time [s] at which a metric over the states so far breaks.
+
+    None for metrics that are not of single states.
+    """
     running = next((of.running for of in _declared_of(replay) if of.name == metric), None)
     start, values = (np.nan, ()) if running is None else running(replay)
     if running is None or not holds(start):

@@ -80,7 +80,7 @@ def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
 
 
 def _with_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -> ReplayTrace:
-    """Add the change to the first scene after the motion, when an obstacle may have appeared."""
+    """Add the change to the first scene after the motion: an obstacle may have appeared."""
     last_ns = int(trace.stamp_ns[-1])
     next_ns = scene.next_ns(last_ns)
     if next_ns is None:

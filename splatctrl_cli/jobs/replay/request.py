@@ -88,7 +88,10 @@ class ReplayRequest(RobotOptions, RunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayInputs:
-    """All inputs of a replay; states in the model's joint order, link surfaces None if unreadable."""
+    """All inputs of a replay; states in the model's joint order.
+
+    surfaces: of links, None if unreadable. kept: margins of pairs.
+    """
 
     source: RecordSource
     states: StateColumns

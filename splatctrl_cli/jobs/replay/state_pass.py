@@ -51,12 +51,12 @@ class ReplayRecord:
     """Audit of T states in the scenes known at their times, with what happened.
 
     obstacles: nearest to the nearest sphere.
-    between: `lower` [m], clearance bound since the state before, NaN at the first; `met`, 1 if a posture on the way
-    has it; `unbounded` [s], time without a bound; `surface` [m], clearance of the body; `represented` [m], of the
+    between: clearance bound since the state before (`lower` [m], NaN at the first). `met`: 1 if a posture on the way
+    has it. `unbounded` [s]: time without a bound. `surface` [m]: clearance of the body. `represented` [m]: of the
     spheres to splats alone.
-    near: `NEAR_COLUMNS`, NaN where not evaluated.
-    hindsight: later depth about unwatched times. newer_depth: states judged by a late map. strain: shares of the
-    velocity and acceleration limits. closest: of link pairs below their margin, gap [m] and stamp.
+    near: `NEAR_COLUMNS`, NaN where not evaluated. hindsight: later depth about unwatched times. newer_depth: states
+    judged by a late map. strain: shares of the velocity and acceleration limits. closest: of link pairs below their
+    margin, gap [m] and stamp.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class ReplayRecord:
         self._seen_before: Seen | None = None  # when the fixed spheres were last looked at
 
     def blocks(self, stamps: Stamps) -> Iterator[tuple[int, int]]:
-        """Ranges of at most BLOCK states of stamps (T,), with one scene and robot surface each."""
+        """Ranges of at most BLOCK of stamps (T,), with one scene and robot surface each."""
         first = 0
         while first < len(stamps):
             scene, last = self._scene.at(int(stamps[first])), first + 1

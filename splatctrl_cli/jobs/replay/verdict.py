@@ -108,7 +108,6 @@ def waivers(request: ReplayRequest) -> Iterator[str]:
 
 
 def _declared_notes(judged: Judged) -> Iterator[str]:
-    """Notes on learned parts, declared contact, carried objects, and unused entries."""
     declared, inputs = judged.inputs.declared, judged.inputs
     if inputs.model.self_model is not None:
         yield from (part.words(int(inputs.states.stamp_ns[0])) for part in inputs.model.self_model.parts)

@@ -69,7 +69,7 @@ class WriteReportResult(WrittenFile):
 def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> WriteReportResult:
     """Write the page.
 
-    Raises InputError for a folder that is no complete run or batch, is too new, or unlike `against`.
+    Raises InputError for no or an incomplete run or batch, one too new, or unlike `against`.
     """
     if is_batch(request.path):
         page = _of_batch(request, open_batch(request.path), progress)
@@ -115,7 +115,6 @@ def _of_run(request: WriteReportRequest, run: RunFolder) -> Page:
 def _in_space(
     section: RunSection, run: RunFolder, roots: tuple[Path, ...], scenes: dict[str, str], name: str
 ) -> RunSection:
-    """Add the section's scene by name, or why there is none."""
     try:
         scenes[name] = packed(space_of_run(run, roots))
         return replace(section, space=name)
@@ -125,8 +124,6 @@ def _in_space(
 
 @dataclass(frozen=True, kw_only=True)
 class _Job:
-    """A job of a batch with its folder, or why that is unreadable."""
-
     ran: Run
     run: RunFolder | None
     why: str
@@ -179,7 +176,6 @@ def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progres
 
 
 def _gallery(jobs: Sequence[_Job], linked: set[str]) -> list[Picture]:
-    """A picture, of score or field, for each recording without a section."""
     shown = {job.ran.recording for job in jobs if job.ran.node in linked and job.run is not None}
     found = list[Picture]()
     for command, (name, words) in WITH_PICTURES.items():
@@ -249,7 +245,6 @@ def _section(
 
 
 def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> list[Table]:
-    """Table with a row for each recording, worst first, and a column for each job."""
     nodes = {(job.ran.recording, job.ran.column): job.ran for job in jobs}
     recordings = dict.fromkeys(job.ran.recording for job in jobs)
     names = columns_of(((ran.job, ran.column) for ran in batch.runs), batch.jobs)

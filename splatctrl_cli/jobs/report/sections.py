@@ -66,7 +66,6 @@ def section_of(
 
 
 def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
-    """Criteria that hold, or do not, the deciding one first."""
     rows = list[Row]()
     for reason in verdict.get("reasons", []):
         when = "" if reason["time_s"] is None else f" at {reason['time_s']:.2f} s"

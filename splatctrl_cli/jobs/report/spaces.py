@@ -172,7 +172,7 @@ def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
 
 
 def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple[float, Snapshot]]:
-    """Snapshots a replay used, each with the time [s] of the motion it was known from."""
+    """Snapshots a replay used, each with the motion time [s] it was known from."""
     latency_ns = round(1e9 * float(run.option("--latency") or 0.0))
     first, last = (int(stamp) - latency_ns for stamp in (states.stamps_ns[0], states.stamps_ns[-1]))
     known = [s for s in scene.snapshots if s.stamp_ns <= last] if scene.has_clock else list(scene.snapshots[-1:])
@@ -205,7 +205,6 @@ def _with_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) 
 
 
 def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
-    """Motion over at most MOST_STATES, with the state of least clearance."""
     count = len(states.seconds)
     chosen = set(np.linspace(0, count - 1, min(count, MOST_STATES)).round().astype(int).tolist())
     worst = states.worst()
@@ -236,7 +235,6 @@ def position_of(states: States, robot: RobotModel, state: int) -> Float64:
 
 
 def _deciding(run: RunFolder, states: States, robot: RobotModel) -> Deciding | None:
-    """The first failed reason with time and place, else the least clearance."""
     for reason in run.verdict.get("reasons", []):
         if reason["outcome"] != "passed" and reason["place"] is not None and reason["time_s"] is not None:
             words = f"{reason['sentence']} at {reason['time_s']:.2f} s, {reason['cause']}"

@@ -283,7 +283,6 @@ def _verdict(
 
 
 def _uncovered(report: CoverageReport, urdf: UrdfFile, allowed: float) -> list[str]:
-    """Faulty links, worst first."""
     bodies, root = urdf.rigid_bodies(), urdf.root
     bare = [f"{link} moves and has no sphere" for link in report.bare_links if bodies[link][0] != root]
     far = [(link.deficit.proven, link.link) for link in report.links if link.deficit is not None]

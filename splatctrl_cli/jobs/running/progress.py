@@ -7,7 +7,7 @@ TELL_S = 10.0  # between two lines of one wait
 
 
 class Progress(Protocol):
-    """Receiver of log lines; `is_quiet` if nobody reads them, so no bar is drawn."""
+    """Receiver of log lines; no bar is drawn if `is_quiet`."""
 
     is_quiet: bool
 
@@ -29,10 +29,7 @@ SILENT = Silent()
 
 
 class Wait:
-    """A wait of many steps: announced, then reported with the time left.
-
-    total: None if unknown.
-    """
+    """A wait of many steps, announced, then reported with the time left."""
 
     def __init__(self, progress: Progress, what: str, unit: str, total: int | None = None) -> None:
         self._progress, self._what, self._unit, self._total = progress, what, unit, total

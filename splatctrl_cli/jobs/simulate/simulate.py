@@ -206,7 +206,7 @@ def copied_arm(
 ) -> tuple[RobotModel, SelfSurfaces]:
     """Copy ``robot.urdf``, its ``meshes/`` and ``robot_spheres.yaml`` into a folder and read them.
 
-    The spheres are those of the file `given`, or fitted. Raises InputError without collision geometry or meshes.
+    The spheres come from the file `given`, or are fitted. Raises InputError without collision geometry or meshes.
     """
     original = read_urdf(urdf)
     solids = read_solids(original, packages)
@@ -282,7 +282,6 @@ def _with_own_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, pro
 
 
 def _copy(source: Path, folder: Path, copies: Mapping[tuple[str, str], str], is_visual: bool) -> str:
-    """Copy a mesh under a new name, and return the name."""
     kind = "meshes/visual" if is_visual else "meshes"
     stem = f"{source.stem}.stl" if is_visual else source.name
     name = f"{kind}/{stem}" if f"{kind}/{stem}" not in copies.values() else f"{kind}/{len(copies)}_{stem}"
@@ -296,9 +295,10 @@ def _copy(source: Path, folder: Path, copies: Mapping[tuple[str, str], str], is_
 
 
 def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
-    """Postures (K, J) with the tip at a pose (4, 4), or nearer to the base if out of reach.
+    """Find postures (K, J) with the tip at a pose (4, 4).
 
-    q: the simulated arm's, a first guess for an arm of as many joints.
+    If out of reach, the pose moves nearer to the base. q: the simulated arm's, a first guess for an arm of as many
+    joints.
     """
     tip = model.frame_names[-1]
     guesses = [model.middle, *random_postures(model, fixed.SIMULATED_GUESSES, seed=0)]
@@ -322,7 +322,7 @@ def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
 
 
 def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
-    """Yield poses turned about z, their place at `nearer` times the distance from the base axis."""
+    """Yield poses turned about z, `nearer` times as far from the base axis."""
     for angle in 2 * np.pi * np.arange(fixed.SIMULATED_TURNS) / fixed.SIMULATED_TURNS:
         T = T_base_hand.copy()
         c, s = np.cos(angle), np.sin(angle)

@@ -243,6 +243,5 @@ def _simulated(simulation: RunFolder, stages: Sequence[Stage], command_line: Com
 
 
 def _digests_behind(recording: Path) -> Iterable[str]:
-    """sha256 of a log, or of a capture's logs."""
     header = recording / "capture.json"
     return json.loads(header.read_text())["sources"].values() if header.is_file() else (sha256(recording),)

@@ -83,9 +83,9 @@ def _num_changes(ordered: Mapping[float, str]) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class LeastChange:
-    """Last point with the start's outcome and first with another along a direction, in range shares.
+    """Points before and after a flip along one direction, in range shares.
 
-    length: of the latter.
+    length: of `first`.
     """
 
     last: tuple[float, ...]
@@ -94,11 +94,12 @@ class LeastChange:
 
 
 def find_least(judge: JudgeAt, alone: Sequence[float | None], *, tolerance: float) -> LeastChange | None:
-    """Find the shortest joint change in the unit cube that flips the outcome of (0, ..., 0).
+    """Find the shortest joint change that flips the outcome of (0, ..., 0).
 
-    alone: the share at which each value flips it alone. It tries the diagonal and SWEEP_DIRECTIONS of Halton's
-    sequence, then turns the best towards and away from each value, by a quarter and an eighth. Each is tried at the
-    best length so far, and bisected to `tolerance` if it flips. None if no direction does.
+    Points lie in the unit cube. alone: the share at which each value flips it alone. It tries the diagonal and
+    SWEEP_DIRECTIONS of Halton's sequence, then turns the best towards and away from each value, by a quarter and an
+    eighth. Each is tried at the best length so far, and bisected to `tolerance` if it flips. None if no direction
+    does.
     """
     num = len(alone)
     start = judge([(0.0,) * num])[0]

@@ -359,7 +359,6 @@ def _together(
 
 
 def _write(out: Path, asked: Mapping[str, Any], result: SweepResult | None) -> None:
-    """sweep.json; without a result while the sweep runs."""
     found = {} if result is None else result.as_dict()
     document = {"format": FORMAT, "version": VERSION, "is_done": result is not None, "asked": asked, **found}
     write_durably(out / FILE, lambda path: write_json(path, document))
