@@ -1,6 +1,6 @@
 """Subcommands with examples, options, and functions by name.
 
-What a function needs is imported when it runs, so that help answers at once.
+A function's imports wait until it runs, so that help answers at once.
 """
 
 import importlib
@@ -38,7 +38,7 @@ LOG, ROBOT = "sample_data/tabletop/log.mcap", "--urdf arm.urdf --spheres arm.yam
 class Command:
     """A subcommand or action; `run` names MODULE:FUNCTION of this package.
 
-    With `actions` it has no other options. judges: ends in a verdict, for CI.
+    With `actions` it has no options of its own. judges: ends in a verdict, for CI.
     """
 
     summary: str

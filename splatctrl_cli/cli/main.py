@@ -1,4 +1,4 @@
-"""``splatctrl``: parse, run one subcommand, and turn errors into a line and exit code."""
+"""``splatctrl``: run one subcommand; errors become a line and exit code."""
 
 import argparse
 import errno

@@ -1,4 +1,4 @@
-"""Options of several subcommands, and their values; imports nothing heavy, for quick help."""
+"""Options of several subcommands; imports nothing heavy, for quick help."""
 
 import argparse
 import math

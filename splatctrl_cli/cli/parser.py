@@ -1,4 +1,4 @@
-"""An argument parser with one-line errors, short help, and options of one line each."""
+"""An argument parser with one-line errors, short help, and one-line options."""
 
 import argparse
 import difflib

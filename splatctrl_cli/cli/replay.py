@@ -1,4 +1,4 @@
-"""``splatctrl replay``: clearance of logged motion, and what a controller would do."""
+"""``splatctrl replay``: clearance of motion, and what a controller would do."""
 
 import argparse
 from collections.abc import Iterator, Sequence

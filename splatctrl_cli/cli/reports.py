@@ -1,4 +1,4 @@
-"""Output for other programs: the envelope of ``--json``, ``--junit FILE``, and GitHub annotations."""
+"""Output for other programs: ``--json`` envelope, ``--junit FILE``, GitHub annotations."""
 
 import argparse
 import sys

@@ -1,4 +1,4 @@
-"""Atomic outputs with one writer at a time, and ``run.json`` with digests of their files."""
+"""Atomic outputs with one writer at a time, and ``run.json`` with their digests."""
 
 import errno
 import fcntl
@@ -85,8 +85,8 @@ _WITHOUT_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.
 def held(partial: Path, *, is_folder: bool) -> Iterator[None]:
     """Lock a partial output for the block; create it if missing.
 
-    The lock follows a renamed file or folder, ends with the process, and leaves nothing. Without flock(2) nothing is
-    locked. Raises UsageError if another run has the lock.
+    The lock follows a rename, ends with the process, and leaves nothing. Without flock(2) nothing is locked. Raises
+    UsageError if another run has the lock.
     """
     descriptor = _taken(partial, is_folder=is_folder)
     try:
@@ -185,11 +185,11 @@ def output_path(
 ) -> Iterator[Path]:
     """Yield ``NAME.partial`` (an empty folder, or a file name); rename it to `path` on success.
 
-    A failure removes it; an interrupted run leaves it. `checkpoint`: a file in it to continue from; with that file, a
-    failure to write or of a card also leaves it. `resume` yields such a folder unchanged, and no failure removes it.
-    A link `path` stays, and its target is written. Raises UsageError if `path` has no name, exists without `force`,
-    or is of the wrong kind. Likewise for a folder of no command, another writer, or an unwritable parent. Raises
-    WriteError if `is_write_failure`; other errors pass unchanged.
+    A failure removes it; an interrupted run leaves it. With the file `checkpoint` in it, a failure to write or of a
+    card also leaves it. `resume` yields such a folder unchanged, and no failure removes it. A link `path` stays, and
+    its target is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind.
+    Likewise for a folder of no command, another writer, or an unwritable parent. Raises WriteError if
+    `is_write_failure`; other errors pass unchanged.
     """
     try:
         path = followed(path)

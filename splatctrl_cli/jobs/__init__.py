@@ -1,1 +1,1 @@
-"""Jobs behind the commands, without a terminal: a typed request in, a typed result out."""
+"""Jobs behind the commands: a typed request in, a typed result out, no terminal."""

@@ -1,4 +1,4 @@
-"""A calibration from request to result: cameras against each other and the robot."""
+"""A calibration: cameras against each other and the robot."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""A check from request to result: faults of a recording, before it costs an hour."""
+"""A check: faults of a recording, before they cost an hour."""
 
 import statistics
 from collections.abc import Collection, Iterator, Mapping, Sequence

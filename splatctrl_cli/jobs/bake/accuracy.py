@@ -1,4 +1,4 @@
-"""Report and verdict of a baked field; its errors against truth, mesh and held-out depth."""
+"""Report and verdict of a baked field, and its errors against references."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

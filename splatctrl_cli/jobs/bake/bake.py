@@ -1,4 +1,4 @@
-"""A bake from request to result: splats to a distance grid, slab by slab on disk."""
+"""A bake: splats to a distance grid, slab by slab on disk."""
 
 import shutil
 from collections.abc import Collection, Mapping, Sequence
@@ -64,9 +64,8 @@ def bake_to_disk(
 ) -> GridSlabs:
     """Bake the channels into ``partial/channels``; the baker's counts then cover all slabs.
 
-    kept: unchanged cells of an update; unknown: treatment of unobserved space. --resume continues after the last slab
-    of an interrupted bake. Raises UsageError for other settings than that bake had, or without room on disk or in
-    memory.
+    kept: unchanged cells of an update; unknown: treatment of unobserved space. --resume continues after the last
+    slab. Raises UsageError if that bake had other settings, or without room on disk or in memory.
     """
     baker, request, folder = job.baker, job.request, partial / FOLDER
     layout, config = baker.layout, request.config

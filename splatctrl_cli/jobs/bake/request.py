@@ -1,4 +1,4 @@
-"""A bake's request and its input: the scene, and for an update the field before."""
+"""A bake's request and input: the scene, and an update's previous field."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""A batch from request to verdict: read the suite, run its graph, write batch.json."""
+"""A batch: read the suite, run its graph, write batch.json."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The graph of a suite: a node for each recording, job and variant."""
+"""The graph of a suite: nodes of recording, job and variant."""
 
 import itertools
 import re

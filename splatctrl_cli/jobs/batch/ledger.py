@@ -1,4 +1,4 @@
-"""Runs by node and key in SQLite, with claims, input digests, and keys of nodes.
+"""Runs by node and key in SQLite, with claims and input digests.
 
 A key covers a node's words, the content of its inputs, and the code.
 """

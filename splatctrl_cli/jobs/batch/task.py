@@ -1,7 +1,7 @@
-"""One node's run in a forked child under limits, with its log, result and end.
+"""One node's run in a forked child under limits, with log, result and end.
 
-A runner process has the commands imported, so a node costs a fork, not a start of Python. It has one thread and runs
-one node at a time, read as JSON lines from stdin. When stdin ends, so does the run.
+A runner process has imported the commands, so a node costs a fork, not a start of Python. Its one thread runs one
+node at a time, read as JSON lines from stdin. When stdin ends, so does the run.
 """
 
 import contextlib
@@ -65,7 +65,7 @@ class Task:
 class End:
     """The end of a run; exit_code is None if it was killed, for `cause`.
 
-    seconds of wall time from `started` [s since 1970]. peak_mb [MB]. stamp: of the output, changes when rewritten.
+    started [s since 1970]. stamp: of the output, changes when rewritten.
     """
 
     key: str
@@ -250,7 +250,7 @@ def _be_child(function: Entry, task: Task) -> NoReturn:
 
 
 def _wait(pid: int, task: Task) -> str:
-    """Wait for the child or end it; return why, if so. Exits if stdin ends."""
+    """Wait for the child, or end it and return why. Exits if stdin ends."""
     start, asked, cause = time.monotonic(), 0.0, ""
     ended, look = os.pidfd_open(pid), POLL if task.memory else 1.0
     try:

@@ -1,4 +1,4 @@
-"""A comparison from request to result: regressions between runs, batches, or since a baseline."""
+"""A comparison: regressions between runs, batches, or since a baseline."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence

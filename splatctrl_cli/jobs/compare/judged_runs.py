@@ -1,4 +1,4 @@
-"""Judged runs to compare: a command's folder, a batch, or a baseline."""
+"""Judged runs to compare: of a folder, a batch, or a baseline."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""An export from request to result: splats in a viewer's format, or a run as Foxglove MCAP.
+"""An export: splats in a viewer's format, or a run as Foxglove MCAP.
 
 Written splats are read back and rendered before they count.
 """

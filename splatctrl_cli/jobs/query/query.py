@@ -1,4 +1,4 @@
-"""A query from request to result: answers of a field or scene at points of a table."""
+"""A query: answers of a field or scene at points of a table."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping

@@ -1,6 +1,6 @@
 """Time steps that leave a map: those due, and those with a new obstacle.
 
-Without the latter, an obstacle present only between two maps would escape a replay.
+An obstacle present only between two maps would otherwise escape a replay.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A reconstruction from request to result: splats, occupancy, audit and snapshots."""
+"""A reconstruction: recording to splats, occupancy, audit and snapshots."""
 
 from collections.abc import Mapping
 from contextlib import closing

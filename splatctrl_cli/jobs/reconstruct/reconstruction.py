@@ -1,4 +1,4 @@
-"""The fitter over a source's time steps, with outputs and checkpoints on the way."""
+"""The fitter over a source's time steps, with outputs and checkpoints."""
 
 import math
 import time
@@ -247,7 +247,6 @@ class Reconstruction:
         self._save(is_last=True)
 
     def metrics(self) -> dict[str, object]:
-        """Metrics for ``run.json`` and gates."""
         assert self.fitter is not None
         last = self.rows[-1]
         learned = None if self.robot is None else self.robot.self_model
@@ -296,7 +295,6 @@ class Reconstruction:
         self.writer.audit(row)
 
     def snapshot(self, stamp_ns: int) -> None:
-        """Write the current map."""
         assert self.fitter is not None
         known, thresholds = self.fitter.known_voxels(), self.config.occupancy
         states = known.grid.states(thresholds.free_below, thresholds.occupied_above)

@@ -1,4 +1,4 @@
-"""The job of `robot learn`: choose frame sets of distinct postures, and fuse the arm in them."""
+"""Learning a robot's own surface: choose frame sets of distinct postures, and fuse them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""The verdict of a reconstruction: its map, and doubts with time and place."""
+"""The verdict of a reconstruction."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

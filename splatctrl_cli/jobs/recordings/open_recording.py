@@ -1,4 +1,4 @@
-"""Opening a recording to train on or score, and checks that its cameras agree."""
+"""Recordings opened to train on or score, and checked for agreement."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace

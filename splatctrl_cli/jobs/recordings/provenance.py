@@ -1,4 +1,4 @@
-"""Matches of a scene or field, a log, a truth and a robot by content.
+"""Matches of scene or field, log, truth and robot by content.
 
 Camera names are alike on every rig and prove nothing.
 """

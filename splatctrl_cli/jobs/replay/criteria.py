@@ -1,4 +1,4 @@
-"""The input of a replay's criteria, and the criteria of time and of the controller."""
+"""Input of a replay's criteria; criteria of time and of the controller."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

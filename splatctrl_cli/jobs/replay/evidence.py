@@ -2,8 +2,8 @@
 
 The field's value at a surface point is the map's miss there. Let a sphere's true clearance be d, and p the true
 surface point nearest to it. The exact distance is 1-Lipschitz, so the map's clearance is at most d plus the miss at
-p. Let no surface within `verdict.evidence_reach` of the motion be missed by more than b (`evaluate.conformal`). Then
-the true clearance is at least the map's less b, or more than that reach.
+p. If no surface within `verdict.evidence_reach` of the motion is missed by more than b (`evaluate.conformal`), the
+true clearance is at least the map's less b, or more than that reach.
 """
 
 from collections.abc import Iterable, Iterator

@@ -1,4 +1,4 @@
-"""Files of a replay: steps, events, summary, plots, and pictures of the worst moments."""
+"""Files of a replay: steps, events, summary and pictures."""
 
 import math
 import re

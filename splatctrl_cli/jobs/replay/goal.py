@@ -1,4 +1,4 @@
-"""The controller of a replay, and its goal: pose, configuration, waypoints or logged twists."""
+"""The controller of a replay and its goal."""
 
 import csv
 import math

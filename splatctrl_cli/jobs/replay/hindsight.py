@@ -1,4 +1,4 @@
-"""Obstacles a map did not contain yet: later depth shows one where the arm was."""
+"""Obstacles that only later depth shows where the arm was."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

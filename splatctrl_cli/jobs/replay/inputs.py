@@ -1,4 +1,4 @@
-"""A replay's robot with the coverage of its spheres, and the states of a log."""
+"""A replay's robot with its sphere coverage, and a log's states."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass

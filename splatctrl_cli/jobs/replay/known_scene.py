@@ -1,4 +1,4 @@
-"""Scenes a replay may use: a baked grid, or the splats known at each time."""
+"""Scenes known to a replay: a baked grid, or splats over time."""
 
 import math
 from bisect import bisect_right

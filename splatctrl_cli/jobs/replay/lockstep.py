@@ -1,4 +1,4 @@
-"""A log's reconstruction in lockstep with its replay: frame sets enter as its clock passes."""
+"""A log's reconstruction in lockstep with its replay's clock."""
 
 import time
 from bisect import bisect_right

@@ -1,4 +1,4 @@
-"""Metrics of a replay, with names known beforehand: value, sample count, and first failure."""
+"""Metrics of a replay by predefined names: value, sample count, first failure."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,4 +1,4 @@
-"""Criteria of the motion against the scene, the robot itself, its limits and its goal."""
+"""Criteria of a replay's motion: scene, self-collision, limits and goal."""
 
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""A replay from its request to its result: read, replay, measure, write."""
+"""A replay: read, replay, measure, write."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

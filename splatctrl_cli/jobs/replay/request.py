@@ -1,4 +1,4 @@
-"""A replay's request, its inputs, and its result: audit, trace and references."""
+"""A replay's request, inputs and result."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class ReplayRequest(RobotOptions, RunOptions):
 
     log: read by `options`. urdf: None for the robot of the log. The scene is `scene` (a reconstruction), `field` (a
     baked grid) or `lockstep` (reconstruct on the way, on `device`). start_time [s] may be FIRST_MAP. evidence: a
-    held-out camera, or k for each k-th frame set; it bounds the map's error. require_evidence, require_proof: no pass
+    held-out camera, or k for each k-th frame set, to bound the map's error. require_evidence, require_proof: no pass
     without evidence, or with space about the arm assumed free. unseen: `JUDGE` or `OCCUPIED`. controller: a user's
     class ``module:Class``; controller_command: a program (docs/controllers.md). report_only: the verdict sets no exit
     code.

@@ -1,4 +1,4 @@
-"""States of a replay as they come, block by block: measured, explained and stored."""
+"""States of a replay, measured, explained and stored block by block."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

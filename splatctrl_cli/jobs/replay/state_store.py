@@ -1,4 +1,4 @@
-"""States of a replay in files: columns and objects, read whole, singly, or by blocks."""
+"""States of a replay in files, read whole, singly, or by blocks."""
 
 import pickle
 import tempfile

@@ -1,4 +1,4 @@
-"""The verdict of a replay: every criterion of *safe*, with time, place and remedy."""
+"""The verdict of a replay, by every criterion of *safe*."""
 
 from collections.abc import Iterator
 from dataclasses import replace

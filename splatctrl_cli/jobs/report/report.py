@@ -1,4 +1,4 @@
-"""A report from request to page: a run, a batch, or a 3-D view, in one HTML file."""
+"""A report on a run or batch, or a 3-D view, in one HTML file."""
 
 import json
 import math

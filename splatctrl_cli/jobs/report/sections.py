@@ -1,4 +1,4 @@
-"""Sections of a page on one run, and changes since an earlier one."""
+"""Sections of a page on one run, and its changes."""
 
 import json
 import shlex

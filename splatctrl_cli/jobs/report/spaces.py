@@ -1,4 +1,4 @@
-"""The 3-D scene of a run, scene folder, field or splat file."""
+"""3-D scenes of runs, scene folders, fields and splat files."""
 
 import re
 from collections.abc import Mapping

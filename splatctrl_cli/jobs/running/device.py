@@ -1,4 +1,4 @@
-"""Device of a fit or bake: the processor, or a usable CUDA card worth its start."""
+"""Device of a fit or bake: the processor, or a CUDA card worth its start."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -91,7 +91,7 @@ def automatic(
 
 
 def chosen(name: str, is_enough: bool, progress: Progress) -> Device:
-    """Device of --device for fields; auto asks for a card if the work is enough.
+    """Device of --device for fields; auto uses a card if the work is enough.
 
     Raises UsageError if unusable.
     """

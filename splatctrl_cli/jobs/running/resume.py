@@ -1,4 +1,4 @@
-"""Resumption of an interrupted run: what must be equal, and what differs."""
+"""Resumption of an interrupted run, and what must be equal."""
 
 import json
 from collections.abc import Iterator, Mapping

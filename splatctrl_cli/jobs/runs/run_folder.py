@@ -1,4 +1,4 @@
-"""Output folder of a finished run (``run.json``, states, pictures), and of a batch."""
+"""Output folder of a finished run or batch."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""Reference of `score`: the recording, its scored views by protocol, and their masks."""
+"""Reference of `score`: recording, scored views by protocol, and masks."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

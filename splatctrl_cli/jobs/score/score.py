@@ -1,4 +1,4 @@
-"""A score of a scene against held-out views, from request to result: one or several scans."""
+"""A score of scenes against held-out views of one or several scans."""
 
 import csv
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Renders scored views from the splats of their time; scores views and surfaces."""
+"""Scores of rendered views and of surfaces."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Sequence

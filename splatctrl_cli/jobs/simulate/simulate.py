@@ -1,4 +1,4 @@
-"""A simulation from request to result: a log of an arm at a table, with its truth.
+"""A simulation: a log of an arm at a table, with its truth.
 
 Another arm gets its files, its spheres, and a motion that moves its tip like ours.
 """

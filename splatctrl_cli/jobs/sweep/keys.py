@@ -1,4 +1,4 @@
-"""Keys of a sweep, and the jobs of a run with their values."""
+"""Keys of a sweep, and the jobs with their values."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence

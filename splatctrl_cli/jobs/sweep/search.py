@@ -1,4 +1,4 @@
-"""Search for a change of outcome: along one value, or over several."""
+"""Search for a change of outcome over one or several values."""
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence

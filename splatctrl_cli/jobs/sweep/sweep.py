@@ -1,4 +1,4 @@
-"""A sweep from request to result: replay with other values until the verdict flips."""
+"""A sweep: replay with other values until the verdict flips."""
 
 import math
 import time
