@@ -106,7 +106,7 @@ class OfThisProgram:
 
 
 def run_words(words: list[str]) -> int:
-    """Entry point of a runner."""
+    """Run the program, for a runner."""
     main = importlib.import_module("splatctrl_cli.cli.main").main
     code: int = main(words)
     return code

@@ -119,7 +119,6 @@ class Parser(argparse.ArgumentParser):
         )
 
     def format_full_help(self) -> str:
-        """Every option, by group."""
         return self._format([*self._action_groups, self.run_group])
 
     def _format(self, groups: Iterable[argparse._ArgumentGroup]) -> str:

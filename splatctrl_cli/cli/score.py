@@ -52,7 +52,7 @@ def _request(args: argparse.Namespace) -> ScoreRequest:
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:
-    """Raises UsageError for options of --cloud alone."""
+    """Read --cloud's settings. Raises UsageError for its options alone."""
     if args.cloud is None:
         for name in ("unit", "masks"):
             if getattr(args, f"cloud_{name}") is not None:

@@ -32,7 +32,7 @@ class RowFile:
     """Rows of one shape, appended; reads return copies, without mapping into memory."""
 
     def __init__(self, shape: tuple[int, ...] = (), blocks: Iterable[Float64] = ()) -> None:
-        """shape: of a row; blocks: first rows (T, ...)."""
+        """Start with `blocks` of rows (T, ...); shape: of a row."""
         self.row_shape = shape
         self._row_bytes = 8 * int(np.prod(shape, dtype=np.int64))
         self._num = 0

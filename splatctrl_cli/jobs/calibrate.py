@@ -285,7 +285,7 @@ def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotE
 def _calibration(
     source: FrameSource, solution: Solution, begin: Mapping[str, Float64], unknown: Mapping[str, tuple[str, ...]]
 ) -> Calibration:
-    """begin: initial T_recorded_camera (4, 4) by camera."""
+    """Build the calibration; begin: initial T_recorded_camera (4, 4) by camera."""
     evidence, estimate, certainty = solution.adjustment.evidence, solution.estimate, solution.certainty
     cameras = {}
     for camera in evidence.cameras:

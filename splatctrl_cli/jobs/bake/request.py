@@ -63,7 +63,6 @@ class BakeRequest(RunOptions):
 
     @property
     def label_names(self) -> list[str]:
-        """Label names for a field's header."""
         return sorted(label.name.lower() for label in self.labels)
 
 

@@ -101,7 +101,7 @@ class Ledger(AbstractContextManager["Ledger"]):
     """The ledger of batches in one folder; several processes may open it."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises InputError for another or a newer file."""
+        """Open the ledger. Raises InputError for another or a newer file."""
         folder.mkdir(parents=True, exist_ok=True)
         self.folder, self.path = folder, folder / NAME
         self._owner = f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"

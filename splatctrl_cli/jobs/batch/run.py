@@ -265,5 +265,4 @@ def verdict_in(result: Path) -> dict[str, Any]:
 
 
 def not_run(node: Node, key: str, folder: Path, *, state: str, cause: str) -> Run:
-    """Run of a node that did not run, with its cause."""
     return replace(run_of(node, key, End.without_one(key, cause), folder), state=state)

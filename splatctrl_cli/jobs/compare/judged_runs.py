@@ -231,7 +231,7 @@ def _key(name: str) -> str:
 
 
 def _toml(value: object) -> str:
-    """Nine digits, as in ``steps.csv``."""
+    """Format a value with nine digits, as in ``steps.csv``."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int | float):
@@ -274,7 +274,7 @@ def worst_state(folder: Path | None, metric: str) -> WorstState | None:
 
 
 def _badness(where: Shown, text: str) -> float:
-    """Smaller is worse; infinite if the cell does not count."""
+    """Rank a cell: smaller is worse, infinite does not count."""
     if where.pick not in ("least", "largest"):
         return 0.0 if text == where.pick else math.inf
     if not text:

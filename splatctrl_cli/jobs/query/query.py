@@ -78,7 +78,10 @@ class SceneAnswers:
         threads: int,
         device: Memory | None = None,
     ) -> None:
-        """device: a card for the distances. Raises UsageError if unknown space counts: only a grid has it."""
+        """Build the fields, on the card `device` if given.
+
+        Raises UsageError if unknown space counts: only a grid has it.
+        """
         if config.field.unknown != "free":
             raise UsageError(
                 f"field.unknown = {config.field.unknown}: only a baked field has it",
@@ -140,7 +143,7 @@ class GridAnswers:
     """Channels of a baked grid: interpolated distances, labels and observations of the nearest cell."""
 
     def __init__(self, grid: DistanceGrid, where: str) -> None:
-        """Raises InputError as `GridField` does, and for an unknown label or state."""
+        """Read the channels. Raises InputError as `GridField` does, and for unknown labels or states."""
         self._field = GridField(grid)
         self.box = self._field.box
         self._has_bound = "bound" in grid.channels
@@ -228,8 +231,8 @@ class QueryRequest(RunOptions):
 class QueryResult:
     """A query's figures; kind: scene, field, or field and scene.
 
-    metrics: num_points, num_answered (with a distance), num_outside the box, num_in_collision (distance at most 0),
-    num_never_seen, min_distance, mean_distance and min_bound [m]; None if unknown.
+    metrics: num_points; num_answered, with a distance; num_outside the box; num_in_collision, at a distance of at
+    most 0; num_never_seen; min_distance, mean_distance and min_bound [m]. None if unknown.
     """
 
     out: Path | None

@@ -242,7 +242,7 @@ class Swept:
     """Space within `reach` [m] of an arm's moving spheres, up to SPHERE_CELL more."""
 
     def __init__(self, cells: Float64, radii: Float64, reach: float) -> None:
-        """cells (K, 3): whole numbers of SPHERE_CELL; radii (K,) [m]: the largest sphere in each."""
+        """Enclose cells (K, 3), whole numbers of SPHERE_CELL, by radii (K,) [m], the largest in each."""
         centers, self._reach = (cells + 0.5) * SPHERE_CELL, reach
         enlarged = radii + 0.5 * SPHERE_CELL * 3**0.5
         self._field = SphereField(centers, enlarged)

@@ -200,7 +200,6 @@ def when_and_why(replay: Replay) -> list[str]:
 
 
 def told(event: Event, *, with_kind: bool = True) -> str:
-    """An event as a sentence."""
     unit = UNITS.get(event.kind, "")
     span = f"{event.start_s:.2f} to {event.end_s:.2f} s"
     more = f" and {event.num_names - 1} more" if event.num_names > 1 else ""

@@ -260,7 +260,6 @@ class LoggedStates:
         return {name: num_intervals if name.startswith("clock_") else num_poses for name in [*LOG_FIGURES][1:]}
 
     def lines(self) -> list[str]:
-        """Notes to print."""
         notes = self.source.loss.notes
         more = [f"and {len(notes) - MAX_NOTES} more notes in states.json"] if len(notes) > MAX_NOTES else []
         found = [check.sentence for check in (self.poses, self.clock) if check is not None]

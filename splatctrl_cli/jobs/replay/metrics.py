@@ -293,7 +293,6 @@ def metric_names(
 def metric_scales(
     mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
 ) -> dict[str, Scale]:
-    """Comparison scale of each metric name."""
     scales = {metric.name: metric.scale for metric in _declared(mode, of_fields)} | LOG_FIGURES
     scales |= TWIST_FIGURES if has_twists else {}
     if has_truth:

@@ -72,10 +72,10 @@ class ReplayRecord:
         surfaces: SelfSurfaces | None = None,
         kept: Sequence[KeptMargin] = (),
     ) -> None:
-        """is_continuous: False if the arm is re-anchored, so that nothing is bounded between states.
+        """Start an empty record.
 
-        declared: intended contact, its times from `first_state_ns`. surfaces: for self-collision; None uses the
-        spheres.
+        is_continuous: False if the arm is re-anchored, so that nothing is bounded between states. declared: intended
+        contact, its times from `first_state_ns`. surfaces: for self-collision; None uses the spheres.
         """
         self._declared, self._first_state_ns = declared or Declarations(), first_state_ns
         self.audit, self.obstacles, self.ages = StoredAudit(), StoredObjects[str](), Figures()

@@ -139,7 +139,6 @@ class RobotResult:
 
     @property
     def doubts(self) -> list[str]:
-        """Possible faults of the spheres."""
         return list(self.model.doubts) if len(self.model.sphere_set.radii) else []
 
     def as_dict(self) -> dict[str, Any]:

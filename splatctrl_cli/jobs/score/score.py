@@ -68,7 +68,7 @@ class ScoreRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreResult:
-    """report: the content of ``score.json``."""
+    """A score; report: the content of ``score.json``."""
 
     __repr__ = brief
 
@@ -210,7 +210,7 @@ def _protocol(reference: Reference, scene: SceneFolder, scores: Scores) -> dict[
 
 
 def _free_mass(path: Path, scene: SceneFolder) -> float:
-    """NaN without an occupancy grid."""
+    """Free mass of the scene, NaN without an occupancy grid."""
     if not (path / "occupancy.npz").is_file():
         return nan
     keys = ("config", "occupancy", "free_below")

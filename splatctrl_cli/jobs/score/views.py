@@ -217,7 +217,6 @@ class CloudSettings:
         return replace(self, path=path, space=None if self.masks is None else read_observed(self.masks, scan or ""))
 
     def words(self) -> str:
-        """Definition of the figures."""
         within = "" if self.masks is None else f"; within the masks and above the planes of {self.masks}"
         return (
             f"{self.path}, 1 unit = {self.unit:g} m; points {1e3 * self.spacing:g} mm apart; means below"
