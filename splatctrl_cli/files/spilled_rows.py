@@ -14,7 +14,7 @@ from splatctrl_cli.records import Float64, Index
 
 IN_MEMORY = 2**20  # [bytes] up to which a file is memory
 BLOCK = 4096  # rows at once
-FEW = 4096  # rows that are read beside those that were asked for
+FEW = 4096  # unrequested rows that may be read along
 
 
 def scratch_folder() -> Path:

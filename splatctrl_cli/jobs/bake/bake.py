@@ -75,7 +75,7 @@ def bake_to_disk(
         voxel=layout.voxel,
         shape=layout.shape,
         channels=baker.channels,
-        settings={  # everything that decides the bytes beside the grid and its channels
+        settings={  # everything else that decides the bytes
             **deciding_versions(),
             **{f"field.{name}": value for name, value in asdict(config.field).items()},
             **{f"occupancy.{name}": value for name, value in asdict(config.occupancy).items()},

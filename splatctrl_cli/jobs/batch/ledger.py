@@ -30,7 +30,7 @@ from splatctrl_cli.jobs.batch.graph import Node
 NAME, OWNERS = "ledger.sqlite", ".owners"
 FILE, FORMAT, FILE_VERSION = "batch.json", "splatctrl-batch", 1  # what a batch says of itself
 VERSION = 1  # of the tables
-BUSY_S, WAIT_S = 30.0, 0.02  # to wait for another process that writes, and before it is asked again
+BUSY_S, WAIT_S = 30.0, 0.02  # longest wait for another writer, and between attempts
 _COMPARISON = re.compile(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)")
 WITHOUT_EFFECT = ("--force", "--resume", "--quiet", "-q", "--json")
 THREADS = "--threads"  # changes no byte

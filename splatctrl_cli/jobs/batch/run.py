@@ -23,7 +23,7 @@ from splatctrl_cli.jobs.running.progress import Progress, duration
 DONE, FAILED, ERROR, SKIPPED, TO_DO = "done", "failed", "error", "skipped", "to do"
 NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes of a command that came to none
 AGAIN_S = 0.5  # between looks at what another batch runs
-STILL_S = 60.0  # without an end, after which it is said what is waited for
+STILL_S = 60.0  # without an ended node, until a log line names what runs
 MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes, when nothing here asked for it
 DISK_FULL = 6
 UNRUN = "has not run since the suite, its inputs or the program changed"

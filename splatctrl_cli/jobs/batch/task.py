@@ -184,7 +184,7 @@ def main(entry: str) -> None:
         end = _run(function, Task(**json.loads(line)))
         try:
             os.write(1, (json.dumps(asdict(end)) + "\n").encode())
-        except BrokenPipeError:  # nobody waits for it any more; the end is in its file
+        except BrokenPipeError:  # its reader is gone; the end is in its file
             return
 
 
@@ -258,7 +258,7 @@ def _wait(pid: int, task: Task) -> str:
             ready, _, _ = select.select([ended, 0], [], [], look)
             if ended in ready:
                 return cause
-            if 0 in ready and not os.read(0, 1):  # nobody waits for this any more
+            if 0 in ready and not os.read(0, 1):  # its reader is gone
                 _signal(pid, signal.SIGKILL)
                 os._exit(1)
             if task.memory and _memory_of(pid) > task.memory:

@@ -114,7 +114,7 @@ class Reconstruction:
         self.num_read = 0  # time steps of the source, those that were left out included
         self.is_refined = False
         self.corrected: dict[str, Any] = {}  # what was corrected of the views
-        self._early: TimeStep | None = None  # the first that said nothing of the workspace
+        self._early: TimeStep | None = None  # the first step without a workspace
         self.depth: RecordedDepth | None = None  # by which the map's lengths were chosen
         allowed, still, guess = request.allow_disagreement, not self.source.has_clock, guessed_unit(self.source)
         self.agreement = CameraAgreement(self.source, is_allowed=allowed, is_still=still, guess=guess)

@@ -244,7 +244,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
         return
     value = found.bound.bound
     if surface is None:
-        return  # no distance at any state, which is said of them
+        return  # no distance at any state: other criteria report it
     if surface >= value:
         yield held(bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
         return

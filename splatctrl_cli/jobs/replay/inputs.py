@@ -41,7 +41,7 @@ from splatctrl_cli.robot.self_margins import (
 from splatctrl_cli.robot.self_model import ALWAYS
 
 MAX_NOTES = 10  # printed
-GRASPING = 1.0  # [s] before a thing is held, and after, in which the hand may touch it
+GRASPING = 1.0  # [s] before and after a grasp in which the hand may touch the object
 ANGLE = Scale(unit="rad")
 LOG_FIGURES = {  # they describe the log
     "num_poses": DESCRIBES,

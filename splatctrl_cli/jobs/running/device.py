@@ -144,7 +144,7 @@ class FitDevice:
     def close(self) -> None:
         """Free the card's memory."""
         if self._fit is not None:
-            with suppress(DeviceError):  # a card that failed has been told of
+            with suppress(DeviceError):  # its failure was reported already
                 self._fit.close()
 
     @contextmanager

@@ -14,7 +14,7 @@ from splatctrl_cli.files.output import sha256
 from splatctrl_cli.formats.scene.scene_writer import Checkpoint, read_checkpoint
 from splatctrl_cli.kernels import arithmetic
 
-DECIDING_OPTIONS: Mapping[str, object] = {  # what decides the bytes of a scene beside its configuration, if not given
+DECIDING_OPTIONS: Mapping[str, object] = {  # defaults that decide a scene's bytes, besides its configuration
     **{"cameras": None, "camera": [], "camera_pose": [], "world_frame": None, "depth_scale": None},
     **{
         "pairing_tolerance": 0.02,

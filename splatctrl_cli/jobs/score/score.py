@@ -280,7 +280,7 @@ def _score_scans(
     for scan, scene in scenes.items():
         progress.log(f"{scan}: scores {scene}")
         recording = of_scan(request.recording, scan)
-        # the means alone are held to gates and a baseline
+        # gates and baseline apply to the means alone
         alone = replace(request, scene=scene, recording=recording, require=(), baseline=None)
         results[scan] = _score_scene(alone, folder and folder / scan, progress)
     report = {"scenes": str(request.scene), "reference": str(request.recording.path)}
