@@ -33,7 +33,7 @@ PRELOADED = (  # of a runner
     *("check", "ingest", "reconstruct.reconstruct", "export.export", "bake.bake", "score.score", "replay.replay"),
 )
 MOST_ROWS = 40  # recordings that are all printed
-OWN = ("out", "force", "resume", "threads")  # options that a batch gives itself, where a command has them
+OWN = ("out", "force", "resume", "threads")  # options a batch gives itself
 NOT_OF_A_NODE = (*OWN, "help", "help-all", "json", "verbose", "quiet", "junit", "preset")  # the last is in --set
 
 

@@ -15,7 +15,7 @@ from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
 from splatctrl_cli.recording.source import describe
 
 WIDTH = 118  # columns of text
-FEW = 3  # rows that no command reads, which are all printed
+FEW = 3  # unread rows, up to which all are printed
 
 
 def run(args: argparse.Namespace) -> int:

@@ -30,7 +30,7 @@ EXIT_CODES = """\
 exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 3 done, but part of the input was
 damaged; 4 input missing or unusable; 5 cannot be evaluated; 6 writing failed; 70 our own bug, or a card that failed;
 130 interrupted"""
-SHELLS = ("bash", "zsh", "tcsh")  # as shtab has them, which is not imported for a help text
+SHELLS = ("bash", "zsh", "tcsh")  # shtab's, without importing it for help
 LOG, ROBOT = "sample_data/tabletop/log.mcap", "--urdf arm.urdf --spheres arm.yaml"  # of examples
 
 

@@ -54,8 +54,7 @@ class Console:
     ) -> int:
         """Print a verdict, its reasons and notes, then `result` or `lines`; return the exit code.
 
-        With --json a failure's sentence also goes to stderr. code: in place of the verdict's. has_findings: `lines`
-        contain the reasons.
+        With --json a failure's sentence also goes to stderr. has_findings: `lines` contain the reasons.
         """
         code = verdict.exit_code if code is None else code
         if self.is_json:

@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     refuse_endless_files()
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when cv2 is first imported
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of numpy; more wait for each other, and round otherwise
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of numpy; more threads wait, and round otherwise
     words, args, start = sys.argv[1:] if argv is None else list(argv), None, time.perf_counter()
     try:
         args = build_parser(words[0] if words else "").parse_args(words)
@@ -76,7 +76,7 @@ def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbo
     line = " ".join((f"{message}; {remedy}" if remedy else message).split())
     print(f"splatctrl: {line}", file=sys.stderr)
     if is_json and not isinstance(sys.stdout, _Lost):
-        with suppress(OSError):  # the refusal says more than that it could not be printed
+        with suppress(OSError):  # the error matters more than a failed print
             print(
                 json.dumps(enveloped({"error": {"message": message, "remedy": remedy}}, code), indent=2), flush=True
             )

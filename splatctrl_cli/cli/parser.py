@@ -15,7 +15,7 @@ T = TypeVar("T", int, float)
 
 MAX_SECONDS = 1e8  # [s] of a recording: three years
 MOST_WIDTH = 100  # columns of help
-GONE = {  # commands and options that left the command line, and what takes their place
+GONE = {  # removed commands and options, with replacements
     "capture": "`tar -cf X.tar X.capture` for one file, `splatctrl export REPLAY --mcap` for a viewer",
     "splatctrl reconstruct --method": "python -m experiments fits",
     **dict.fromkeys(

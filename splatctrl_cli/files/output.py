@@ -43,7 +43,7 @@ class Parts:
 
     @classmethod
     def beside(cls, path: Path) -> "Parts":
-        """Read the digests in the folder of a file; None without ``run.json`` or from an older version.
+        """Read the digests in a file's folder; None without ``run.json`` or from an older version.
 
         Raises InputError for an unreadable ``run.json``.
         """
@@ -96,7 +96,7 @@ def held(partial: Path, *, is_folder: bool) -> Iterator[None]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, link or folder; a missing one is no error."""
+    """Remove a file, link or folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -115,7 +115,7 @@ def _taken(partial: Path, *, is_folder: bool) -> int:
             continue  # its run ended between
         try:
             _lock(descriptor, partial)
-            if _is_at(partial, descriptor):  # else it was renamed or removed between, and is another's
+            if _is_at(partial, descriptor):  # else another process renamed or removed it
                 if partial.is_dir() == is_folder:
                     return descriptor
                 remove(partial)
@@ -145,7 +145,7 @@ def _is_at(path: Path, descriptor: int) -> bool:
 
 
 def _holder(inode: int) -> int | None:
-    """Process that locks an inode, None if the kernel does not list it."""
+    """Process that locks an inode, None if the kernel lists none."""
     try:
         lines = LOCKS.read_text(encoding="ascii").splitlines()
     except OSError:
@@ -162,12 +162,12 @@ def _holder(inode: int) -> int | None:
     return None
 
 
-MARKERS = ("run.json", "capture.json")  # at the top of every folder that a command wrote
-PARTIAL = ".partial"  # ends the name of an output that is not whole
+MARKERS = ("run.json", "capture.json")  # one is in every folder a command wrote
+PARTIAL = ".partial"  # suffix of an incomplete output
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin", "clarabel", "mcap", "rosbags")
 _WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EBADF})
 WITH_PARTS = ("reconstruct", "sdf-bake", "replay")  # commands whose folders others rely on
-NO_PARTS = ("run.json", "checkpoint")  # what holds the digests, and what only an interrupted run reads
+NO_PARTS = ("run.json", "checkpoint")  # the digests' own file, and what only an interrupted run reads
 
 
 def is_write_failure(error: OSError, output: Path | None = None) -> bool:
@@ -186,10 +186,10 @@ def output_path(
     """Yield ``NAME.partial`` (an empty folder, or a file name); rename it to `path` on success.
 
     A failure removes it; an interrupted run leaves it. With the file `checkpoint` in it, a failure to write or of a
-    card also leaves it. `resume` yields such a folder unchanged, and no failure removes it. A link `path` stays, and
-    its target is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind.
-    Likewise for a folder of no command, another writer, or an unwritable parent. Raises WriteError if
-    `is_write_failure`; other errors pass unchanged.
+    card leaves it, too. `resume` yields such a folder unchanged, and no failure removes it. A link `path` stays, and
+    its target is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind;
+    for a folder of no command, another writer, or an unwritable parent. Raises WriteError if `is_write_failure`;
+    other errors pass.
     """
     try:
         path = followed(path)
@@ -240,13 +240,13 @@ def followed(path: Path) -> Path:
 
 
 def partial_path(path: Path) -> Path:
-    """``NAME.partial`` next to the path, or to a link's target, where an output is written."""
+    """``NAME.partial`` next to the path, or to a link's target."""
     target = followed(path)
     return target.with_name(target.name + PARTIAL)
 
 
 def check_can_be_written(path: Path) -> None:
-    """Raise UsageError early if the nearest existing folder is not writable."""
+    """Raise UsageError early if the nearest folder is not writable."""
     try:
         above = next(folder for folder in followed(path).absolute().parents if folder.exists())
         is_good = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
@@ -258,7 +258,7 @@ def check_can_be_written(path: Path) -> None:
 
 
 def write_durably(path: Path, write: Callable[[Path], object]) -> None:
-    """Call `write` with a temporary name, then replace `path` in one step, on disk."""
+    """Call `write` with a temporary name, then replace `path` on disk in one step."""
     temporary = path.with_name(path.name + ".new")
     try:
         write(temporary)
@@ -280,7 +280,7 @@ def flush(path: Path) -> None:
 
 
 def _check_replaceable(path: Path, *, is_folder: bool) -> None:
-    """Raise UsageError if --force could remove foreign files: ours is empty or has a marker."""
+    """Raise UsageError if --force could remove foreign files: ours have a marker."""
     if path.name in ("", ".."):
         raise UsageError(f"{path}: has no name of its own to write under", remedy="give another --out")
     if is_folder and path.is_file():
@@ -317,7 +317,7 @@ def _replace(partial: Path, path: Path) -> None:
         partial.rename(path)
     else:
         partial.replace(path)
-    remove(old)  # also that of a run which was killed right above
+    remove(old)  # also of a run killed right above
 
 
 class Stopwatch:
@@ -353,7 +353,7 @@ def write_run(
     seed: int = 0,
     verdict: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write ``run.json``: command, settings, sha256 of inputs by name, times, metrics and verdict.
+    """Write ``run.json``: command, settings, sha256 of inputs, times, metrics and verdict.
 
     Write it last: for WITH_PARTS it has the sha256 of every file, checked on opening. It omits ``--resume``, so that
     an interrupted run leaves what an uninterrupted one does.

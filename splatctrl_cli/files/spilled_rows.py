@@ -24,12 +24,12 @@ def scratch_folder() -> Path:
 
 
 def ranges(num: int) -> Iterator[tuple[int, int]]:
-    """First and one past the last row of each `BLOCK` of `num` rows."""
+    """First and one past the last row of each `BLOCK`."""
     yield from ((first, min(first + BLOCK, num)) for first in range(0, num, BLOCK))
 
 
 class RowFile:
-    """Rows of one shape, appended; reads return copies, without mapping into memory."""
+    """Rows of one shape, appended; reads return copies, nothing is mapped."""
 
     def __init__(self, shape: tuple[int, ...] = (), blocks: Iterable[Float64] = ()) -> None:
         """Start with `blocks` of rows (T, ...); shape: of a row."""
@@ -82,7 +82,7 @@ class RowFile:
 class Rows:
     """Rows (T, ...) of a file, optionally of an index (T,) and some `columns`.
 
-    ``rows[first:last]``, ``rows[index]`` and ``rows[number]`` read them like an array's.
+    ``rows[first:last]``, ``rows[index]`` and ``rows[number]`` read like an array's.
     """
 
     def __init__(self, file: RowFile, index: Index | None = None, columns: Index | None = None) -> None:

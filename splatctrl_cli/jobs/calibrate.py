@@ -34,9 +34,9 @@ BASE = "the robot's base"
 class CalibrateRequest(RobotOptions):
     """Calibrate the cameras of a recording; several `paths` only for logs of one session.
 
-    out: None for calibration.toml here. urdf: a robot with recorded joint states, to place cameras against its
-    surface. hold: the fixed camera without a robot (None: the first). board: initial poses if the recorded ones are
-    far off. allow_unobserved: write what was observed of an incomplete calibration.
+    out: None for calibration.toml here. urdf: a robot with recorded joint states, to place cameras against. hold: the
+    fixed camera without a robot (None: the first). board: initial poses if the recorded ones are far off.
+    allow_unobserved: write an incomplete calibration.
     """
 
     paths: tuple[Path, ...]
@@ -93,7 +93,7 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
     """Find the calibration and write it.
 
     Raises UsageError for contradictory options, InputError for an unreadable recording. Raises NotEvaluableError,
-    writing no file, if it does not determine the cameras.
+    writing nothing, if cameras stay undetermined.
     """
     out = request.out or Path("calibration.toml")
     if request.options.calibration is not None:
@@ -112,7 +112,7 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
         frames, sightings = _frames(source, request.board, progress)
         if arm is not None:
             travel = arm.travel(sorted({frame.stamp_ns for frame in frames}))
-            if travel < fixed.CALIBRATION_TRAVEL:  # whose one posture any wrong model explains
+            if travel < fixed.CALIBRATION_TRAVEL:  # any wrong model explains a single posture
                 raise NotEvaluableError(
                     f"calibrate: the robot hardly moves: {1e3 * travel:.0f} mm at most (expected"
                     f" {1e3 * fixed.CALIBRATION_TRAVEL:.0f})",
@@ -170,7 +170,7 @@ def _arm(model: RobotModel, source: FrameSource) -> Arm:
 
 
 def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tuple[list[RgbdFrame], list[Sighting]]:
-    """Up to `CALIBRATION_FRAMES` simultaneous frames of each camera, colourless, and board sightings.
+    """Up to `CALIBRATION_FRAMES` simultaneous frames of each camera, and board sightings.
 
     Raises NotEvaluableError if no frame shows the board.
     """

@@ -105,7 +105,7 @@ def posed_robot(
     base: pose in world as x, y, z, qx, qy, qz, qw. Raises UsageError for robot options without one.
     """
     file = None if urdf is None else read_urdf(urdf)
-    if file is None and spheres is not None:  # without spheres it is often none that can be used
+    if file is None and spheres is not None:  # without spheres it is often unusable
         file = logged_urdf(paths)
     if file is None:
         given = {"spheres": spheres, "base": base, "lock": locked or None, "packages": packages or None}

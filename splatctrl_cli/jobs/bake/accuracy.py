@@ -39,7 +39,7 @@ SUMMARY_METRICS = {
     **dict.fromkeys(("voxel", "length_scale", "median_radius", "median_spacing"), LENGTH),
     **dict.fromkeys(("never_seen_share", "over_estimating_share"), BAD_SHARE),
     "num_warnings": FAULTS,
-}  # and how two runs are compared by them
+}  # comparison scales of the summary's figures
 POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 
 
@@ -126,7 +126,7 @@ def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator
 def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request: BakeRequest) -> HeldOutComparison:
     """Compare with the newest held-out depth not later than the scene's stamp.
 
-    Pixels outside the scene's box or on the robot (with a URDF) do not count: the field has neither.
+    Pixels outside the scene's box or on the robot do not count: the field has neither.
     """
     recording = open_source(log)
     cameras = _held_out_cameras(recording, request, source.cameras)
@@ -158,9 +158,9 @@ def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request:
 def _held_out_cameras(
     recording: RecordSource, request: BakeRequest, trained: Sequence[str] | None
 ) -> tuple[str, ...]:
-    """Return the named cameras, or all not known to have trained the scene.
+    """Return the named cameras, or all not known to have trained.
 
-    Raises UsageError for a training or missing camera, or if none is left.
+    Raises UsageError for a training or missing camera, or without any.
     """
     log, names, known = request.held_out, request.held_out_cameras, recording.cameras
     wrong = [name for name in names if name not in known]

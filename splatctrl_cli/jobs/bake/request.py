@@ -68,9 +68,9 @@ class BakeRequest(RunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class BakeSource:
-    """Splats with the occupancy of the same moment; None (empty) where a bare splat file lacks it.
+    """Splats with the occupancy of the same moment; None (empty) if a bare file lacks it.
 
-    unrepresented: occupied voxels without a splat. workspace: the box outside which the scene keeps no splats.
+    unrepresented: occupied voxels without a splat. workspace: the box outside which no splats are kept.
     """
 
     splats: SplatSet
@@ -86,8 +86,7 @@ class BakeSource:
 def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
     """Read the splats at `path`, as known `at_seconds` after the first snapshot (None: the end).
 
-    Raises InputError for a missing scene, UsageError for a time in a bare file, NotEvaluableError before the first
-    snapshot.
+    Raises InputError without a scene, UsageError for a time in a bare file, NotEvaluableError for too early a time.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="give what reconstruct wrote, or a splats.ply")
@@ -110,9 +109,7 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
         then = scene.snapshot_at(wanted_ns)
         files = [then.path, then.occupancy_path]
     occupancy = final if wanted_ns is None else then.occupancy()
-    lower = (
-        final.origin + 0.5 * final.voxel
-    )  # less a voxel at every border: a surface there may have splats beyond it
+    lower = final.origin + 0.5 * final.voxel  # without the border voxels: a surface there may have splats beyond it
     upper = lower + final.voxel * (np.array(final.log_odds.shape) - 2)
     return BakeSource(
         splats=then.splats(),
@@ -217,7 +214,7 @@ def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
 
 
 def covered(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:
-    """Box of the grid: as given, or around robot reach, previous field, or splats with padding."""
+    """Box of the grid: as given, or of robot, previous field, or splats with padding."""
     if request.box is not None:
         return request.box
     if request.urdf is not None:

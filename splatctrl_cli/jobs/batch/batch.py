@@ -40,10 +40,10 @@ CONNECT_S = 10.0  # to a scheduler
 
 @dataclass(frozen=True, kw_only=True)
 class BatchRequest:
-    """Run the suite of a file into `out` (default: the suite's).
+    """Run a suite's file into `out` (default: the suite's).
 
-    shard: (i, n) runs every n-th recording from the i-th on. dask: address of a scheduler to run nodes. again: rerun
-    finished nodes.
+    shard: (i, n) runs every n-th recording from the i-th on. dask: address of a scheduler. again: rerun finished
+    nodes.
     """
 
     suite: Path
@@ -193,7 +193,7 @@ def _cases_of(run: Run, out: Path) -> list[Case]:
 def write_batch(
     out: Path, suite: Asked, nodes: Sequence[Node], latest: Mapping[str, Run], keys: Mapping[str, str]
 ) -> None:
-    """Write batch.json: every node with a key, and the last run of nodes of other shards.
+    """Write batch.json: every node with a key, and the last run of others.
 
     Nodes not reached are to do.
     """

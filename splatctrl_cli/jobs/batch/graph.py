@@ -12,11 +12,11 @@ from typing import Any, Protocol
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.batch.suite import Job, Limits, Recording, Suite, Table, jobs_for
 
-RECORDING, NAME = "recording", "name"  # what {…} in an option may stand for, beside the jobs
+RECORDING, NAME = "recording", "name"  # placeholders {…} in an option, besides job names
 ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name
 WITHOUT_OUTPUT = ("check", "info")
 CAPTURE, SCENE = "ingest", "reconstruct"
-ROLES: Mapping[str, Mapping[str, str]] = {  # what an option is where the suite does not say: of a command's only job
+ROLES: Mapping[str, Mapping[str, str]] = {  # default sources of options: a command's only job, or the recording
     "simulate": {},
     "ingest": {"source": RECORDING},
     "check": {"source": RECORDING},
@@ -28,7 +28,7 @@ ROLES: Mapping[str, Mapping[str, str]] = {  # what an option is where the suite 
     "replay": {"log": CAPTURE, "scene": SCENE},
 }
 COMMANDS = tuple(ROLES)
-TABLES = ("set", "perturb")  # options of which a matrix varies one entry: set.SECTION.KEY, perturb.NAME
+TABLES = ("set", "perturb")  # options a matrix varies by entry: set.SECTION.KEY, perturb.NAME
 _PLACE = re.compile(r"\{([\w.+-]+)\}")
 _LONGEST = 120  # characters of a node's name
 
@@ -56,8 +56,8 @@ class CommandLine(Protocol):
 class Node:
     """One command on one recording; name: RECORDING/JOB.
 
-    variant: matrix choices here or before, by JOB.OPTION. words: the command line. inputs: files that decide the
-    result. needs: nodes before it. out: None for a command that only prints.
+    variant: matrix choices so far, by JOB.OPTION. words: the command line. inputs: files that decide the result.
+    needs: nodes before it. out: None for a command that only prints.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Node:
 
 
 def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
-    """All nodes, by recording, in the suite's order of jobs after those they need.
+    """All nodes, by recording, each after those it needs.
 
     Raises UsageError for a cycle, an unknown placeholder or option.
     """
@@ -200,7 +200,6 @@ def _nodes_of(
 
 
 def _short(values: Sequence[Any]) -> list[str]:
-    """Values of a matrix for names: paths without their common ends."""
     parts = [_text(value).strip("/").split("/") for value in values]
     least = min(map(len, parts)) - 1
     first = min(_num_alike(parts), least)

@@ -123,7 +123,7 @@ class Ledger(AbstractContextManager["Ledger"]):
         while base.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
             try:
                 base.execute("PRAGMA journal_mode = WAL")
-            except sqlite3.OperationalError:  # for which sqlite waits for no other, as it does for all else
+            except sqlite3.OperationalError:  # sqlite does not wait for other processes here
                 if time.monotonic() > until:
                     raise
                 time.sleep(WAIT_S)
@@ -176,10 +176,7 @@ class Ledger(AbstractContextManager["Ledger"]):
         return {row["job"]: float(row["mean"]) for row in rows}
 
     def runs(self, conditions: Sequence[str] = (), *, only_last: bool = True) -> Iterator[Run]:
-        """Runs that meet conditions like "job=audit", "node=a/*" or "seconds>10".
-
-        Raises UsageError for an invalid one.
-        """
+        """Runs that meet conditions like "job=audit", "node=a/*", "seconds>10". Raises UsageError."""
         clauses, values = ["id IN (SELECT max(id) FROM runs GROUP BY node)"] if only_last else [], []
         for condition in conditions:
             match = _COMPARISON.fullmatch(condition.strip())
@@ -248,7 +245,7 @@ def write_csv(path: Path, runs: Iterable[Run]) -> None:
 
 
 def run_of_document(plain: Mapping[str, Any]) -> Run:
-    """Run of an entry of batch.json, of any version. Raises TypeError, KeyError or AttributeError."""
+    """Run of an entry of batch.json. Raises TypeError, KeyError or AttributeError."""
     known = {name: value for name, value in plain.items() if name in COLUMNS and value is not None}
     return Run(node=plain["id"], **known | {name: json.dumps(known[name]) for name in _OF_JSON if name in known})
 
@@ -330,7 +327,7 @@ def _digest(path: Path, ledger: Ledger) -> str:
 
 
 def _meshes(urdf: Path) -> Iterator[Path]:
-    """Possible places of a URDF's meshes: next to it, or below a folder above."""
+    """Possible places of a URDF's meshes: next to it, or below a parent."""
     for name in dict.fromkeys(_MESH.findall(urdf.read_text(encoding="utf-8", errors="replace"))):
         if "://" not in name:
             yield urdf.parent / name

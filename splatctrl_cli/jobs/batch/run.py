@@ -21,13 +21,13 @@ from splatctrl_cli.jobs.batch.task import End, Task, last_lines, read_end, run_t
 from splatctrl_cli.jobs.running.progress import Progress, duration
 
 DONE, FAILED, ERROR, SKIPPED, TO_DO = "done", "failed", "error", "skipped", "to do"
-NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes of a command that came to none
+NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes without a verdict
 AGAIN_S = 0.5  # between looks at what another batch runs
 STILL_S = 60.0  # without an ended node, until a log line names what runs
 MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes, when nothing here asked for it
 DISK_FULL = 6
 UNRUN = "has not run since the suite, its inputs or the program changed"
-PRINTED = "printed"  # stands for the stamp of an output that there is none of
+PRINTED = "printed"  # stamp of a node that only prints
 
 
 @dataclass(kw_only=True)
@@ -109,7 +109,7 @@ class Scheduler:
         if self.again:
             return None
         is_same = before is not None and before.key == key and before.state in (DONE, FAILED)
-        # neither stamp is there where an error was expected
+        # both stamps are empty after an expected error
         if before is not None and is_same and (node.out is None or before.stamp == stamp_of(node.out)):
             self.num_kept += 1
             judged = _judged_again(before, node)

@@ -22,7 +22,7 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
     *("controller failed", "goal not reached", "gate failed"),
 )
 _NAME = re.compile(r"[\w][\w.+-]*")
-_COMMON = ("log", "capture", "recording", "data")  # names of thousands, to which that of the folder is added
+_COMMON = ("log", "capture", "recording", "data")  # common names, which get the folder's name in front
 _ENDINGS = (".mcap", ".bag", ".db3", ".toml", ".capture")
 
 

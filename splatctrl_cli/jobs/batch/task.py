@@ -1,7 +1,7 @@
 """One node's run in a forked child under limits, with log, result and end.
 
-A runner process has imported the commands, so a node costs a fork, not a start of Python. Its one thread runs one
-node at a time, read as JSON lines from stdin. When stdin ends, so does the run.
+A runner has imported the commands, so a node costs a fork, not a start of Python. It runs one node at a time in one
+thread, read as JSON lines from stdin. When stdin ends, so does the run.
 """
 
 import contextlib
@@ -31,15 +31,15 @@ POLL = 0.02  # [s] between looks at a child's memory
 STOP = 2.0  # [s] for a runner to see that its stdin ended, before it is killed
 GRACE = 10.0  # [s] from asking a child to end to ending it
 PAGE = os.sysconf("SC_PAGE_SIZE")
-PR_SET_PDEATHSIG = 1  # of prctl(2): what a child gets when its parent dies
-RESUME = "--resume"  # left out where there is nothing to go on from
+PR_SET_PDEATHSIG = 1  # of prctl(2): the signal a child gets when its parent dies
+RESUME = "--resume"  # omitted without a partial output
 PART = ".part"  # ends the name of a result that is not whole
-_LAST = 4096  # bytes of a log that are looked at for its last lines
-_local = threading.local()  # a runner for each thread that has run a task
+_LAST = 4096  # bytes of a log searched for its last lines
+_local = threading.local()  # each thread's runner
 _runners: list["subprocess.Popen[str]"] = []
 _numbers = itertools.count()  # of the runners
 VISIBLE, CARD = "CUDA_VISIBLE_DEVICES", "SPLATCTRL_CARD_OF_RUNNER"  # a runner's card, where there are several
-BY_THE_BATCH = ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY")  # what a batch tells of, and its nodes do not
+BY_THE_BATCH = ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY")  # reported by the batch, not by its nodes
 WROTE = (0, 1, 3, 5)  # exit codes of a command that left its output
 
 
@@ -47,7 +47,7 @@ WROTE = (0, 1, 3, 5)  # exit codes of a command that left its output
 class Task:
     """Work of a runner: call `entry` with `words`, write `result` (stdout), `log` (stderr), `end`.
 
-    key: of the node. timeout [s], memory [bytes]: 0 for none. Plain values, for other machines.
+    timeout [s], memory [bytes]: 0 for none. Plain values, for other machines.
     """
 
     entry: str
@@ -85,11 +85,11 @@ class End:
 def run_task(task: Task) -> End:
     """Run a task in this thread's runner, unless it already ended.
 
-    A killed runner is started once more, except after `stop_runners`.
+    A killed runner is started once more, but not after `stop_runners`.
     """
     known = read_end(Path(task.end), task.key)
     if known is not None and known.exit_code is not None and known.stamp in ("", stamp_of(Path(task.out))):
-        return known  # by a worker that was lost before it could say so
+        return known  # ended by a worker that was lost before it reported
     for _ in range(2):
         runner = getattr(_local, "runner", None)
         if runner is None or runner.poll() is not None:
@@ -135,7 +135,7 @@ def read_end(path: Path, key: str) -> End | None:
 
 
 def stamp_of(out: Path) -> str:
-    """Size and time of an output's run.json, or of the file; empty if missing."""
+    """Size and time of an output's run.json, or of the file; empty without."""
     for place in (out / "run.json", out / "capture.json", out):
         with contextlib.suppress(OSError):
             found = place.stat()

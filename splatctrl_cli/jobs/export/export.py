@@ -43,7 +43,7 @@ from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Lab
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render
 
-LAYOUT_COMMENTS = frozenset({"splat", "label"})  # say how a PLY holds its values: not true of the next file
+LAYOUT_COMMENTS = frozenset({"splat", "label"})  # describe a PLY's layout: wrong for the next file
 IMAGE_SIZE = (320, 240)
 
 Splats = SplatSet | GaussianSet
@@ -71,8 +71,8 @@ class ExportResult:
 
     origin: subtracted from every centre [m], in words. not_kept: attributes the format lacks. num_outside: Gaussians
     with sigma or colour clamped to its range. allowed: the format's rounding. Over the pixels of all views:
-    largest_pixel_difference in colour, opacity, or depth over scene size; psnr [dB], None for equal colours;
-    covered_share, with any splat. isotropic_psnr: of the rounded splats, if `was_rounded`, to the source.
+    largest_pixel_difference in colour, opacity, or depth over scene size; psnr [dB], None if equal; covered_share.
+    isotropic_psnr: of the rounded splats to the source.
     """
 
     file: Path
@@ -100,8 +100,8 @@ class ExportResult:
 def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     """Write the splats, read them back and compare.
 
-    Raises UsageError, InputError or NotEvaluableError for unsuitable splats. Raises WriteError, leaving no file, if a
-    value is off by more than the format's rounding, or an exact format looks different.
+    Raises UsageError, InputError or NotEvaluableError for unsuitable splats. Raises WriteError, leaving no file, for
+    errors above the format's rounding, or an exact format that looks different.
     """
     source = _splat_file(request.scene)
     out = request.out or _beside(request.scene)
@@ -109,7 +109,7 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     if os.path.realpath(out) == os.path.realpath(source):
         raise UsageError(f"{out}: is the input itself", remedy="give another --out")
     splats, comments, exact = read_source(source)
-    check_no_shell(source, comments)  # most formats would lose what tells it from surfaces
+    check_no_shell(source, comments)  # most formats would lose the mark that separates it from surfaces
     _check_colors(source, splats)
     is_chosen = np.isin(splats.labels, [*Label] if request.labels is None else list(request.labels))
     selected, exact = (splats, exact) if request.labels is None else (splats.select(is_chosen), exact[is_chosen])
@@ -265,10 +265,10 @@ def _views(centers: Float32) -> tuple[Intrinsics, Sequence[Float64], float]:
     return intrinsics, [look_at(middle + size * direction, middle) for direction in directions], size
 
 
-FREE_BELOW, OCCUPIED_ABOVE = 0.3, 0.7  # of snapshots, whose log-odds say nothing finer
+FREE_BELOW, OCCUPIED_ABOVE = 0.3, 0.7  # for snapshots, whose log-odds are coarse
 CLOUD, SPACE, DISTANCE, TRANSFORMS = "/splats", "/known_space", "/distance", "/tf"
 MESHES, EVENTS, CLEARANCE = "/arm", "/events", "/clearance"
-Later = tuple[int, int, Callable[[FoxgloveLog], None]]  # stamp [ns], place among those of one stamp, what to write
+Later = tuple[int, int, Callable[[FoxgloveLog], None]]  # stamp [ns], order within a stamp, writer
 
 
 @dataclass(frozen=True, kw_only=True)

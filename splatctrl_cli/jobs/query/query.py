@@ -201,7 +201,7 @@ def rows_of(points: Float64, answers: Answers) -> str:
 
 
 STANDARD_INPUT = "standard input"
-OF_GRID = {  # settings of the field by the name that a grid's header gives them
+OF_GRID = {  # field settings: name and type in a grid's header
     "distance": ("distance", str),
     "length_scale": ("length_scale", float),
     "noise": ("noise", float),

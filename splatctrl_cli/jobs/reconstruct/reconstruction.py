@@ -34,9 +34,9 @@ from splatctrl_cli.scene.scale import RecordedDepth, fitted_to, in_words
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import AuditRow, TimeStep, cloud_box, depth_box, time_steps
 
-LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
+LONGEST_SHARE = 50  # a checkpoint waits 50 times as long as the last one took: below 2 % of the run
 
-KEPT = ("num_read", "is_refined", "first_frames", "corrected")  # attributes that a checkpoint keeps as they are
+KEPT = ("num_read", "is_refined", "first_frames", "corrected")  # attributes a checkpoint stores unchanged
 
 
 def training_cameras(source: RecordSource) -> list[str]:
@@ -101,7 +101,7 @@ class Reconstruction:
         self.cloud = None if request.points is None else read_points(request.points)  # instead of depth
         self.identity = identity
         self.declared = declared or Declarations()
-        self._first_state_ns: int | None = None  # from which declared times count
+        self._first_state_ns: int | None = None  # declared times are relative to it
         self.cameras = training_cameras(self.source)
         comments = {"format": FORMAT, "frame": "world", "units": "m", "source": self.source.name}
         self.writer = SceneWriter(folder, comments, checkpoint)
@@ -109,13 +109,13 @@ class Reconstruction:
         self.fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []
         self.stamps: list[int] = []
-        self.repeats: Counter[str] = Counter()  # by camera, frames whose depth was that of the frame before
-        self.first_frames: dict[str, dict[str, Any]] = {}  # of each camera, what tells this recording from another
-        self.num_read = 0  # time steps of the source, those that were left out included
+        self.repeats: Counter[str] = Counter()  # frames with stale depth, by camera
+        self.first_frames: dict[str, dict[str, Any]] = {}  # by camera, to recognise this recording
+        self.num_read = 0  # time steps of the source, skipped ones included
         self.is_refined = False
-        self.corrected: dict[str, Any] = {}  # what was corrected of the views
+        self.corrected: dict[str, Any] = {}  # corrections of the views
         self._early: TimeStep | None = None  # the first step without a workspace
-        self.depth: RecordedDepth | None = None  # by which the map's lengths were chosen
+        self.depth: RecordedDepth | None = None  # that chose the map's lengths
         allowed, still, guess = request.allow_disagreement, not self.source.has_clock, guessed_unit(self.source)
         self.agreement = CameraAgreement(self.source, is_allowed=allowed, is_still=still, guess=guess)
         self._saved_at, self._save_time = -float("inf"), 0.0
@@ -136,7 +136,7 @@ class Reconstruction:
     def check_found(self) -> None:
         """Raise InputError if no splat was made so far."""
         if self.fitter is None and self._early is not None:
-            self._workspace(self._early)  # says that there is no depth
+            self._workspace(self._early)  # raises: there is no depth
         if self.fitter is None:
             raise InputError(
                 f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",

@@ -29,7 +29,7 @@ from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.sphere_files import own_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 
-MOST_MOMENTS = 2000  # of a recording, among which those are chosen that are read
+MOST_MOMENTS = 2000  # of a recording, to choose from
 
 
 @dataclass(frozen=True, kw_only=True)

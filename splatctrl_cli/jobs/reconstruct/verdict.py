@@ -13,10 +13,10 @@ from splatctrl_cli.records import LossReport
 from splatctrl_cli.robot.declared_contact import carried_words
 from splatctrl_cli.scene.time_steps import AuditRow
 
-UNREPRESENTED = Scale(better=Better.LOWER, absolute=8, relative=0.05)  # voxels; by six four seeds are apart
+UNREPRESENTED = Scale(better=Better.LOWER, absolute=8, relative=0.05)  # voxels; four seeds differ by six
 GATED = {
     **dict.fromkeys(("time_steps", "iterations", "splats", "robot_splats", "added", "relocated"), DESCRIBES),
-    **dict.fromkeys(("unmet", "evicted"), DESCRIBES),  # more iterations ask for more slots
+    **dict.fromkeys(("unmet", "evicted"), DESCRIBES),  # more iterations need more slots
     "unrepresented_voxels": UNREPRESENTED,
     "unrepresented_volume": Scale(unit="m3", better=Better.LOWER, absolute=1e-4, relative=0.05),
     "max_unrepresented_voxels": UNREPRESENTED,
@@ -28,7 +28,7 @@ GATED = {
     "exposure_spread": DESCRIBES,
     "loss": Scale(better=Better.LOWER, absolute=1e-3, relative=0.02),
     "psnr": DECIBELS,
-}  # what --require can name, and how two runs are compared by it
+}  # figures --require can name, with their comparison scales
 LONGEST_BLIND = 1.0  # [s] as long as a replay takes what it knows for evidence
 
 

@@ -27,11 +27,11 @@ from splatctrl_cli.scene.time_steps import TimeStep
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingRequest:
-    """A recording at `path`: log, capture, image folder, or DTU data set with `scan` (None: the only one).
+    """A recording at `path`: log, capture, image folder, or DTU data set.
 
-    options: how to read it; for a scan its holdout alone. protocol: training and scored views. masks, depths: folders
-    with what a scan lacks. downscale: of its images, None for the protocol's size. beside: more logs of the session.
-    Raises UsageError for these with an image folder.
+    scan: None for the only one. options: for a scan its holdout alone. protocol: training and scored views. masks,
+    depths: folders with what a scan lacks. downscale: None for the protocol's size. beside: more logs of the session;
+    UsageError with an image folder.
     """
 
     path: Path
@@ -76,7 +76,7 @@ def open_to_train(
     check_pose_jumps(source, max_pose_jump)
     if needs_depth:
         jumps = () if max_pose_jump == POSE_JUMP else ("pose-jump",)
-        later = "agreement"  # asked by `CameraAgreement`, of the poses that the map is made with
+        later = "agreement"  # `CameraAgreement` checks it, with the map's poses
         refuse_errors(recording.path, recording.options, "reconstruct", (*allowed, *jumps, later))
     return source
 

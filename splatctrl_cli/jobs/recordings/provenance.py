@@ -32,7 +32,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.unrepresented import agreement_with_grid
 from splatctrl_cli.simulate.truth import Truth
 
-TILES = (6, 8)  # rows and columns of the picture that is kept of a first frame
+TILES = (6, 8)  # rows and columns of a first frame's stored picture
 
 
 def first_frame(frame: RgbdFrame) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayReques
 from splatctrl_cli.records import Float64
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
-BROKEN, UNKNOWN = "failed", "*not evaluable*"  # as the table of the criteria has them
+BROKEN, UNKNOWN = "failed", "*not evaluable*"  # in the table of criteria
 SLOW = "log joint states more often"
 
 
@@ -93,7 +93,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             count=judged.num_states,
         )
     ahead = nearby(judged, judged.replay.near["ahead"])
-    allowed = SAME_MOMENT_NS / 1e9  # the frames of one time step lie apart
+    allowed = SAME_MOMENT_NS / 1e9  # frames of one time step differ in time
     if ahead is not None and ahead[0] > allowed:
         yield lacking(
             sentence=f"the newest depth near the arm is {ahead[0]:.2f} s later than the state that it judges",

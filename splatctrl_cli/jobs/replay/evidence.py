@@ -37,7 +37,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep, time_steps
 from splatctrl_cli.simulate.truth import distance_to
 
-EVERY = "held_out_every"  # the metric of a scene in lockstep that says which frame sets did not train it
+EVERY = "held_out_every"  # metric of a lockstep scene: its held-out frame sets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +105,7 @@ def check_evidence(request: ReplayRequest) -> None:
 def training_options(request: ReplayRequest, cameras: tuple[str, ...]) -> SourceOptions:
     """Log options of a lockstep without the held-out camera.
 
-    Raises UsageError if no other camera is left.
+    Raises UsageError without another one.
     """
     others = tuple(camera for camera in cameras if camera != request.evidence)
     if not others:
@@ -119,7 +119,7 @@ def training_options(request: ReplayRequest, cameras: tuple[str, ...]) -> Source
 def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
     """Open the log again with the held-out cameras; None without ``--evidence``.
 
-    Raises InputError if the log has no such camera, or no depth from it.
+    Raises InputError if the log has no depth from them.
     """
     if request.evidence is None:
         return None
@@ -181,9 +181,9 @@ class Misses:
 def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: StoredAudit, reach: float) -> Misses:
     """Largest miss of each held-out frame set near the motion, without the robot.
 
-    Near is within `reach` [m]; sets count within the audited time, and one at a time is in memory. Each is compared
-    with the map that judged the states just before it, when that map is oldest. A newer map may already contain other
-    cameras of the same moment.
+    Near is within `reach` [m]; sets count within the audited time. One at a time is in memory. Each is compared with
+    the map that judged the states just before it, its oldest; a newer one may contain other cameras of the same
+    moment.
     """
     swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
@@ -220,7 +220,7 @@ def surface_points(frame: RgbdFrame) -> Float64:
 def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
     """Keep points (Q, 3) [m] that cannot be the robot at q (J,).
 
-    They are farther than ROBOT_MARGIN from its spheres and what these leave uncovered.
+    They are over ROBOT_MARGIN from its spheres and what these leave uncovered.
     """
     if not len(points):
         return points
@@ -230,7 +230,7 @@ def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
 
 
 def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
-    """The largest distance [m] of points (Q, 3) to the map, and its point: (4,); NaN without points."""
+    """Largest distance [m] of points (Q, 3) to the map, and its point: (4,); NaN without points."""
     if not len(points):
         return np.full(4, np.nan)
     values = distance(points)
@@ -251,7 +251,7 @@ class Swept:
 
     @classmethod
     def of(cls, model: RobotModel, audit: StoredAudit, reach: float) -> "Swept":
-        """Sweep every audited state; memory grows with the space passed, not with the states."""
+        """Sweep every audited state; memory grows with the space passed alone."""
         moving = np.flatnonzero(model.moving_spheres)
         cells, radii = np.zeros((0, 3)), np.zeros(0)
         for first, last in ranges(len(audit.stamp_ns)):
@@ -279,7 +279,7 @@ class TrueSurfaces:
         self.seen = np.zeros(len(stamp_ns), dtype=np.bool_)
 
     def watching(self, frames: Iterable[RgbdFrame]) -> Iterator[RgbdFrame]:
-        """Yield the frames unchanged; mark what the scene's cameras see in them."""
+        """Yield the frames; mark what the scene's cameras see in them."""
         for frame in frames:
             if self._cameras is None or frame.camera in self._cameras:
                 mark_seen(self.seen, self._points, self._stamp_ns, frame, has_clock=self._has_clock)
@@ -315,7 +315,7 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfac
 
 
 def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
-    """Compare the audit with the truth near seen surfaces; call it after the last frame."""
+    """Compare the audit with the truth near seen surfaces, after the last frame."""
     truth = np.asarray(replay.true_clearance)
     agreement = {
         name: clearance_agreement(of.distance, truth, surfaces.seen, replay.median_radius)

@@ -205,7 +205,7 @@ def twist_figures(
 ) -> Mapping[str, float | None]:
     """`TWIST_FIGURES` of a controller's T steps; empty without twists.
 
-    Share of states with a valid twist, share of these capped, and errors of the commanded twist [m/s, rad/s].
+    Share of states with a valid twist, share of these capped, and errors [m/s, rad/s].
     """
     if track is None:
         return {}

@@ -59,7 +59,7 @@ class NewerDepth:
         before_ns, known_ns = self._scene.depth_ns(own_ns), self._scene.next_ns(own_ns)
         next_ns = None if known_ns is None else self._scene.depth_ns(known_ns)
         if known_ns is None or before_ns is None or next_ns is None or next_ns - before_ns > UNWATCHED_NS:
-            return  # or `Hindsight` looks back at all that time
+            return  # a longer gap is left to `Hindsight`
         self._compare(known_ns, [(stamp_ns, q)])
 
     def _hold(self, now_ns: int) -> None:
@@ -99,7 +99,7 @@ class Hindsight:
                 self._postures.append(positions[at].copy())
 
     def looked(self, stamp_ns: int, age_s: float) -> None:
-        """Register the age of the depth about the arm at a stamp; NaN if unknown."""
+        """Register the age of depth about the arm; NaN if unknown."""
         if not np.isfinite(age_s):
             return
         seen_ns = stamp_ns - round(age_s * 1e9)

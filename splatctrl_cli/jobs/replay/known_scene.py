@@ -221,7 +221,7 @@ def seen_of(voxels: SeenVoxels) -> Seen:
 
 def _seen_in_grid(observed: Observed, grid: DistanceGrid) -> Seen:
     def look(points: Float64) -> tuple[NDArray[np.int64], UInt8]:
-        is_seen = np.isin(observed(points), BY_CAMERA)  # the robot's spheres stick out: swept by them is not seen
+        is_seen = np.isin(observed(points), BY_CAMERA)  # the robot's spheres stick out: swept space is not seen
         classes = np.where(is_seen, EvidenceClass.FREE, EvidenceClass.OUT_OF_VIEW).astype(np.uint8)
         return np.where(is_seen, np.int64(0), np.int64(-1)), classes
 

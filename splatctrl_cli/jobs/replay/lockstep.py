@@ -160,7 +160,7 @@ class Lockstep:
         self._fitted, self._config, self._console = fitted, config, console
         self._latency_ns, self._ends_with_log = latency_ns, ends_with_log
         self._stopwatch = Stopwatch()
-        self._taking: list[tuple[int, float]] = []  # of each frame set, its stamp [ns] and the time [s] that it took
+        self._taking: list[tuple[int, float]] = []  # stamp [ns] and duration [s] of each frame set
         self._held_out_every = held_out_every
         self._steps = trained(fitted.time_steps(), held_out_every)
         self._next = next(self._steps, None)

@@ -272,7 +272,7 @@ AGREEMENT = {
     **dict.fromkeys(("median", "p95", "largest", "largest_over"), ERROR),
     "share_within": GOOD_SHARE,
     "num_compared": DESCRIBES,
-}  # scales of what clearance_agreement gives, but of its tolerance
+}  # scales of clearance_agreement's figures, except its tolerance
 
 
 def _declared(mode: str, of_fields: Sequence[str]) -> Declared:

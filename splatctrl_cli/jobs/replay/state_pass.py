@@ -35,7 +35,7 @@ from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_ga
 from splatctrl_cli.voxels import EvidenceClass
 
 KINDS = len(EvidenceClass)
-NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # of what was known about the arm, and their shapes at a state
+NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # columns of evidence about the arm, with their shapes at a state
     **dict.fromkeys(("age", "ahead", "unseen", "assumed", "unseen_to_surface", "blind_to_surface"), ()),
     **{
         "unseen_to_surface_place": (3,),
@@ -104,7 +104,7 @@ class ReplayRecord:
         self.newer_depth = NewerDepth(scene, config.control.margin - SLIGHTLY_UNDER, self._clearance_in)
         self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
         self._last_scene: KnownFields | None = None
-        self._seen_before: Seen | None = None  # when the fixed spheres were last looked at
+        self._seen_before: Seen | None = None  # at the last check of the fixed spheres
 
     def blocks(self, stamps: Stamps) -> Iterator[tuple[int, int]]:
         """Ranges of at most BLOCK of stamps (T,), with one scene and robot surface each."""
@@ -214,7 +214,7 @@ class ReplayRecord:
         if self._before is not None:
             stamp, q, velocity = self._before
             earlier = clearances(self._model, self._reach, q[None], known[name])
-            earlier[:, np.isinf(at_states[0])] = np.inf  # what is meant now was meant on the way
+            earlier[:, np.isinf(at_states[0])] = np.inf  # contact declared now was declared on the way
             stamps, positions = np.concatenate([[stamp], stamps]), np.concatenate([q[None], positions])
             velocities = np.concatenate([velocity[None], velocities])
             at_states = np.concatenate([earlier, at_states])
@@ -271,7 +271,7 @@ class ReplayRecord:
                 for name, value in _folded(accounts).items():
                     columns[name][at] = value
                 if not self._scene.has_seen_times:
-                    columns["assumed"][at] = np.nan  # space that was once free may not be now
+                    columns["assumed"][at] = np.nan  # space seen free once may be occupied now
                 elif is_timed:
                     columns["age"][at], columns["ahead"][at] = accounts[0].age, accounts[0].ahead
                     self.hindsight.looked(stamp, accounts[0].age)

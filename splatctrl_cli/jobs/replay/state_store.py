@@ -51,7 +51,7 @@ class StoredObjects(Sequence[T], Generic[T]):
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
         weakref.finalize(self, self._file.close)
-        self._starts: list[int] = []  # of each block: its first object, and where it is in the file
+        self._starts: list[int] = []  # first object of each block; `_places`: its file offset
         self._places: list[int] = []
         self._num = 0
         self._read: tuple[int, list[T]] = (-1, [])

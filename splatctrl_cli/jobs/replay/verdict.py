@@ -13,7 +13,7 @@ from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.robot.declared_contact import carried_words
 
-ASKED = ("--require",)  # criteria that the request itself asked for
+ASKED = ("--require",)  # criteria of the request itself
 LARGER_IS_LAXER = (
     *("max_unknown", "max_map_age", "max_pose_jump", "allow_disagreement", "config.control.limit_tolerance"),
     *("config.verdict.unjudged", "config.verdict.lead_in", "config.verdict.longest_interval"),
@@ -35,7 +35,7 @@ def replay_verdict(judged: Judged) -> Verdict:
         by_map = (*BY_MAP, *(() if replay.outside else BY_OUR_CONTROLLER))
         reasons = [_doubted(reason) if reason.criterion in by_map else reason for reason in reasons]
         reasons.sort(key=lambda reason: reason.criterion != "calibration")
-    reasons.sort(key=lambda reason: reason.label != CONTACT)  # by any measure, before what only broke a margin
+    reasons.sort(key=lambda reason: reason.label != CONTACT)  # contact by any measure precedes a broken margin
     counts = counts_of(replay, judged.logged, judged.metrics)
     reasons += gate_reasons(
         request.require, judged.metrics, counts, first_time=lambda name, holds: first_time(replay, name, holds)

@@ -27,17 +27,17 @@ from splatctrl_cli.jobs.runs.run_folder import (
 from splatctrl_cli.report.page import Cell, Page, Picture, RunSection, Table, packed, picture, rendered
 
 MOST_SCENES = 6  # of a batch, without `all_scenes`
-PICTURES = {True: (3, 800), False: (1, 640)}  # of a batch's run with and without a scene: how many, how wide [px]
+PICTURES = {True: (3, 800), False: (1, 640)}  # number and width [px] for a batch's run with and without a scene
 LOG_LINES = 12  # of a job that ended in an error
 MOST_ROWS = 40  # of recordings that are shown at once
 WITHOUT_A_RUN = ("skipped", "to do")  # states of jobs
 WITH_SPACE = ("replay", "reconstruct", "sdf-bake")
 MAP = "reconstruct"
-WITH_PICTURES = {  # by command: what is in a picture's name, and what it shows
+WITH_PICTURES = {  # by command: part of a picture's name, and its caption
     "score": ("_best_worst", "photo, render and depth error of the best and the worst view"),
     "sdf-bake": ("slices", "slices of the distance"),
 }
-MOST_PICTURES, PICTURE_WIDTH = 24, 560  # of recordings as expected: how many, how wide [px]
+MOST_PICTURES, PICTURE_WIDTH = 24, 560  # number and width [px] for recordings as expected
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from splatctrl_cli.report.timeline import legend, timeline
 PASSED = "passed"
 MOST_METRICS = 400  # rows of a table
 WIDTH = 900  # pixels of a picture at most
-PICTURES = {  # by the beginning of a file's name: what it shows
+PICTURES = {  # captions by start of file name
     "worst_": "a moment of least clearance: photo, and the arm's spheres as the replay had them",
     "clearance": "clearance over time",
     "commands": "what the controller commanded",

@@ -27,7 +27,7 @@ from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 MOST_STATES = 240  # of a motion
 MOST_SETS = 5  # of splats over time
 MOST_UNKNOWN = 6000  # cubes of space never seen
-MOST_CELLS = 80  # along a side of a grid of which the surface is drawn
+MOST_CELLS = 80  # along a side of a grid whose surface is drawn
 PLACE = re.compile(r"at \((-?[\d.]+), (-?[\d.]+), (-?[\d.]+)\)")
 
 

@@ -73,7 +73,7 @@ def with_self_model(model: RobotModel, given: Path | None, scene: Path | None = 
     try:
         found.check_robot(model.surface, model.urdf.links, path)
     except InputError:
-        if given is None:  # that the scene is of another robot is what a replay says
+        if given is None:  # a replay reports a scene of another robot
             return model
         raise
     return model.with_self_model(found)

@@ -48,7 +48,7 @@ SCALES = {
     "num_spheres": DESCRIBES,
     **dict.fromkeys(("num_bare_links", "num_open_links", "num_stray_spheres"), FAULTS),
 }
-METRICS: dict[str, Callable[[CoverageReport], float | None]] = {  # lengths in metres, None where no figure bounds it
+METRICS: dict[str, Callable[[CoverageReport], float | None]] = {  # lengths [m], None if unbounded
     "max_deficit": lambda report: report.max_deficit,
     "uncovered_share": lambda report: report.uncovered_share,
     "max_protrusion": lambda report: report.max_protrusion,

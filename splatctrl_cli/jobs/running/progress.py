@@ -34,7 +34,7 @@ class Wait:
     def __init__(self, progress: Progress, what: str, unit: str, total: int | None = None) -> None:
         self._progress, self._what, self._unit, self._total = progress, what, unit, total
         self._told = time.monotonic()
-        self._first: tuple[float, int] | None = None  # the time of the first steps, which take longer, and how many
+        self._first: tuple[float, int] | None = None  # time and number of the first steps, which take longer
         self._done = 0
 
     def announce(self) -> Self:

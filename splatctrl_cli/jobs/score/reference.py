@@ -29,9 +29,8 @@ Mask = Callable[[RgbdFrame], Bool | None]
 class Reference:
     """Recording `where` with all its cameras, to score against.
 
-    scan: name in a data set. training_stamps_ns: of the protocol's training views. mask_rule: describes `mask`.
-    Without depth, what training cameras saw is unknown. stamps_ns: by camera, for a session of logs. doubts: about
-    the scores.
+    scan: name in a data set. mask_rule: describes `mask`. Without depth, what training cameras saw is unknown.
+    stamps_ns: by camera, for a session of logs.
     """
 
     where: Path
@@ -196,7 +195,7 @@ def recording_check(
 ) -> dict[str, Any]:
     """Compare the recording with the scene's own; raises InputError for another, unless allowed.
 
-    Compares first frames of training cameras (not kept by older versions), and digests of files of equal name.
+    Compares first frames of training cameras (unless an older version), and digests of equal file names.
     """
     recorded = scene.run.get("metrics", {}).get("first_frames")
     then = scene.run.get("inputs", {})

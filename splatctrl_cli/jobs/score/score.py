@@ -95,7 +95,7 @@ class ScoreResult:
 def score(request: ScoreRequest, progress: Progress = SILENT) -> ScoreResult:
     """Score a scene, or scenes of several scans and their mean. Raises SplatCtrlError."""
     if request.baseline is not None:
-        read_baseline(request.baseline)  # better refused now than after the views
+        read_baseline(request.baseline)  # refuses it before the views are scored
     names = NAMES if request.baseline is None else NAMES_WITH_CHANGES
     check_gate_names(request.require, names, {"--baseline": NAMES_WITH_CHANGES})
     scenes = _scenes_of_scans(request)
@@ -111,7 +111,7 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
         folder.mkdir(exist_ok=True)
     scene = open_splats(request.scene)
     if scene.is_anisotropic:
-        scene.gaussians()  # either raises where there is none to compare
+        scene.gaussians()  # both raise if there is no splat to compare
     else:
         field_splats(scene.splats())
     reference = open_reference(recording, progress)

@@ -228,10 +228,10 @@ def copied_arm(
 def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Motion:
     """Adapt the scene's motion to another arm, whose tip follows the simulated arm's hand.
 
-    The tip is the last link of the URDF, its z pointing away from the arm. It goes as far as it reaches, turned any
-    way about z. The shortest clear way through the postures found is taken, or the least slowed one if none keeps the
-    velocity limits. An arm that fits the original postures keeps the original motion. Raises InputError if no posture
-    reaches a waypoint, or every way collides.
+    The tip is the URDF's last link, its z pointing away from the arm. It goes as far as it reaches, turned any way
+    about z. The shortest clear way through the postures found is taken, or the least slowed one if none keeps the
+    velocity limits. An arm that fits the original postures keeps the original motion. Raises InputError for an
+    unreachable waypoint, or if every way collides.
     """
     times, ours = scene.motion.times, scene.motion.waypoints
     if ours.shape[1] == model.num_joints and all(
@@ -332,9 +332,9 @@ def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
 
 
 def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
-    """Cost of a leg: its length [rad], more if close to anything, most if slowed; infinite in collision.
+    """Cost of a leg: length [rad], more if close to anything, most if slowed; infinite in collision.
 
-    A slowed leg meets objects at other times: it must avoid all of them, and is refused if one moves.
+    A slowed leg meets objects at other times: it must avoid all, and is refused if one moves.
     """
     slowed = leg.within(model.velocity_limit)
     is_late = slowed.times[-1] > leg.times[-1]

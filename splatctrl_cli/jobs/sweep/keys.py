@@ -17,8 +17,8 @@ from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB
 from splatctrl_cli.simulate.tabletop import VISITOR
 
 SIMULATE, FIT, BAKE = "simulate", "reconstruct", "sdf-bake"
-MADE_BEFORE = {REPLAY: ("scene", "field"), BAKE: ("scene",)}  # options of a command that name what another wrote
-FITTED = ("scene", "occupancy", "human")  # sections of the configuration that the map is made with
+MADE_BEFORE = {REPLAY: ("scene", "field"), BAKE: ("scene",)}  # options naming another command's output
+FITTED = ("scene", "occupancy", "human")  # configuration sections of the map
 PLACES = ("obstacle-x", "obstacle-y", "obstacle-radius")  # in the order of simulate --visitor
 
 
@@ -163,7 +163,7 @@ def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine)
         if "cameras" in options.values() and not all(stage.cameras for stage in stages if stage.command in options):
             raise UsageError(f"--over {name}: the run does not say which cameras trained", remedy="reconstruct again")
     searched = {name: replace(key, is_monotone=key.is_monotone and not is_driven) for name, key in keys.items()}
-    return Chain(stages=tuple(stages), keys=searched)  # an arm that is driven moves otherwise with another value
+    return Chain(stages=tuple(stages), keys=searched)  # a driven arm moves differently with another value
 
 
 def _made_before(stage: Stage) -> str | None:

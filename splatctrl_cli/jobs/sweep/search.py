@@ -10,7 +10,7 @@ from scipy.stats import qmc
 
 from splatctrl_cli.config.fixed import SWEEP_DIRECTIONS, SWEEP_SAMPLES, SWEEP_SEARCHED
 
-Judge = Callable[[Sequence[float]], Sequence[str]]  # outcomes of values, which may run side by side
+Judge = Callable[[Sequence[float]], Sequence[str]]  # outcomes of values, judged in parallel
 JudgeAt = Callable[[Sequence[Sequence[float]]], Sequence[str]]  # likewise of points in several values
 
 
@@ -18,8 +18,8 @@ JudgeAt = Callable[[Sequence[Sequence[float]]], Sequence[str]]  # likewise of po
 class Flip:
     """The flip nearest to the start: last value before it, first after; None without one.
 
-    outcomes: of all values tried, by distance from the start. is_monotone: at most one change. spacing: largest gap
-    of values before the flip (or of all without one); a narrower flip may be missed.
+    outcomes: by distance from the start. is_monotone: at most one change. spacing: largest gap tried before the flip
+    (or anywhere without one); a narrower flip may be missed.
     """
 
     last: float | None
@@ -34,8 +34,8 @@ def find_flip(
 ) -> Flip:
     """Find the flip nearest to `start` within `tolerance` (1 for whole values).
 
-    The ends and SWEEP_SAMPLES values evenly between come first. SWEEP_SEARCHED values are tried if the outcome is not
-    declared monotone, or turns back. Then the nearest pair with different outcomes is bisected.
+    It tries the ends and SWEEP_SAMPLES values evenly between; SWEEP_SEARCHED if the outcome is not declared monotone,
+    or turns back. Then it bisects the nearest pair with different outcomes.
     """
     known: dict[float, str] = {}
 
@@ -76,7 +76,6 @@ def _ordered(known: Mapping[float, str], start: float) -> dict[float, str]:
 
 
 def _num_changes(ordered: Mapping[float, str]) -> int:
-    """Number of changes between the start's outcome and any other."""
     is_first = [outcome == next(iter(ordered.values())) for outcome in ordered.values()]
     return sum(a != b for a, b in itertools.pairwise(is_first))
 
@@ -97,9 +96,8 @@ def find_least(judge: JudgeAt, alone: Sequence[float | None], *, tolerance: floa
     """Find the shortest joint change that flips the outcome of (0, ..., 0).
 
     Points lie in the unit cube. alone: the share at which each value flips it alone. It tries the diagonal and
-    SWEEP_DIRECTIONS of Halton's sequence, then turns the best towards and away from each value, by a quarter and an
-    eighth. Each is tried at the best length so far, and bisected to `tolerance` if it flips. None if no direction
-    does.
+    SWEEP_DIRECTIONS of Halton's sequence, then turns the best by a quarter and an eighth towards and away from each
+    value. Each is tried at the best length so far, and bisected to `tolerance` if it flips.
     """
     num = len(alone)
     start = judge([(0.0,) * num])[0]

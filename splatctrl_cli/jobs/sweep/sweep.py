@@ -23,7 +23,7 @@ from splatctrl_cli.jobs.sweep.search import Flip, find_flip, find_least
 FORMAT, VERSION = "splatctrl-sweep", 1
 TOLERANCE = 1 / 64  # of a range
 FILE = "sweep.json"
-REFUSED, BY_ITS_VALUES = "refused", (2, 4)  # an outcome, and the exit codes of a command that it stands for
+REFUSED, BY_ITS_VALUES = "refused", (2, 4)  # an outcome, and the exit codes it stands for
 
 
 @dataclass(frozen=True, kw_only=True)
