@@ -17,7 +17,7 @@ _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
 
 
 class Console:
-    """Prints results to stdout, log lines to stderr unless --quiet, and reports verdicts to CI.
+    """Output of a command: results to stdout, log lines to stderr unless --quiet, verdicts to CI.
 
     is_step: a step of another command; CI gets no verdict.
     """

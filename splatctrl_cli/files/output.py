@@ -187,9 +187,9 @@ def output_path(
 
     A failure removes it; an interrupted run leaves it. With the file `checkpoint` in it, a failure to write or of a
     card leaves it, too. `resume` yields such a folder unchanged, and no failure removes it. A link `path` stays, and
-    its target is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind;
-    for a folder of no command, another writer, or an unwritable parent. Raises WriteError if `is_write_failure`;
-    other errors pass.
+    its target is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind.
+    The same holds for a folder of no command, another writer, or an unwritable parent. Raises WriteError if
+    `is_write_failure`; other errors pass.
     """
     try:
         path = followed(path)

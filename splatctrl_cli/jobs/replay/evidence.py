@@ -182,8 +182,8 @@ def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: Store
     """Largest miss of each held-out frame set near the motion, without the robot.
 
     Near is within `reach` [m]; sets count within the audited time. One at a time is in memory. Each is compared with
-    the map that judged the states just before it, its oldest; a newer one may contain other cameras of the same
-    moment.
+    the map that judged the states just before it, when that map is oldest. A newer map may contain other cameras of
+    the same moment.
     """
     swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])

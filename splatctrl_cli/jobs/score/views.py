@@ -51,7 +51,7 @@ class Scores:
 
 @dataclass(frozen=True, kw_only=True)
 class Scorer:
-    """Scores views of `reference`; `draw` gets every view's row of pictures.
+    """Scorer of views of `reference`; `draw` gets every view's row of pictures.
 
     newest: render from the newest snapshot not later than the view, else from the final splats.
     """
