@@ -1,6 +1,6 @@
-"""The public Python API in one place (docs/api.md): the jobs, what they take and return, and what they raise.
+"""The public Python API (docs/api.md): jobs, requests, results and errors.
 
-``import splatctrl_cli`` hands out the same names without loading this module until one of them is asked for.
+``import splatctrl_cli`` offers the same names, and loads this module on first use.
 """
 
 from splatctrl_cli.config import Config, load_config

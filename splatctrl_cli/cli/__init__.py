@@ -1,1 +1,1 @@
-"""The command line: one file per subcommand. The only room that parses arguments, prints, exits and catches."""
+"""The command line, a file per subcommand. It alone parses, prints, exits and catches."""

@@ -1,4 +1,4 @@
-"""``splatctrl batch``: a suite of recordings and commands, its verdict, and the ledger of what ran."""
+"""``splatctrl batch``: a suite, its verdict, and its ledger."""
 
 import argparse
 import importlib
@@ -33,12 +33,11 @@ PRELOADED = (  # of a runner
     *("check", "ingest", "reconstruct.reconstruct", "export.export", "bake.bake", "score.score", "replay.replay"),
 )
 MOST_ROWS = 40  # recordings that are all printed
-OWN = ("out", "force", "resume", "threads")  # options that a batch gives itself, where a command has them
+OWN = ("out", "force", "resume", "threads")  # options a batch gives itself
 NOT_OF_A_NODE = (*OWN, "help", "help-all", "json", "verbose", "quiet", "junit", "preset")  # the last is in --set
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     console = Console(args, is_step=True)  # it tells CI of every recording itself
     workers = args.workers or os.cpu_count() or 1
     request = request_of(BatchRequest, args, workers=workers)
@@ -66,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 class OfThisProgram:
-    """Nodes are commands of this program; `threads` is for each."""
+    """Command line of nodes that run this program; `threads` for each."""
 
     entry = "splatctrl_cli.cli.batch:run_words"
 
@@ -74,7 +73,7 @@ class OfThisProgram:
         self._threads = threads
 
     def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
-        """Words for options by their long names, and the files among them. Raises UsageError for what is none."""
+        """Words for options by long name, and files among them. Raises UsageError for unknown ones."""
         parser, places, words = _parser_of(command), list[str](), [command]
         given = {"threads": self._threads, **options}
         known = [name for name in given if name not in OWN or f"--{name}" in parser._option_string_actions]
@@ -92,7 +91,7 @@ class OfThisProgram:
         return tuple(words), tuple(path for path in found if isinstance(path, Path))
 
     def options_of(self, words: Sequence[str]) -> dict[str, Any]:
-        """The options that words say, by their long names: `parsed` gives words that say the same."""
+        """Options in words, by long name, as `parsed` takes them."""
         parser = _parser_of(words[0])
         found, given = dict[str, Any](), vars(parser.parse_args([*words[1:]]))
         for action in parser._actions:
@@ -107,14 +106,14 @@ class OfThisProgram:
 
 
 def run_words(words: list[str]) -> int:
-    """What a runner calls: the program itself."""
+    """Run the program, for a runner."""
     main = importlib.import_module("splatctrl_cli.cli.main").main
     code: int = main(words)
     return code
 
 
 def preload() -> None:
-    """What a runner imports once, for all the commands that it runs."""
+    """Import in a runner what all commands need."""
     os.environ.setdefault(
         "OPENCV_IO_MAX_IMAGE_PIXELS", str(importlib.import_module("splatctrl_cli.cli.main").MAX_PIXELS)
     )
@@ -139,7 +138,6 @@ def _action(parser: Parser, command: str, name: str) -> argparse.Action:
 
 
 def _words_of(where: str, action: argparse.Action, value: Any, folder: Path) -> list[str]:
-    """What a person would type for a value of a suite."""
     name = max(action.option_strings, key=len, default="")
     if action.nargs == 0:
         if not isinstance(value, bool):
@@ -169,7 +167,6 @@ def _text(value: Any) -> str:
 
 
 def _lines(result: BatchResult, *, is_long: bool) -> Iterator[str]:
-    """A row for each recording, a column for each job and variant; of many recordings those not as expected."""
     runs = {(run.recording, run.column): run for run in result.runs}
     columns = columns_of(((run.job, column) for (_, column), run in runs.items()), result.jobs)
     recordings = list(dict.fromkeys(recording for recording, _ in runs))
@@ -191,7 +188,6 @@ def _cell(run: Run | None) -> str:
 
 
 def _listed(console: Console, args: argparse.Namespace, request: BatchRequest, command_line: OfThisProgram) -> int:
-    """The last runs, those that --where and --failed ask for: of the suite's nodes, or of all in a batch's folder."""
     folder, order = request.suite, dict[str, int]()
     if not folder.is_dir():
         _, nodes, folder = planned(request, command_line)

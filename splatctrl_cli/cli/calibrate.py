@@ -1,4 +1,4 @@
-"""``splatctrl calibrate``: where cameras stand against each other and the robot, and how sure that is."""
+"""``splatctrl calibrate``: camera poses against each other and the robot."""
 
 import argparse
 import math

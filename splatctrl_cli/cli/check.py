@@ -1,4 +1,4 @@
-"""``splatctrl check``, ``info``, ``ingest``: what is wrong with a recording, what a file holds, its capture."""
+"""``splatctrl check``, ``info``, ``ingest``: faults of a recording, file contents, captures."""
 
 import argparse
 import textwrap
@@ -15,7 +15,7 @@ from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
 from splatctrl_cli.recording.source import describe
 
 WIDTH = 118  # columns of text
-FEW = 3  # rows that no command reads, which are all printed
+FEW = 3  # unread rows, up to which all are printed
 
 
 def run(args: argparse.Namespace) -> int:
@@ -67,7 +67,6 @@ def _lines(report: CheckReport) -> Iterator[str]:
 
 
 def _needs(report: CheckReport) -> Iterator[str]:
-    """Commands that can start, those that errors keep from it, then what each lacks beside."""
     ready = [need.command for need in report.needs if not report.lacks(need)]
     if ready:
         yield f"can start: {', '.join(ready)}"
@@ -88,7 +87,7 @@ def run_info(args: argparse.Namespace) -> int:
 
 
 def show_described(console: Console, summary: Summary, *, is_long: bool = False) -> int:
-    """Facts and tables, and what a reconstruction lacks."""
+    """Print facts and tables, and what a reconstruction lacks."""
     code = DAMAGED if summary.damaged else 0
     return console.result(summary.as_dict(), _described(summary, is_long=is_long), code=code)
 
@@ -120,7 +119,7 @@ def _facts(facts: Mapping[str, object], indent: str) -> Iterator[str]:
 
 
 def _fact(value: object) -> str:
-    """A float with up to six decimals, more digits where it is small; a dash for nothing."""
+    """Text of a float with up to six decimals, more if small; a dash for None."""
     if not isinstance(value, float):
         return "-" if value is None else str(value)
     return f"{value:.6f}".rstrip("0").rstrip(".") if value == 0 or abs(value) >= 1e-3 else f"{value:.6g}"
@@ -133,7 +132,6 @@ def run_ingest(args: argparse.Namespace) -> int:
 
 
 def show_ingested(console: Console, result: IngestResult) -> int:
-    """Frames by camera, and what was lost."""
     lost = asdict(result.summary.loss)
     lines = table(["camera", "frames"], sorted(result.summary.num_frames.items()))
     lines += [f"{name.replace('_', ' ')}: {value}" for name, value in lost.items() if value and name != "notes"]

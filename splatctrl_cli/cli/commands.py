@@ -1,5 +1,6 @@
-"""Every subcommand: what it is for, examples, its options, and the function that runs it, by name: what that function
-needs is imported when it runs, so that help answers at once.
+"""Subcommands with examples, options, and functions by name.
+
+A function's imports wait until it runs, so that help answers at once.
 """
 
 import importlib
@@ -29,14 +30,15 @@ EXIT_CODES = """\
 exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 3 done, but part of the input was
 damaged; 4 input missing or unusable; 5 cannot be evaluated; 6 writing failed; 70 our own bug, or a card that failed;
 130 interrupted"""
-SHELLS = ("bash", "zsh", "tcsh")  # as shtab has them, which is not imported for a help text
+SHELLS = ("bash", "zsh", "tcsh")  # shtab's, without importing it for help
 LOG, ROBOT = "sample_data/tabletop/log.mcap", "--urdf arm.urdf --spheres arm.yaml"  # of examples
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """A subcommand, or an action of one: `run` names MODULE:FUNCTION of this room, `options` are its own; with
-    `actions` it has no more than these. judges: it ends in a verdict, of which it can tell CI.
+    """A subcommand or action; `run` names MODULE:FUNCTION of this package.
+
+    With `actions` it has no options of its own. judges: ends in a verdict, for CI.
     """
 
     summary: str
@@ -48,7 +50,7 @@ class Command:
 
 
 def build_parser(command: str | None = None) -> Parser:
-    """The parser with the options of `command` alone, or of every subcommand."""
+    """Build the parser with options of `command` alone, or of all."""
     parser = Parser(
         prog="splatctrl",
         description="What did the robot's cameras know, and would this controller have kept it safe?",
@@ -74,7 +76,7 @@ def _add_commands(parser: Parser, commands: dict[str, Command], *, dest: str, on
 
 
 def judges(words: Sequence[str]) -> bool:
-    """Whether the command that `words` begin with is there, and ends in a verdict."""
+    """True if the words start a command with a verdict."""
     command = COMMANDS.get(words[0]) if words else None
     if command is not None and command.actions is not None:
         command = command.actions.get(words[1]) if len(words) > 1 else None
@@ -102,7 +104,6 @@ _DEMO = (
 
 
 def _robot(spheres: str) -> tuple[Adds, ...]:
-    """``--urdf``, ``--packages``, and ``--spheres`` with its default."""
     return (
         *_URDF,
         option("--spheres FILE", f"YAML (also cuRobo's) or URDF with the spheres (default: {spheres})", Path),

@@ -1,4 +1,4 @@
-"""What subcommands print: tables and JSON on stdout, log lines on stderr."""
+"""Output of subcommands: tables and JSON on stdout, log lines on stderr."""
 
 import argparse
 import json
@@ -17,8 +17,9 @@ _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
 
 
 class Console:
-    """Results to stdout, as a table or one JSON object; log lines to stderr unless --quiet; verdicts to CI, too, but
-    not those of a step of the command (is_step).
+    """Output of a command: results to stdout, log lines to stderr unless --quiet, verdicts to CI.
+
+    is_step: a step of another command; CI gets no verdict.
     """
 
     def __init__(self, args: argparse.Namespace, *, is_step: bool = False) -> None:
@@ -28,14 +29,11 @@ class Console:
         self.reports = reports_of(args) if hasattr(args, "junit") and not is_step else None
 
     def log(self, line: str) -> None:
-        """One progress line on stderr."""
         if not self.is_quiet:
             print(line, file=sys.stderr, flush=True)
 
     def result(self, result: Mapping[str, Any], lines: Iterable[str], *, code: int = 0) -> int:
-        """The command's result, which ends with the exit code `code`, as returned: `result` as JSON with --json, else
-        `lines`.
-        """
+        """Print `result` as JSON with --json, else `lines`; return `code`."""
         if self.is_json:
             text = json.dumps(enveloped(result, code), indent=2, allow_nan=False, default=plain)
             self._args.is_printed = True
@@ -54,8 +52,9 @@ class Console:
         code: int | None = None,
         has_findings: bool = False,
     ) -> int:
-        """A verdict, its reasons and notes, then `result` or `lines`; with --json the sentence goes to stderr where
-        the exit code is not 0. Returns that: `code`, else the verdict's. has_findings: the lines say each reason.
+        """Print a verdict, its reasons and notes, then `result` or `lines`; return the exit code.
+
+        With --json a failure's sentence also goes to stderr. has_findings: `lines` contain the reasons.
         """
         code = verdict.exit_code if code is None else code
         if self.is_json:
@@ -77,12 +76,12 @@ class Console:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
-    """Aligned text columns; numbers to the right, words to the left."""
+    """Aligned text columns, numbers to the right."""
     return list(long_table(header, lambda: rows))
 
 
 def long_table(header: Sequence[str], rows: Callable[[], Iterable[Sequence[object]]]) -> Iterator[str]:
-    """`table` of rows that are made twice, first for their widths, and never all held."""
+    """`table` of rows made twice, first for widths, to bound memory."""
     widths, is_number = [len(name) for name in header], [True] * len(header)
     for row in rows():
         for i, cell in enumerate(map(str, row)):
@@ -99,11 +98,10 @@ def long_table(header: Sequence[str], rows: Callable[[], Iterable[Sequence[objec
 
 
 def shown(value: float | None, form: str) -> str:
-    """A number in a format, a dash for none."""
     return "-" if value is None else format(value, form)
 
 
 def labels_of(text: str) -> frozenset[Label]:
-    """The labels in a field: objects, and those that ``--include`` names. Raises UsageError for another name."""
+    """Labels in a field: objects and those of ``--include``. Raises UsageError for others."""
     names = () if text.strip() == "none" else names_of(text, ("robot", "human"), "--include")
     return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})

@@ -1,4 +1,4 @@
-"""``splatctrl compare``: what got worse between two runs, two batches, or since a stored baseline."""
+"""``splatctrl compare``: regressions between runs, batches, or since a baseline."""
 
 import argparse
 from collections.abc import Iterator
@@ -18,7 +18,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _lines(result: CompareResult, *, is_long: bool) -> Iterator[str]:
-    """What got worse, what got better (and with `is_long` what only changed), and what was not alike."""
     kinds = (Change.WORSE, Change.BETTER, *((Change.OTHER,) if is_long else ()))
     rows = [_row(one) for one in result.figures if one.change in kinds]
     num = len(rows) if is_long else max(MOST_ROWS, result.metrics["num_worse"])

@@ -1,6 +1,4 @@
-"""``splatctrl config``: what a run would use and where each setting comes from; a template; the schema of --json;
-``completion``: a script by which a shell completes commands, options, their choices and files; ``help``: a page.
-"""
+"""``splatctrl config``, ``completion``, ``help``: settings and their sources, shell scripts, pages."""
 
 import argparse
 import json
@@ -48,7 +46,6 @@ def run_help(args: argparse.Namespace) -> int:
 
 
 def _complete_files(parser: Parser) -> None:
-    """Names of files and folders for what is a path."""
     for action in parser._actions:
         if action.type is Path:
             action.complete = shtab.FILE  # type: ignore[attr-defined]

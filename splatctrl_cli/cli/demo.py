@@ -1,4 +1,4 @@
-"""``splatctrl simulate`` and ``demo``: a recording that is made, and the whole main job on one, with pictures."""
+"""``splatctrl simulate`` and ``demo``: simulated recordings, and the main jobs on one."""
 
 import argparse
 import contextlib
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     step_console = Console(args, is_step=True)
 
     def told(result: StepResult, folder: Path) -> None:
-        """Print what the command of this step would, with the folder's name of later."""
+        """Print a step's output, with the final folder name."""
         text = io.StringIO()
         with contextlib.redirect_stdout(text):
             _show(step_console, result)

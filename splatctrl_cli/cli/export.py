@@ -1,4 +1,4 @@
-"""``splatctrl export``: splats in the formats that viewers open, read back and rendered before they count."""
+"""``splatctrl export``: splats in viewers' formats."""
 
 import argparse
 from collections.abc import Iterator
@@ -38,7 +38,6 @@ def _run_mcap(console: Console, args: argparse.Namespace) -> int:
 
 
 def show_exported(console: Console, result: ExportResult) -> int:
-    """What was written, and what it keeps of its source."""
     return console.result(result.as_dict(), _lines(result))
 
 

@@ -1,4 +1,4 @@
-"""``splatctrl``: parses the words, runs one subcommand, turns errors into one line and an exit code."""
+"""``splatctrl``: run one subcommand; errors become a line and exit code."""
 
 import argparse
 import errno
@@ -31,7 +31,7 @@ _NEVER_END = {"FIFO": stat.S_ISFIFO, "socket": stat.S_ISSOCK, "device": stat.S_I
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code; 6 where stdout was closed and there was something to print."""
+    """Run the command line and return its exit code; 6 if output met a closed stdout."""
     lost = _stand_in_for_closed_streams()
     code = _run(argv)
     if lost.is_written and code not in {70, INTERRUPTED}:
@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     refuse_endless_files()
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when cv2 is first imported
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of numpy; more wait for each other, and round otherwise
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of numpy; more threads wait, and round otherwise
     words, args, start = sys.argv[1:] if argv is None else list(argv), None, time.perf_counter()
     try:
         args = build_parser(words[0] if words else "").parse_args(words)
@@ -66,7 +66,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbose: bool) -> tuple[str, int]:
-    """Say an error in a line on stderr, with --json as an object on stdout; that line, and the exit code."""
+    """Print an error on stderr, with --json as an object on stdout; return line and exit code."""
     message, remedy, code = _told(error)
     if code == INTERRUPTED and remedy.endswith(RESUME):
         goes_on = shlex.join([words[0], RESUME, *(word for word in words[1:] if word != RESUME)])
@@ -76,7 +76,7 @@ def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbo
     line = " ".join((f"{message}; {remedy}" if remedy else message).split())
     print(f"splatctrl: {line}", file=sys.stderr)
     if is_json and not isinstance(sys.stdout, _Lost):
-        with suppress(OSError):  # the refusal says more than that it could not be printed
+        with suppress(OSError):  # the error matters more than a failed print
             print(
                 json.dumps(enveloped({"error": {"message": message, "remedy": remedy}}, code), indent=2), flush=True
             )
@@ -84,7 +84,6 @@ def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbo
 
 
 def _told(error: BaseException) -> tuple[str, str, int]:
-    """What an error comes to: a message, a remedy and the exit code."""
     match error:
         case SplatCtrlError():
             return error.message, error.remedy, error.exit_code
@@ -108,20 +107,19 @@ def _told(error: BaseException) -> tuple[str, str, int]:
 
 
 class _Lost(io.TextIOBase):
-    """Stands where a stream was closed before the program began (``>&-``), and knows whether it was written to."""
+    """Stand-in for a stream closed before the start (``>&-``); knows if it was written to."""
 
     is_written = False
 
     def write(self, text: str) -> int:
-        """Take the text to nowhere."""
         self.is_written = True
         return len(text)
 
 
 def _stand_in_for_closed_streams() -> _Lost:
-    """Replace stdout or stderr where it is closed, and keep its number from the next file that is opened.
+    """Replace closed stdout or stderr, and reserve their numbers.
 
-    Returns what stands for stdout; nothing is ever written to it where stdout is open.
+    Returns the stand-in for stdout, never written to if stdout is open.
     """
     for number in range(3):
         try:
@@ -135,7 +133,7 @@ def _stand_in_for_closed_streams() -> _Lost:
 
 
 def _check_outputs(args: argparse.Namespace) -> None:
-    """Refuse an output or a report that cannot be written; a report that is refused is not written at all."""
+    """Refuse an unwritable output or report; a refused report is not written."""
     out, report = getattr(args, "out", None), getattr(args, "junit", None)
     values = [value for name, value in vars(args).items() if name not in ("out", "junit")]
     given = [each for value in values for each in (value if isinstance(value, list) else [value])]
@@ -154,7 +152,7 @@ def _check_outputs(args: argparse.Namespace) -> None:
 
 
 def _check_output(out: Path, inputs: Sequence[Path], option: str) -> None:
-    """Refuse an output that cannot be written, or that is or holds an input, itself or its partial."""
+    """Refuse an output that is unwritable, or that is or contains an input."""
     check_can_be_written(out)
     targets = _places(out)
     for given in inputs:
@@ -164,17 +162,17 @@ def _check_output(out: Path, inputs: Sequence[Path], option: str) -> None:
 
 
 def _places(output: Path) -> set[Path]:
-    """Where an output is written: itself, and its partial."""
+    """Output path and its partial."""
     target = Path(os.path.realpath(output))  # resolve() raises RuntimeError for a link to itself
     return {target, target.with_name(target.name + PARTIAL)} if target.name else {target}
 
 
 @cache
 def refuse_endless_files() -> None:
-    """From now on, opening what is no file to read it raises OSError, wherever in the program that is.
+    """Make reading a FIFO, socket or device raise OSError from now on, anywhere.
 
-    A FIFO in a folder of images would wait for its writer, a link to /dev/zero would fill the memory. Folders hold
-    millions of files and are read in many places, so it is the interpreter that looks, once for each file it opens.
+    A FIFO among images would wait for its writer; a link to /dev/zero would fill the memory. Files are opened in many
+    places, so the interpreter checks each one.
     """
     sys.addaudithook(_look)
 

@@ -1,4 +1,4 @@
-"""Options that several subcommands have, and what is made of them; imports nothing heavy, for help is to be quick."""
+"""Options of several subcommands; imports nothing heavy, for quick help."""
 
 import argparse
 import math
@@ -25,14 +25,14 @@ SEVERAL_LOGS = "several logs of one session are read as one"
 
 
 def request_of(kind: type[T], args: argparse.Namespace, **given: Any) -> T:
-    """A request: fields that are `given`, or that an option of the same name has; the others keep their default."""
+    """Build a request from `given` fields, else equally named options, else defaults."""
     names = {field.name for field in fields(kind)} - given.keys()  # type: ignore[arg-type]
     parsed = {name: value for name, value in vars(args).items() if name in names and value is not None}
     return kind(**given, **{name: tuple(v) if isinstance(v, list) else v for name, v in parsed.items()})
 
 
 def source_options(args: argparse.Namespace) -> SourceOptions:
-    """What `add_source` parsed. Raises UsageError for a value of the wrong form."""
+    """Options of `add_source`. Raises UsageError for a wrong form."""
     return request_of(
         SourceOptions,
         args,
@@ -49,7 +49,7 @@ def source_options(args: argparse.Namespace) -> SourceOptions:
 
 
 def locked_joints(args: argparse.Namespace) -> dict[str, float]:
-    """Values by joint of ``--lock JOINT=VALUE``. Raises UsageError for a value that is not a number."""
+    """Values of ``--lock JOINT=VALUE``. Raises UsageError for other values."""
     return dict(_number_of("--lock", text, "JOINT") for text in args.lock)
 
 
@@ -62,7 +62,7 @@ def _number_of(option: str, assignment: str, what: str = "NAME") -> tuple[str, f
 
 
 def names_of(text: str, choices: Mapping[str, Any] | tuple[str, ...], option: str) -> tuple[str, ...]:
-    """The names in a list with commas. Raises UsageError for a name that is not a choice, or no name at all."""
+    """Names in a comma list. Raises UsageError for an unknown name or none."""
     names = tuple(dict.fromkeys(_names(text) or ()))
     unknown = [name for name in names if name not in choices]
     if unknown or not names:
@@ -71,7 +71,7 @@ def names_of(text: str, choices: Mapping[str, Any] | tuple[str, ...], option: st
 
 
 def pose(text: str) -> tuple[float, ...]:
-    """A pose as POSE, for argparse."""
+    """Parse a pose as POSE, for argparse."""
     values = numbers(text)
     if len(values) != 7:
         raise argparse.ArgumentTypeError(f"expected 7 numbers {POSE.lower()}, got {len(values)}")
@@ -83,7 +83,6 @@ def pose(text: str) -> tuple[float, ...]:
 
 
 def _device(text: str) -> str:
-    """The name of a device, for argparse."""
     if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", text):
         raise argparse.ArgumentTypeError(f"expected auto, cpu, cuda or cuda:N, got {shown(text)}")
     return text
@@ -98,7 +97,7 @@ def numbers(text: str) -> tuple[float, ...]:
 
 
 def _listed(name: str, text: str) -> str:
-    """A list for argparse, without spaces around its names. Raises UsageError for one that names nothing."""
+    """Strip a comma list, for argparse. Raises UsageError if empty."""
     names = _names(text)
     if not names:
         raise UsageError(f"{name} {text!r}: expected names, got none", remedy="leave the option out")
@@ -170,7 +169,7 @@ def output(what: str, *, default: str) -> tuple[Adds, ...]:
 
 
 def settings(example: str = "") -> tuple[Adds, ...]:
-    """``--set`` and ``--preset``, which is the first of the settings."""
+    """``--set`` and ``--preset``, the first of the settings."""
     paper = "paper: as printed (splatctrl help paper has our departures)"
     return (
         option("--set SECTION.KEY=VALUE ...", f"one setting{example}"),

@@ -1,6 +1,4 @@
-"""An argument parser whose errors are one line with a remedy, whose help fits a screen, and whose options are
-declared a line each.
-"""
+"""An argument parser with one-line errors, short help, and one-line options."""
 
 import argparse
 import difflib
@@ -17,7 +15,7 @@ T = TypeVar("T", int, float)
 
 MAX_SECONDS = 1e8  # [s] of a recording: three years
 MOST_WIDTH = 100  # columns of help
-GONE = {  # commands and options that left the command line, and what takes their place
+GONE = {  # removed commands and options, with replacements
     "capture": "`tar -cf X.tar X.capture` for one file, `splatctrl export REPLAY --mcap` for a viewer",
     "splatctrl reconstruct --method": "python -m experiments fits",
     **dict.fromkeys(
@@ -38,9 +36,9 @@ GONE = {  # commands and options that left the command line, and what takes thei
 
 
 class Parser(argparse.ArgumentParser):
-    """Raises UsageError where argparse prints its usage and leaves; the parsers of subcommands are of this class.
+    """Argument parser that raises UsageError, also for subcommands.
 
-    ``--help`` shows what stands in no group of its own; ``--help-all`` shows everything.
+    ``--help`` shows ungrouped options, ``--help-all`` all.
     """
 
     def __init__(self, *, examples: Sequence[str] = (), **kwargs: Any) -> None:
@@ -53,7 +51,7 @@ class Parser(argparse.ArgumentParser):
             option("--help-all", "show every option", action=_HelpAll, nargs=0)(self)
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> tuple[Any, list[str]]:  # type: ignore[override]
-        """As in argparse, but what is left over is refused here, by the parser that knows the options."""
+        """Refuse leftovers here, where the options are known."""
         self._words = list(sys.argv[1:] if args is None else args)
         parsed, left_over = super().parse_known_args(args, namespace)
         if left_over:
@@ -61,7 +59,7 @@ class Parser(argparse.ArgumentParser):
         return parsed, left_over
 
     def error(self, message: str) -> NoReturn:
-        """Raise UsageError with argparse's message and what to do about it."""
+        """Raise UsageError with argparse's message and a remedy."""
         command = self.prog.partition(" ")[2]
         if "required" in message:  # perhaps because it was misspelt
             unknown = [w for w in self._words if w.startswith("--") and w.partition("=")[0] not in self._known()]
@@ -89,18 +87,17 @@ class Parser(argparse.ArgumentParser):
 
     @property
     def actions(self) -> "argparse._SubParsersAction[Parser] | None":
-        """The parsers below this one, None where it takes options itself."""
         return next((action for action in self._actions if isinstance(action, argparse._SubParsersAction)), None)
 
     @property
     def groups(self) -> list[tuple[str, list[argparse.Action]]]:
-        """Options by the title of their group, the first of which are what ``--help`` shows."""
+        """Options by group title; ``--help`` shows the first."""
         shown = [action for group in self._action_groups[:2] for action in group._group_actions]
         more = [*self._action_groups[2:], self.run_group]
         return [("", shown), *((group.title or "", group._group_actions) for group in more if group._group_actions)]
 
     def format_usage(self) -> str:
-        """One line: places, and options that are required."""
+        """One line of positionals and required options."""
         either = [group for group in self._mutually_exclusive_groups if group.required]
         grouped = {id(action) for group in either for action in group._group_actions}
         required = [f"({' | '.join(invocation(a) for a in group._group_actions)})" for group in either]
@@ -110,7 +107,7 @@ class Parser(argparse.ArgumentParser):
         return " ".join(["usage:", self.prog, *places, *required, "[options]"]) + "\n"
 
     def format_help(self) -> str:
-        """What people use, and examples."""
+        """Common options and examples."""
         num_hidden = sum(len(actions) for _, actions in self.groups[1:])
         titles = ", ".join(title for title, _ in self.groups[1:])
         examples = "".join(f"  splatctrl {example}\n" for example in self.examples)
@@ -122,7 +119,6 @@ class Parser(argparse.ArgumentParser):
         )
 
     def format_full_help(self) -> str:
-        """Every option, by group."""
         return self._format([*self._action_groups, self.run_group])
 
     def _format(self, groups: Iterable[argparse._ArgumentGroup]) -> str:
@@ -146,10 +142,9 @@ def option(
     default: Any = None,
     **more: Any,
 ) -> Adds:
-    """``-o/--out PATH``, ``--flag``, ``--repeatable NAME ...`` or a ``PLACE``, declared a line each.
+    """Declare ``-o/--out PATH``, ``--flag``, ``--repeatable NAME ...`` or a ``PLACE``.
 
-    kind: what makes the value of the text, or the words to choose from. default: of an option that is not given;
-    the help says it where it is a number or a word. more: as in argparse.
+    kind: converts the text, or a tuple of choices. default: the help shows it if given. more: as in argparse.
     """
     flags, _, metavar = name.partition(" ")
     is_place, repeats = not flags.startswith("-"), metavar.endswith(" ...")
@@ -173,37 +168,32 @@ def option(
 
 
 def group(title: str, *options: Adds) -> Adds:
-    """Options that ``--help-all`` alone shows."""
+    """Options for ``--help-all`` alone."""
     return lambda container: add_all(container.add_argument_group(title), options)
 
 
 def either(*options: Adds, required: bool = False) -> Adds:
-    """Options of which one may be given, or has to be."""
+    """Exclusive options."""
     return lambda container: add_all(container.add_mutually_exclusive_group(required=required), options)
 
 
 def of_run(*options: Adds) -> Adds:
-    """Options of the last group, which every command has."""
+    """Options of the last group, in every command."""
     return lambda parser: add_all(parser.run_group, options)
 
 
 def add_all(container: Any, options: Iterable[Adds]) -> None:
-    """Add them to a parser, or to a group of one."""
     for add in options:
         add(container)
 
 
 class _HelpAll(argparse.Action):
-    """Prints everything and leaves."""
-
     def __call__(self, parser: Any, *_: object) -> None:
         print(parser.format_full_help(), end="")
         parser.exit()
 
 
 class _Formatter(argparse.HelpFormatter):
-    """Up to MOST_WIDTH columns, with room for the names of options."""
-
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=28, width=min(shutil.get_terminal_size().columns - 2, MOST_WIDTH))
 
@@ -212,7 +202,7 @@ class _Formatter(argparse.HelpFormatter):
 
 
 def invocation(action: argparse.Action) -> str:
-    """``-o, --out PATH``, the same in every version of Python."""
+    """``-o, --out PATH``, alike in all Python versions."""
     if not action.option_strings:
         name = str(action.metavar or action.dest)
         return {"?": f"[{name}]", "+": f"{name} ..."}.get(str(action.nargs), name)
@@ -225,31 +215,31 @@ def invocation(action: argparse.Action) -> str:
 
 
 def real(low: float, high: float, unit: str = "") -> Callable[[str], float]:
-    """A number from `low` to `high`, both allowed, in `unit`."""
+    """Parser of a number in [low, high]."""
     return _bounded(float, Within(low, high, unit, ""))
 
 
 def whole(low: int, high: int, unit: str = "") -> Callable[[str], int]:
-    """A whole number from `low` to `high`, both allowed."""
+    """Parser of a whole number in [low, high]."""
     return _bounded(int, Within(low, high, unit, ""))
 
 
 def setting(section: type[Section], key: str) -> Callable[[str], float]:
-    """A number that stands for a key of the configuration: its type and range."""
+    """Parser of a configuration key's number: its type and range."""
     declared = section.declared[key]
     assert isinstance(declared, Within)
     return _bounded(int if type(getattr(section, key)) is int else float, declared)
 
 
 def words(section: type[Section], key: str) -> tuple[str, ...]:
-    """The words that a key of the configuration may be."""
+    """Choices of a configuration key."""
     declared = section.declared[key]
     assert isinstance(declared, OneOf)
     return declared.words
 
 
 def several(text: str) -> tuple[float, ...]:
-    """Numbers joined by commas; none where one of them is not a number, or not within `MAX_PLACE`."""
+    """Numbers joined by commas; none if one is invalid or beyond `MAX_PLACE`."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:

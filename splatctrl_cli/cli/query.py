@@ -1,4 +1,4 @@
-"""``splatctrl query``: distances, gradients, bounds, probabilities and what is nearest, at the points of a table."""
+"""``splatctrl query``: distances, gradients, bounds, probabilities and nearest splats at points."""
 
 import argparse
 import shutil
@@ -17,7 +17,7 @@ RATED = 1000  # points from which on a rate says something
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code; without an output the answers go to stdout, figures to stderr."""
+    """Run; without an output answers go to stdout, figures to stderr."""
     console = Console(args)
     request = request_of(
         QueryRequest,

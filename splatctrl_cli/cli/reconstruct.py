@@ -48,14 +48,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None) -> RecordingRequest:
-    """The recording at `path`, or at --dtu where that is given."""
+    """The recording at `path`, or at --dtu."""
     is_dtu = args.dtu is not None
     given = {"path": args.dtu or path, "is_dtu": is_dtu, "options": source_options(args), "masks": masks}
     return request_of(RecordingRequest, args, **given)
 
 
 def show_reconstructed(console: Console, result: ReconstructResult) -> int:
-    """The verdict, and a row of figures."""
     found = {"scene": str(result.out), "metrics": result.metrics, "removed": result.removed}
     return console.concluded(result.verdict, found, [*_lines(result), f"wrote {result.out}"])
 

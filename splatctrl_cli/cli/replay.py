@@ -1,4 +1,4 @@
-"""``splatctrl replay``: the clearance of logged motion, what a controller says of it, or what it does instead."""
+"""``splatctrl replay``: clearance of motion, and what a controller would do."""
 
 import argparse
 from collections.abc import Iterator, Sequence
@@ -36,15 +36,11 @@ def run(args: argparse.Namespace) -> int:
 def show_replayed(
     console: Console, result: ReplayResult, *, code: int, is_long: bool = False, with_steps: bool = False
 ) -> int:
-    """The verdict, when and why, and the figures."""
     lines = _lines(result, is_long=is_long, with_steps=with_steps)
     return console.concluded(result.verdict, {"out": str(result.out), **result.metrics}, lines, code=code)
 
 
 def _lines(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator[str]:
-    """What goes to stdout after the verdict: when and why, the headline figures (all with `is_long`), what stands
-    beside, notes, and a row per step on request.
-    """
     replay, metrics = result.replay, result.metrics
     shown = metrics if is_long else {name: metrics[name] for name in HEADLINE if metrics.get(name) is not None}
     lines = when_and_why(replay)
@@ -60,7 +56,6 @@ def _lines(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator
 
 
 def _mount_lines(violations: Sequence[StaticViolation]) -> list[str]:
-    """How near the spheres that no joint moves stand to the scene, in one line however many they are."""
     if not violations:
         return []
     nearest = min(violations, key=lambda violation: violation.clearance)

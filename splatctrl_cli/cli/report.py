@@ -1,4 +1,4 @@
-"""``splatctrl report`` and ``splatctrl view``: pages that open from disk."""
+"""``splatctrl report`` and ``view``: HTML pages."""
 
 import argparse
 import os
@@ -24,7 +24,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def run_view(args: argparse.Namespace) -> int:
-    """Write a page in 3-D and open it, and return the exit code."""
     console = Console(args)
     result = view(request_of(ViewRequest, args, roots=tuple(args.root)))
     found = f"{result.num_splats} splats, {result.num_states} states, {result.num_unknown} cubes never seen"
@@ -36,7 +35,7 @@ def run_view(args: argparse.Namespace) -> int:
 
 
 def opened(page: Path) -> bool:
-    """Open a page in a browser with a window; False where there is none."""
+    """Open a page in a browser window; False without one."""
     if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in SCREENS):
         return False
     return webbrowser.open(page.absolute().as_uri())

@@ -1,6 +1,4 @@
-"""What a command tells other programs: how every object of ``--json`` begins, as its published JSON Schema says; and
-where one that judges tells CI what it found: ``--junit FILE``, and on GitHub annotations and a summary.
-"""
+"""Output for other programs: ``--json`` envelope, ``--junit FILE``, GitHub annotations."""
 
 import argparse
 import sys
@@ -22,14 +20,14 @@ SCHEMA_FILE = Path(__file__).parent.parent / "report" / "output.schema.json"
 
 
 def enveloped(result: Mapping[str, Any], code: int) -> dict[str, Any]:
-    """The schema's name and the exit code, then the result."""
+    """Add schema name and exit code in front."""
     first = {"schema": SCHEMA, "exit_code": code}
     return {**first, **result, **first}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reports:
-    """One command's report: `path` of the recording, the file of --junit, and by time.perf_counter when it began."""
+    """A command's report: the recording's `path`, --junit file, and start by time.perf_counter."""
 
     command: str
     path: str
@@ -37,11 +35,11 @@ class Reports:
     start: float
 
     def conclude(self, verdict: Mapping[str, Any], code: int) -> None:
-        """Tell of a verdict. Raises UsageError and WriteError where the file cannot be written."""
+        """Report a verdict. Raises UsageError or WriteError if the file is unwritable."""
         self._write(cases_of(verdict, self._group), notes_of(verdict), code, {"label": verdict["label"]})
 
     def fail(self, line: str, code: int) -> None:
-        """Tell of a command that came to no verdict; `line` is what it said."""
+        """Report a command without a verdict by its error line."""
         self._write([error_case(self._group, line, exit_code=code)], (), code, {})
 
     @property
@@ -63,7 +61,7 @@ class Reports:
 
 
 def publish(suites: Sequence[Suite], *, junit: Path | None, is_fatal: bool) -> None:
-    """Write --junit, and on GitHub the annotations and the summary. A summary that cannot be written is said."""
+    """Write --junit, and GitHub annotations and summary; an unwritable summary is printed."""
     if junit is not None:
         write_junit(junit, suites)
     try:
@@ -73,7 +71,6 @@ def publish(suites: Sequence[Suite], *, junit: Path | None, is_fatal: bool) -> N
 
 
 def reports_of(args: argparse.Namespace) -> Reports:
-    """The report of a command that was parsed."""
     action = getattr(args, "action", None)
     command = f"{args.command} {action}" if action else args.command
     given = next((value for name in RECORDINGS if (value := getattr(args, name, None))), "")
@@ -84,9 +81,9 @@ def reports_of(args: argparse.Namespace) -> Reports:
 def tell_of_failure(
     words: Sequence[str], args: argparse.Namespace | None, line: str, code: int, start: float
 ) -> None:
-    """Write the report of a command that came to no verdict; where that cannot be done, too, say why on stderr.
+    """Report a command without a verdict; if that fails too, print why.
 
-    args: None where the words could not be parsed; start: when the command began, by time.perf_counter.
+    args: None for unparsed words. start: by time.perf_counter.
     """
     unparsed = Reports(command=words[0], path="", junit=_junit_in(words), start=start)
     try:
@@ -97,7 +94,6 @@ def tell_of_failure(
 
 
 def _junit_in(words: Sequence[str]) -> Path | None:
-    """The file of --junit, among words that argparse refused."""
     for word, following in zip(words, [*words[1:], ""], strict=True):
         if word == "--":
             break

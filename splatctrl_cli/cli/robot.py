@@ -1,4 +1,4 @@
-"""``splatctrl robot``: fit collision spheres, measure them, list self-collision pairs, learn parts, show a robot."""
+"""``splatctrl robot``: collision spheres, self-collision pairs, learned parts."""
 
 import argparse
 import math
@@ -31,7 +31,6 @@ LEARNED = ("num_pixels", "num_configurations", "area", "outside_95", "outside_mo
 
 
 def run_spheres(args: argparse.Namespace) -> int:
-    """Fit, write, measure what was written, and return the exit code."""
     console, fit = Console(args), request_of(FitOptions, args)
     if args.max_spheres is None and args.max_protrusion is None:
         fit = request_of(FitOptions, args, max_spheres=DEFAULT_SPHERES)
@@ -102,7 +101,6 @@ def _learned_row(part: LearnedLink) -> tuple[object, ...]:
 
 
 def _coverage_lines(result: CoverageResult) -> Iterator[str]:
-    """The table by link and, below it, what it means."""
     report = result.report
     header = ("link", "spheres", "area cm2", "uncovered %", "deficit mm", "at x, y, z mm", "sticks out mm")
     yield from (*table(header, [_row(link) for link in report.links]), "", coverage_summary(report))
@@ -118,7 +116,6 @@ def _coverage_lines(result: CoverageResult) -> Iterator[str]:
 
 
 def _pairs_lines(result: PairsResult) -> list[str]:
-    """The pairs of links, those that are checked first."""
     found, header = result.found, ("link", "and", "sphere pairs", "gap mm", "touch %", "left out because")
     ordered = sorted(found.link_pairs, key=lambda pair: pair.left_out is not None)
     rows = [(*pair.links, pair.num_sphere_pairs, *_gap(pair), pair.left_out or "") for pair in ordered]
@@ -131,7 +128,6 @@ def _pairs_lines(result: PairsResult) -> list[str]:
 
 
 def _robot_lines(result: RobotResult) -> list[str]:
-    """Joints with limits, locked joints, a row per link, doubts, and meshes that are not there."""
     model, urdf = result.model, result.model.urdf
     kinds = {joint.name: joint.kind for joint in urdf.joints}
     joints = [(name, kinds[name], *map(_number, limits)) for name, *limits in result.joints]

@@ -1,4 +1,4 @@
-"""The options of commands on recordings and on many runs."""
+"""Options of commands on recordings and runs."""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The options of the commands that make and judge scenes and motions."""
+"""Options of commands on scenes and motions."""
 
 from pathlib import Path
 
@@ -220,7 +220,6 @@ STEP_LIMIT = 10.0  # [s]
 
 
 def _start(text: str) -> float | str:
-    """Seconds not below zero, or the time of the first map, for argparse."""
     return text if text == "first-map" else real(0, MAX_SECONDS, "s or first-map")(text)
 
 

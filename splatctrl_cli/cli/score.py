@@ -1,4 +1,4 @@
-"""``splatctrl score``: renders views that did not train a scene and compares them with what was recorded."""
+"""``splatctrl score``: renders compared with held-out views."""
 
 import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -41,7 +41,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def show_scored(console: Console, result: ScoreResult) -> int:
-    """The verdict, and a row per view or scan."""
     return console.concluded(result.verdict, result.report, lines_of(result.report))
 
 
@@ -53,7 +52,7 @@ def _request(args: argparse.Namespace) -> ScoreRequest:
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:
-    """None where no cloud is given. Raises UsageError for options that mean nothing here."""
+    """Read --cloud's settings. Raises UsageError for its options alone."""
     if args.cloud is None:
         for name in ("unit", "masks"):
             if getattr(args, f"cloud_{name}") is not None:
@@ -69,7 +68,6 @@ def _cloud(args: argparse.Namespace) -> CloudSettings | None:
 
 
 def lines_of(report: Mapping[str, Any]) -> Iterable[str]:
-    """The table of a report, and what belongs to its figures."""
     return _lines_of_scans(report) if "results" in report else _lines_of_views(report)
 
 
@@ -116,7 +114,6 @@ def _with_mean(
     mean: Sequence[Any],
     metrics: Mapping[str, Any],
 ) -> list[str]:
-    """The table of the rows, below a line their mean, and the changes where there was a baseline."""
     last = [[*mean, *_cells(columns, metrics)]]
     if f"{PREFIX}num_views" in metrics:
         last.append(["change", "-", *(_change(name, metrics.get(PREFIX + name)) for name in columns)])
@@ -126,7 +123,6 @@ def _with_mean(
 
 
 def _protocol_lines(protocol: Mapping[str, Any]) -> list[str]:
-    """Protocol, split, mask rule, averaging, resolution and background."""
     color = ", ".join(f"{value:.2f}" for value in protocol["background"])
     published = protocol["published_resolution"]
     resolution = ", ".join(protocol["resolution"])
@@ -142,8 +138,6 @@ def _protocol_lines(protocol: Mapping[str, Any]) -> list[str]:
 
 
 def _cloud_lines(metrics: Mapping[str, Any], words: str) -> list[str]:
-    """Accuracy, completeness and Chamfer, and by what they came about."""
-
     def length(name: str) -> str:
         return "-" if metrics[name] is None else f"{1e3 * metrics[name]:.2f} mm"
 
@@ -161,12 +155,10 @@ def _cells(columns: Sequence[str], metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _change(name: str, value: float | None) -> str:
-    """A change as the table shows it, with its sign."""
     return "-" if value is None else ("-" if value < 0 else "+") + _cell(name, abs(value))
 
 
 def _cell(name: str, value: float | None) -> str:
-    """A figure as the table shows it."""
     if value is None:
         return "-"
     if name.startswith("depth"):

@@ -1,4 +1,4 @@
-"""``splatctrl sdf-bake``: a scene's splats as a distance grid, and its accuracy where the truth is known."""
+"""``splatctrl sdf-bake``: splats as a distance grid, with its accuracy."""
 
 import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,7 +28,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def show_baked(console: Console, result: BakeResult) -> int:
-    """The verdict, the field's summary and what it was compared with."""
     console.log(f"baked in {result.seconds['bake']:.2f} s; wrote {result.out}")
     compared = result.accuracy.as_dict()
     printed = {**result.summary, **({"accuracy": compared} if compared else {})}
@@ -55,7 +54,7 @@ def _request(args: argparse.Namespace) -> BakeRequest:
 
 
 def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
-    """The log and the cameras of ``LOG:camera,...``; none named means every one that did not train."""
+    """Log and cameras of ``LOG:camera,...``; none means all that did not train."""
     path, colon, cameras = text.rpartition(":")
     if not colon or Path(text).exists():
         return Path(text), ()
@@ -63,7 +62,6 @@ def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
 
 
 def _lines(result: BakeResult) -> Iterator[str]:
-    """The summary, and a table for each thing that the field was compared with."""
     rows = [(name.replace("_", " "), _shown(value)) for name, value in result.summary.items()]
     yield from table(("field", ""), rows)
     truth, mesh, held_out = result.accuracy.truth, result.accuracy.reference_mesh, result.accuracy.held_out_depth
@@ -83,7 +81,6 @@ def _lines(result: BakeResult) -> Iterator[str]:
 
 
 def _truth_lines(compared: TruthComparison) -> list[str]:
-    """The table by band, and whether the exact distance keeps to its allowance."""
     accuracy, figures = compared.accuracy, ("mean", "rmse", "median", "over_95", "over_max")
     rows = [
         (where, name, _band(band), *_errors(band, figures))
@@ -131,7 +128,7 @@ def _band(band: BandAccuracy) -> str:
 
 
 def _errors(band: BandAccuracy, figures: Sequence[str] = ERRORS) -> list[object]:
-    """The count, and the errors [mm]."""
+    """Count and errors [mm]."""
     values = (getattr(band, name) for name in figures)
     return [band.count, *("-" if value is None else f"{value * 1e3:.1f}" for value in values)]
 

@@ -1,4 +1,4 @@
-"""``splatctrl sweep``: how far a replay is from the other verdict."""
+"""``splatctrl sweep``: distance of a replay from another verdict."""
 
 import argparse
 import os
@@ -12,7 +12,6 @@ from splatctrl_cli.jobs.sweep.sweep import KeyFlip, SweepRequest, SweepResult, T
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     console, workers = Console(args), args.workers or os.cpu_count() or 1
     request = request_of(SweepRequest, args, out=args.out or Path("sweep"), workers=workers)
     result = sweep(request, OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1)), console)
@@ -20,7 +19,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _lines(result: SweepResult, *, is_long: bool) -> Iterator[str]:
-    """The verdict before, a row for each key, the least change of all, and what each flip is."""
     yield str(result.before["sentence"])
     yield ""
     header = ("key", "from", "to", "unit", "verdict until", "", "verdict from", "", "tried")

@@ -1,1 +1,1 @@
-"""How files are written and read whatever they hold: whole or not at all, locked, with digests."""
+"""Files on disk: atomic outputs, spilled rows, summaries."""

@@ -1,6 +1,4 @@
-"""Outputs that appear whole or not at all, of which one at a time writes, and the ``run.json`` in every output
-folder, with the digests by which it knows the folder's files.
-"""
+"""Atomic outputs with one writer at a time, and ``run.json`` with their digests."""
 
 import errno
 import fcntl
@@ -27,7 +25,7 @@ REMEDY = "make it again with the command in run.json"
 
 @dataclass(frozen=True, kw_only=True)
 class Parts:
-    """What a folder was when it was written; digests: None where an older version wrote it."""
+    """Digests of a folder's files as written; None from an older version."""
 
     folder: Path
     digests: Mapping[str, str] | None = None
@@ -35,7 +33,7 @@ class Parts:
 
     @classmethod
     def of_run(cls, folder: Path, run: Mapping[str, object]) -> "Parts":
-        """Of what ``run.json`` holds. Raises InputError for values that are not digests."""
+        """Read the digests in ``run.json``. Raises InputError for invalid ones."""
         digests = run.get("parts")
         if digests is not None and not (
             isinstance(digests, dict) and all(isinstance(value, str) for value in digests.values())
@@ -45,9 +43,9 @@ class Parts:
 
     @classmethod
     def beside(cls, path: Path) -> "Parts":
-        """Of the folder that a file is in; without digests where there is no ``run.json``, or an older version's.
+        """Read the digests in a file's folder; None without ``run.json`` or from an older version.
 
-        Raises InputError for a ``run.json`` that cannot be read.
+        Raises InputError for an unreadable ``run.json``.
         """
         file = path.parent / "run.json"
         if not file.is_file():
@@ -59,11 +57,11 @@ class Parts:
         return cls.of_run(path.parent, run if isinstance(run, dict) else {})
 
     def has(self, path: Path) -> bool:
-        """Whether a file is to be there: listed, or where nothing is, there."""
+        """True if a file is listed; without digests, if it exists."""
         return path.is_file() if self.digests is None else self._name(path) in self.digests
 
     def checked(self, path: Path) -> Path:
-        """The path itself. Raises InputError where the file is not what was written."""
+        """Return the path. Raises InputError if the file is not as written."""
         if self.digests is None:
             return path
         wanted = self.digests.get(self._name(path))
@@ -85,10 +83,10 @@ _WITHOUT_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.
 
 @contextmanager
 def held(partial: Path, *, is_folder: bool) -> Iterator[None]:
-    """Hold a partial output, which is made if it is not there, for the time of the block.
+    """Lock a partial output for the block; create it if missing.
 
-    The lock goes with the folder or file when that is renamed, and with the process when that is killed; nothing is
-    left of it. On a file system without flock(2) nothing is locked. Raises UsageError where another run holds it.
+    The lock follows a rename, ends with the process, and leaves nothing. Without flock(2) nothing is locked. Raises
+    UsageError if another run has the lock.
     """
     descriptor = _taken(partial, is_folder=is_folder)
     try:
@@ -98,7 +96,7 @@ def held(partial: Path, *, is_folder: bool) -> Iterator[None]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, a link, or a folder with all that is in it; a missing one is no error."""
+    """Remove a file, link or folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -106,7 +104,6 @@ def remove(path: Path) -> None:
 
 
 def _taken(partial: Path, *, is_folder: bool) -> int:
-    """A descriptor of the partial output, locked."""
     while True:
         if partial.is_symlink():
             partial.unlink(missing_ok=True)
@@ -118,7 +115,7 @@ def _taken(partial: Path, *, is_folder: bool) -> int:
             continue  # its run ended between
         try:
             _lock(descriptor, partial)
-            if _is_at(partial, descriptor):  # else it was renamed or removed between, and is another's
+            if _is_at(partial, descriptor):  # else another process renamed or removed it
                 if partial.is_dir() == is_folder:
                     return descriptor
                 remove(partial)
@@ -148,7 +145,7 @@ def _is_at(path: Path, descriptor: int) -> bool:
 
 
 def _holder(inode: int) -> int | None:
-    """The process that holds a lock on an inode, None where the kernel does not tell."""
+    """Process that locks an inode, None if the kernel lists none."""
     try:
         lines = LOCKS.read_text(encoding="ascii").splitlines()
     except OSError:
@@ -165,16 +162,16 @@ def _holder(inode: int) -> int | None:
     return None
 
 
-MARKERS = ("run.json", "capture.json")  # at the top of every folder that a command wrote
-PARTIAL = ".partial"  # ends the name of an output that is not whole
+MARKERS = ("run.json", "capture.json")  # one is in every folder a command wrote
+PARTIAL = ".partial"  # suffix of an incomplete output
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin", "clarabel", "mcap", "rosbags")
 _WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EBADF})
 WITH_PARTS = ("reconstruct", "sdf-bake", "replay")  # commands whose folders others rely on
-NO_PARTS = ("run.json", "checkpoint")  # what holds the digests, and what only an interrupted run reads
+NO_PARTS = ("run.json", "checkpoint")  # the digests' own file, and what only an interrupted run reads
 
 
 def is_write_failure(error: OSError, output: Path | None = None) -> bool:
-    """Whether `error` came from writing: a disk that is full or broken, or a file in `output`. Else from reading."""
+    """True if writing failed: a full or broken disk, or a file in `output`."""
     if error.errno in _WRITE_FAILURES:
         return True
     if output is None or not isinstance(error.filename, str):
@@ -186,15 +183,13 @@ def is_write_failure(error: OSError, output: Path | None = None) -> bool:
 def output_path(
     path: Path, *, force: bool, is_folder: bool, checkpoint: str | None = None, resume: bool = False
 ) -> Iterator[Path]:
-    """Yield ``NAME.partial`` (an empty folder, or a file name to write to); rename it to `path` on success.
+    """Yield ``NAME.partial`` (an empty folder, or a file name); rename it to `path` on success.
 
-    A failure leaves nothing behind; an interrupted run leaves ``NAME.partial``. `checkpoint` names the file in that
-    folder from which a run can go on: where it is there, a failure to write or of a card leaves the folder, too. With
-    `resume` such a folder is yielded as it is, and no failure removes it.
-    Where `path` is a link, all of this happens to what it leads to, and the link stays.
-    Raises UsageError when `path` has no name of its own, exists without `force`, is not of the kind to write, is
-    a folder that no command wrote, or is being written by another run, and when its parent cannot be written;
-    WriteError where `is_write_failure` (a full disk); every other error as it is.
+    A failure removes it; an interrupted run leaves it. With the file `checkpoint` in it, a failure to write or of a
+    card leaves it, too. `resume` yields such a folder unchanged, and no failure removes it. A link `path` stays, and
+    its target is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind.
+    The same holds for a folder of no command, another writer, or an unwritable parent. Raises WriteError if
+    `is_write_failure`; other errors pass.
     """
     try:
         path = followed(path)
@@ -235,7 +230,7 @@ def output_path(
 
 
 def followed(path: Path) -> Path:
-    """Where an output is written: a link stays, and what it leads to is replaced. Raises UsageError for a loop."""
+    """Target of a link, else the path itself. Raises UsageError for a loop."""
     if not path.is_symlink():
         return path
     target = Path(os.path.realpath(path))
@@ -245,13 +240,13 @@ def followed(path: Path) -> Path:
 
 
 def partial_path(path: Path) -> Path:
-    """``NAME.partial``, under which an output is written: beside what a link leads to."""
+    """``NAME.partial`` next to the path, or to a link's target."""
     target = followed(path)
     return target.with_name(target.name + PARTIAL)
 
 
 def check_can_be_written(path: Path) -> None:
-    """Raise UsageError for an output that no command can write, before any work: its nearest folder says so."""
+    """Raise UsageError early if the nearest folder is not writable."""
     try:
         above = next(folder for folder in followed(path).absolute().parents if folder.exists())
         is_good = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
@@ -263,7 +258,7 @@ def check_can_be_written(path: Path) -> None:
 
 
 def write_durably(path: Path, write: Callable[[Path], object]) -> None:
-    """Call `write` with a temporary name, and put what it wrote in the place of `path` in one step, on disk."""
+    """Call `write` with a temporary name, then replace `path` on disk in one step."""
     temporary = path.with_name(path.name + ".new")
     try:
         write(temporary)
@@ -276,7 +271,7 @@ def write_durably(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def flush(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on disk."""
+    """Wait until a file, or a folder's names, are on disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -285,7 +280,7 @@ def flush(path: Path) -> None:
 
 
 def _check_replaceable(path: Path, *, is_folder: bool) -> None:
-    """Raise UsageError where --force could remove what no command wrote: a folder is ours if empty or marked."""
+    """Raise UsageError if --force could remove foreign files: ours have a marker."""
     if path.name in ("", ".."):
         raise UsageError(f"{path}: has no name of its own to write under", remedy="give another --out")
     if is_folder and path.is_file():
@@ -322,18 +317,18 @@ def _replace(partial: Path, path: Path) -> None:
         partial.rename(path)
     else:
         partial.replace(path)
-    remove(old)  # also that of a run which was killed right above
+    remove(old)  # also of a run killed right above
 
 
 class Stopwatch:
-    """Wall time by stage, for ``run.json``."""
+    """Wall time by stage [s]."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time of the block to stage `name`."""
+        """Add the block's time to stage `name`."""
         start = time.perf_counter()
         try:
             yield
@@ -342,7 +337,7 @@ class Stopwatch:
 
 
 def part_digests(folder: Path) -> dict[str, str]:
-    """sha256 by name, relative to `folder`, of every file in it and in its folders."""
+    """sha256 of every file below `folder`, by relative name."""
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return {name: sha256(folder / name) for name in names if name.partition("/")[0] not in NO_PARTS}
 
@@ -358,11 +353,10 @@ def write_run(
     seed: int = 0,
     verdict: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write ``run.json``: what ran, with what, on what (sha256 by name), how long, what came out and, of a command
-    that judges, its verdict; of WITH_PARTS also the sha256 of every file, which is checked when one is opened: it is
-    to be written last.
+    """Write ``run.json``: command, settings, sha256 of inputs, times, metrics and verdict.
 
-    ``--resume`` is left out of the arguments: an interrupted run leaves what an uninterrupted one does.
+    Write it last: for WITH_PARTS it has the sha256 of every file, checked on opening. It omits ``--resume``, so that
+    an interrupted run leaves what an uninterrupted one does.
     """
     run = {
         "command": command,
@@ -384,7 +378,7 @@ def write_run(
 
 
 def write_json(path: Path, value: object) -> None:
-    """Indented JSON without NaN, ending in a newline."""
+    """Write indented JSON without NaN."""
     path.write_text(json.dumps(value, indent=2, allow_nan=False, default=plain) + "\n", encoding="utf-8")
 
 
@@ -394,12 +388,12 @@ def sha256(path: Path) -> str:
 
 
 def plain(value: object) -> object:
-    """What JSON can hold of a value that it does not know."""
+    """Convert a foreign value for JSON."""
     if hasattr(value, "tolist"):
         return value.tolist()
     return str(value)
 
 
 def finite(value: float) -> float | None:
-    """The value, None where JSON has none for it."""
+    """The value, None if not finite."""
     return value if math.isfinite(value) else None

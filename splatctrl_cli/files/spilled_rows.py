@@ -1,4 +1,4 @@
-"""Rows of numbers that memory need not hold: in a file without a name, read a block at a time."""
+"""Rows of numbers in an unnamed file, read by blocks to bound memory."""
 
 import os
 import tempfile
@@ -14,25 +14,25 @@ from splatctrl_cli.records import Float64, Index
 
 IN_MEMORY = 2**20  # [bytes] up to which a file is memory
 BLOCK = 4096  # rows at once
-FEW = 4096  # rows that are read beside those that were asked for
+FEW = 4096  # unrequested rows that may be read along
 
 
 def scratch_folder() -> Path:
-    """Where files without a name lie: TMPDIR, else /var/tmp (on disk, unlike some /tmp), else what there is."""
+    """Folder for unnamed files: TMPDIR, else /var/tmp (on disk, unlike some /tmp), else any."""
     given, on_disk = os.environ.get("TMPDIR"), Path("/var/tmp")
     return Path(tempfile.gettempdir()) if given or not os.access(on_disk, os.W_OK) else on_disk
 
 
 def ranges(num: int) -> Iterator[tuple[int, int]]:
-    """First and one past the last row of every `BLOCK` of `num` rows."""
+    """First and one past the last row of each `BLOCK`."""
     yield from ((first, min(first + BLOCK, num)) for first in range(0, num, BLOCK))
 
 
 class RowFile:
-    """Rows of one shape, added at the end; what is read is a copy, and nothing is mapped into memory."""
+    """Rows of one shape, appended; reads return copies, nothing is mapped."""
 
     def __init__(self, shape: tuple[int, ...] = (), blocks: Iterable[Float64] = ()) -> None:
-        """shape: of a row; blocks: rows (T, ...) to begin with."""
+        """Start with `blocks` of rows (T, ...); shape: of a row."""
         self.row_shape = shape
         self._row_bytes = 8 * int(np.prod(shape, dtype=np.int64))
         self._num = 0
@@ -70,7 +70,7 @@ class RowFile:
             self._waiting = []
 
     def take(self, index: Index) -> Float64:
-        """The rows of an index (T,), in its order."""
+        """Rows of an index (T,), in its order."""
         if not len(index):
             return self.read(0, 0)
         first, last = int(index.min()), int(index.max()) + 1
@@ -80,9 +80,9 @@ class RowFile:
 
 
 class Rows:
-    """Rows (T, ...) of a file: all, or those of an index (T,); of each row all numbers, or those of `columns`.
+    """Rows (T, ...) of a file, optionally of an index (T,) and some `columns`.
 
-    ``rows[first:last]``, ``rows[index]`` and ``rows[number]`` read them, as those of an array.
+    ``rows[first:last]``, ``rows[index]`` and ``rows[number]`` read like an array's.
     """
 
     def __init__(self, file: RowFile, index: Index | None = None, columns: Index | None = None) -> None:
@@ -110,15 +110,14 @@ class Rows:
             yield from self[first:last]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Float64:
-        """All of them, for numpy's functions: in memory."""
         return np.asarray(self[: len(self)], dtype=dtype)
 
     def select(self, index: Index) -> "Rows":
-        """The rows of an index (K,), in its order."""
+        """Rows of an index (K,), in its order."""
         return Rows(self._file, index if self._index is None else self._index[index], self._columns)
 
     def of_columns(self, order: Index) -> "Rows":
-        """These columns of each row, in that order."""
+        """Rows with these columns, in that order."""
         return Rows(self._file, self._index, order if self._columns is None else self._columns[order])
 
     def _read(self, first: int, last: int) -> Float64:
@@ -135,17 +134,15 @@ Table = Float64 | Rows
 
 
 def selected(table: Table, index: Index) -> Table:
-    """The rows of an index (K,), in its order; of a file without reading them."""
+    """Rows of an index (K,), in its order; a file is not read."""
     return table.select(index) if isinstance(table, Rows) else table[index]
 
 
 def of_columns(table: Table, order: Index) -> Table:
-    """These columns of each row, in that order."""
     return table.of_columns(order) if isinstance(table, Rows) else table[:, order]
 
 
 def blocks_of(table: Table) -> Iterator[Float64]:
-    """The rows, a block at a time."""
     yield from (table[first:last] for first, last in ranges(len(table)))
 
 
@@ -155,7 +152,6 @@ def absent(num: int, width: int) -> Rows:
 
 
 def scaled(rows: Rows, factor: float) -> Rows:
-    """The rows times a factor."""
     if factor == 1.0:
         return rows
     return Rows(RowFile(rows.shape[1:], (block * factor for block in blocks_of(rows))))

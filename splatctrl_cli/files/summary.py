@@ -1,5 +1,6 @@
-"""The shape of what `info` says about a file, and the names in a folder, which may hold millions: as text, a tenth of
-the time and memory of paths.
+"""The shape of `info`'s answer, and names in folders of millions of files.
+
+Names are text: paths cost ten times more.
 """
 
 import os
@@ -10,7 +11,7 @@ from pathlib import Path
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """A table: rows of as many cells as the header has; unused: first cells of those that no command reads."""
+    """A table; unused: first cells of rows no command reads."""
 
     name: str
     header: tuple[str, ...]
@@ -20,10 +21,7 @@ class Grid:
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """A described file: its kind, facts by name, tables, what a reconstruction would lack, remarks.
-
-    damaged counts what could not be read.
-    """
+    """A described file: facts, tables, missing input, notes; `damaged` counts unreadable parts."""
 
     path: str
     kind: str
@@ -34,7 +32,7 @@ class Summary:
     damaged: int = 0
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values for JSON: facts, each table as a list of objects, `missing` and `notes`."""
+        """Plain values for JSON; tables are lists of objects."""
         return {
             "path": self.path,
             "kind": self.kind,
@@ -47,13 +45,13 @@ class Summary:
 
 
 def names_in(folder: Path) -> list[str]:
-    """Names of the files and folders in `folder`, sorted."""
+    """Sorted names in `folder`."""
     with os.scandir(folder) as entries:
         return sorted(entry.name for entry in entries)
 
 
 def files_below(path: Path) -> tuple[int, int]:
-    """Files that a folder holds at any depth, and their bytes, links to folders not followed; of a file, itself."""
+    """Number and bytes of files at any depth, links not followed; a file counts itself."""
     if not path.is_dir():
         return (1, path.stat().st_size) if path.is_file() else (0, 0)
     count, size, folders = 0, 0, [str(path)]

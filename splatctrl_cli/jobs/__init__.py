@@ -1,1 +1,1 @@
-"""What each command does, without a terminal: a typed request in, a typed result out."""
+"""Jobs behind the commands: a typed request in, a typed result out, no terminal."""

@@ -1,4 +1,4 @@
-"""A calibration from its request to its result: cameras against each other and the robot, from what they recorded."""
+"""A calibration: cameras against each other and the robot."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -32,12 +32,11 @@ BASE = "the robot's base"
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateRequest(RobotOptions):
-    """Calibrate the cameras of a recording, `paths` of which are several only where they are logs of one session.
+    """Calibrate the cameras of a recording; several `paths` only for logs of one session.
 
-    out: the TOML file (None: calibration.toml here). urdf: a robot whose joint states are recorded, from whose
-    surface the cameras are placed. hold: the camera that stays where it is recorded where there is no robot (None:
-    the first). board: what places the cameras to begin with, where the recorded poses are far off. allow_unobserved:
-    write what could be found where not all could.
+    out: None for calibration.toml here. urdf: a robot with recorded joint states, to place cameras against. hold: the
+    fixed camera without a robot (None: the first). board: initial poses if the recorded ones are far off.
+    allow_unobserved: write an incomplete calibration.
     """
 
     paths: tuple[Path, ...]
@@ -52,8 +51,9 @@ class CalibrateRequest(RobotOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateResult:
-    """The file, what stands in it, and how far [m] points lie from what another camera or the robot shows there,
-    before and after (`Adjustment.distance`). moved: how far [m] and by what angle [deg], by camera.
+    """The written calibration, and distances [m] of points to other cameras or the robot.
+
+    before, after: `Adjustment.distance`. moved: by camera [m], [deg].
     """
 
     out: Path
@@ -92,8 +92,8 @@ class CalibrateResult:
 def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> CalibrateResult:
     """Find the calibration and write it.
 
-    Raises UsageError for options that contradict each other, InputError for a recording that cannot be read, and
-    NotEvaluableError where it does not say where the cameras are: then no file is written.
+    Raises UsageError for contradictory options, InputError for an unreadable recording. Raises NotEvaluableError,
+    writing nothing, if cameras stay undetermined.
     """
     out = request.out or Path("calibration.toml")
     if request.options.calibration is not None:
@@ -112,7 +112,7 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
         frames, sightings = _frames(source, request.board, progress)
         if arm is not None:
             travel = arm.travel(sorted({frame.stamp_ns for frame in frames}))
-            if travel < fixed.CALIBRATION_TRAVEL:  # whose one posture any wrong model explains
+            if travel < fixed.CALIBRATION_TRAVEL:  # any wrong model explains a single posture
                 raise NotEvaluableError(
                     f"calibrate: the robot hardly moves: {1e3 * travel:.0f} mm at most (expected"
                     f" {1e3 * fixed.CALIBRATION_TRAVEL:.0f})",
@@ -170,8 +170,9 @@ def _arm(model: RobotModel, source: FrameSource) -> Arm:
 
 
 def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tuple[list[RgbdFrame], list[Sighting]]:
-    """Up to `CALIBRATION_FRAMES` of each camera by stamp, taken at the same moments, without colour, and the board
-    where they show it. Raises NotEvaluableError where none does.
+    """Up to `CALIBRATION_FRAMES` simultaneous frames of each camera, and board sightings.
+
+    Raises NotEvaluableError if no frame shows the board.
     """
     stamps = stamps_by_camera(source)
     chosen = frames_nearest(stamps, spread(min(stamps.values(), key=len), fixed.CALIBRATION_FRAMES))
@@ -193,7 +194,7 @@ def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tup
 
 
 def stamps_by_camera(source: FrameSource) -> dict[str, list[int]]:
-    """Stamps [ns] of each camera's frames. Raises InputError where there is no frame."""
+    """Stamps [ns] of each camera's frames. Raises InputError without frames."""
     stamps: dict[str, list[int]] = {}
     for stamp, camera, _ in source.poses():
         stamps.setdefault(camera, []).append(stamp)
@@ -227,7 +228,7 @@ def _no_board(board: Board, num_frames: int, others: Counter[tuple[int, int]]) -
 
 
 def depth_frame(stored: StoredFrame) -> RgbdFrame:
-    """A frame's depth within `VIEWS_RANGE`, of what is no person."""
+    """A frame's depth within `VIEWS_RANGE`, people removed."""
     low, high = VIEWS_RANGE
     is_used = (stored.depth >= low) & (stored.depth <= high)
     if stored.human is not None:
@@ -243,7 +244,7 @@ def depth_frame(stored: StoredFrame) -> RgbdFrame:
 
 
 def _held(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool) -> tuple[str, ...]:
-    """The cameras that stay: none where there is a robot or one that moves, else one."""
+    """Fixed cameras: none with a robot or a moving camera, else one."""
     if request.hold is not None and request.hold not in cameras:
         raise UsageError(f"--hold {request.hold}: no such camera", remedy=f"use one of: {', '.join(cameras)}")
     if request.hold is not None:
@@ -259,7 +260,6 @@ def _held(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool
 
 
 def _unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
-    """The directions that each camera's pose is not known in."""
     evidence = solution.adjustment.evidence
     found = {}
     for camera in solution.adjustment.unknowns.poses:
@@ -285,7 +285,7 @@ def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotE
 def _calibration(
     source: FrameSource, solution: Solution, begin: Mapping[str, Float64], unknown: Mapping[str, tuple[str, ...]]
 ) -> Calibration:
-    """begin: T_recorded_camera (4, 4) by camera, that the solution was begun at."""
+    """Build the calibration; begin: initial T_recorded_camera (4, 4) by camera."""
     evidence, estimate, certainty = solution.adjustment.evidence, solution.estimate, solution.certainty
     cameras = {}
     for camera in evidence.cameras:

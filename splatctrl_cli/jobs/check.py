@@ -1,4 +1,4 @@
-"""A check from its request to its result: what is wrong with a recording, before it costs an hour."""
+"""A check: faults of a recording, before they cost an hour."""
 
 import statistics
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -29,12 +29,11 @@ _ALLOWING = {  # the options that take an error on
 
 @dataclass(frozen=True, kw_only=True)
 class CheckRequest:
-    """One check of a recording, `paths` of which are several only where they are logs of one session.
+    """One check of a recording; several `paths` only for logs of one session.
 
-    num_images: only so many of a topic are read, None for all. urdf: a robot to compare joint states and depth with,
-    with `spheres` alone the one that the log describes;
-    base: its pose in world as x, y, z, qx, qy, qz, qw; locked: values [rad or m] of joints that no log moves.
-    fail_on: "error", "warning" or NEVER, the least severity that fails.
+    num_images: read of each topic, None for all. urdf: robot to compare joint states and depth with; with `spheres`
+    alone the log's own. base: its pose in world as x, y, z, qx, qy, qz, qw. locked: values [rad or m] of unlogged
+    joints. fail_on: least severity that fails: "error", "warning" or NEVER.
     """
 
     paths: tuple[Path, ...]
@@ -49,7 +48,7 @@ class CheckRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckResult:
-    """What was found, and the verdict on it."""
+    """Findings and verdict."""
 
     report: CheckReport
     verdict: Verdict
@@ -57,8 +56,9 @@ class CheckResult:
 
 
 def check(request: CheckRequest) -> CheckResult:
-    """Read the recording once. Raises UsageError for options that contradict each other, InputError for a recording
-    that cannot be opened.
+    """Check the recording, reading it once.
+
+    Raises UsageError for contradictory options, InputError for an unreadable recording.
     """
     if request.num_images is not None and request.num_images < 1:
         raise UsageError(f"--quick {request.num_images}: expected 1 or more")
@@ -72,9 +72,7 @@ def check(request: CheckRequest) -> CheckResult:
 
 
 def refuse_errors(path: Path, options: SourceOptions, command: str, allowed: Collection[str] = ()) -> None:
-    """Raise InputError where `check` finds an error that stops this command; `allowed`: codes of errors that the user
-    accepts.
-    """
+    """Raise InputError if `check` finds an error for this command, except `allowed` codes."""
     report = _report(CheckRequest(paths=(path,), options=options), None, only_errors=True)
     errors = [f for f in report.refusing(Need(command=command, lacks=())) if f.code not in allowed]
     if errors:
@@ -102,12 +100,12 @@ def posed_robot(
     locked: Mapping[str, float],
     packages: Sequence[Path] = (),
 ) -> RobotModel | None:
-    """The robot of a URDF, with `spheres` alone the one that the recording describes; None without either.
+    """Robot of a URDF, with `spheres` alone the recording's own; None without either.
 
-    base: its pose in world as x, y, z, qx, qy, qz, qw. Raises UsageError for what belongs to a robot, without one.
+    base: pose in world as x, y, z, qx, qy, qz, qw. Raises UsageError for robot options without one.
     """
     file = None if urdf is None else read_urdf(urdf)
-    if file is None and spheres is not None:  # without spheres it is often none that can be used
+    if file is None and spheres is not None:  # without spheres it is often unusable
         file = logged_urdf(paths)
     if file is None:
         given = {"spheres": spheres, "base": base, "lock": locked or None, "packages": packages or None}
@@ -121,7 +119,6 @@ def posed_robot(
 
 
 def _agreement(report: CheckReport) -> Iterator[Finding]:
-    """Whether views agree on where the surfaces are that both see."""
     good: list[float] = []
     for pair in agreements(list(report.frames), *VIEWS_RANGE):
         both = list(dict.fromkeys(pair.cameras))
@@ -147,7 +144,6 @@ def _agreement(report: CheckReport) -> Iterator[Finding]:
 
 
 def _verdict(report: CheckReport, fail_on: str) -> Verdict:
-    """Of the findings: errors, and warnings where asked for, fail; the other warnings are notes."""
     fatal = {Severity.ERROR, *([Severity.WARNING] if fail_on == Severity.WARNING else [])}
     read = Reason(
         criterion="messages",

@@ -1,4 +1,4 @@
-"""The whole main job on the sample recording, one job after the other, with pictures."""
+"""The main jobs on the sample recording, with pictures."""
 
 import shlex
 import sys
@@ -68,9 +68,9 @@ Told = Callable[[StepResult, Path], None]
 
 @dataclass(frozen=True, kw_only=True)
 class DemoRequest:
-    """Run on the folder `data`, which `splatctrl simulate` wrote, and write everything into the folder `out`.
+    """Run on `data`, a folder of `splatctrl simulate`, and write into `out`.
 
-    data: None for the sample recording; where that is not installed, the same is simulated into `out` first.
+    data: None for the sample recording, simulated into `out` if not installed.
     """
 
     data: Path | None = None
@@ -81,7 +81,7 @@ class DemoRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class DemoResult:
-    """Whether each step ended as expected, the wall time [s], and pictures by path, with a description each."""
+    """Verdict of the steps, wall time [s], and pictures with descriptions."""
 
     out: Path
     verdict: Verdict
@@ -91,9 +91,7 @@ class DemoResult:
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """One step: the words after `splatctrl` that do the same, what does it, and the label that its verdict should
-    have, or several with "or" between them ("done" where it has none).
-    """
+    """One step: its command-line words, its function, and expected labels joined by "or"."""
 
     words: Sequence[str]
     run: Callable[[], StepResult]
@@ -101,14 +99,13 @@ class Step:
 
     @property
     def name(self) -> str:
-        """The command, and the mode of a replay that drives the arm."""
         return f"{self.words[0]} --mode closed-loop" if "closed-loop" in self.words else self.words[0]
 
 
 def demo(request: DemoRequest, progress: Progress = SILENT, told: Told = lambda result, folder: None) -> DemoResult:
-    """Run all steps, and draw pictures of what they made. Raises InputError for a folder that is no recording.
+    """Run all steps, and draw their pictures. Raises InputError for no recording.
 
-    told: takes the result of each step at once, and the folder that stands for `out` until all is done.
+    told: called with each result, and the temporary folder of `out`.
     """
     start, stopwatch, out = time.perf_counter(), Stopwatch(), request.out
     recorded = request.data or (SAMPLE if SAMPLE.is_dir() else None)
@@ -141,7 +138,7 @@ def demo(request: DemoRequest, progress: Progress = SILENT, told: Told = lambda 
 
 
 def _refuse_unusable(data: Path, out: Path) -> None:
-    """Raises InputError where `data` is no recording, UsageError where it is the output, too."""
+    """Raise InputError if `data` is no recording, UsageError if it is the output."""
     missing = [name for name in INPUTS if not (data / name).is_file()]
     if missing:
         raise InputError(
@@ -152,7 +149,6 @@ def _refuse_unusable(data: Path, out: Path) -> None:
 
 
 def _steps(data: Path, out: Path, threads: int, progress: Progress) -> list[Step]:
-    """The steps, to be run in this order, on the folder `data`; each writes into the folder `out`."""
     log, truth, urdf, spheres = (data / name for name in INPUTS)
     capture, scene = out / "tabletop.capture", out / "scene"
     training = RecordingRequest(path=capture, options=SourceOptions(cameras=TRAINING))
@@ -226,7 +222,6 @@ def _steps(data: Path, out: Path, threads: int, progress: Progress) -> list[Step
 
 
 def _reason(step: Step, request: DemoRequest, folder: Path, progress: Progress, told: Told) -> Reason:
-    """Run a step as a person would type it; whether it ends as expected."""
     shown = [word.replace(str(folder), str(request.out)) for word in step.words]
     progress.log(f"\n$ splatctrl {shlex.join(shown)}")
     with _recorded_as(shown):
@@ -245,7 +240,7 @@ def _reason(step: Step, request: DemoRequest, folder: Path, progress: Progress, 
 
 @contextmanager
 def _recorded_as(words: Sequence[str]) -> Iterator[None]:
-    """What a run.json says of its arguments meanwhile: those that make the same again."""
+    """Set the arguments that run.json records."""
     arguments = sys.argv
     sys.argv = [arguments[0], *words]
     try:
@@ -255,7 +250,6 @@ def _recorded_as(words: Sequence[str]) -> Iterator[None]:
 
 
 def _label(result: StepResult) -> str:
-    """The label of the verdict; of a step without one whether it is done, or its input was damaged."""
     if isinstance(result, Summary):
         return f"exit code {DAMAGED}" if result.damaged else "done"
     if isinstance(result, IngestResult):
@@ -264,7 +258,6 @@ def _label(result: StepResult) -> str:
 
 
 def _draw(data: Path, out: Path, threads: int) -> None:
-    """Draw the first two of PICTURES."""
     newest: dict[str, RgbdFrame] = {}
     joints: JointState | None = None
     source = open_source(out / "tabletop.capture")

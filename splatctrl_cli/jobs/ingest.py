@@ -1,4 +1,4 @@
-"""Recorded inputs into capture folders."""
+"""Recordings into capture folders."""
 
 import json
 from collections.abc import Mapping
@@ -21,9 +21,9 @@ from splatctrl_cli.recording.source_options import SourceOptions
 
 @dataclass(frozen=True, kw_only=True)
 class IngestRequest:
-    """Write the recording as the capture folder `out` (None: NAME.capture here, NAME that of the first of `paths`).
+    """Write a recording as a capture; several `paths` only for logs of one session.
 
-    paths: several only where they are logs of one session.
+    out: None for NAME.capture here, by the first path.
     """
 
     paths: tuple[Path, ...]
@@ -35,7 +35,7 @@ class IngestRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class IngestResult:
-    """The capture folder, and what was written into it."""
+    """The capture folder, and its content."""
 
     capture: Path
     summary: CaptureSummary
@@ -47,15 +47,14 @@ class IngestResult:
 
     @property
     def exit_code(self) -> int:
-        """3 where part of the input was damaged."""
+        """3 for damaged input."""
         return DAMAGED if self.summary.loss.damaged else 0
 
 
 def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
-    """Write the capture, or go on with one that was interrupted, to the same bytes.
+    """Write the capture, or continue an interrupted one to the same bytes.
 
-    Raises UsageError where no camera is left to train with or another run was interrupted, InputError for a recording
-    that cannot be used.
+    Raises UsageError without a training camera or for another interrupted run, InputError for an unusable recording.
     """
     stopwatch, options = Stopwatch(), request.options
     out = request.out or Path(request.paths[0].stem + ".capture")
@@ -107,7 +106,6 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
 
 
 def _identity(options: SourceOptions, inputs: Mapping[str, str]) -> dict[str, Any]:
-    """Everything that decides the bytes of a capture, as plain values; inputs: sha256 by name."""
     versions = {name: metadata.version(name) for name in ("numpy", "opencv-python-headless")}
     values = {"splatctrl": __version__, **versions, "options": asdict(options), "sha256": dict(inputs)}
     plain: dict[str, Any] = json.loads(json.dumps(values, default=str))

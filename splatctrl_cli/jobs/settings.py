@@ -1,4 +1,4 @@
-"""Every key of the configuration with its value and where that comes from, as TOML that ``--config`` takes."""
+"""Every configuration key with value and source, as TOML for ``--config``."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,7 @@ Value = int | float | str | tuple[float, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """A key with its value; source: `DEFAULT`, the preset, the file's name, or ``--set``."""
+    """A key with its value; source: `DEFAULT`, preset, file name, or ``--set``."""
 
     section: str
     key: str
@@ -26,7 +26,6 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """``section.key``."""
         return f"{self.section}.{self.key}"
 
     def as_dict(self) -> dict[str, object]:
@@ -40,10 +39,7 @@ class Setting:
 
 
 def resolved_settings(path: Path | None, assignments: Sequence[str]) -> tuple[Setting, ...]:
-    """All keys as a run would use them: defaults, then the preset, the file, each assignment.
-
-    Raises as `load_config`.
-    """
+    """All keys after defaults, preset, file and assignments. Raises as `load_config`."""
     used, default = load_config(path, assignments), Config()
     sources = sources_of(path, assignments)
     settings = []
@@ -64,7 +60,7 @@ def resolved_settings(path: Path | None, assignments: Sequence[str]) -> tuple[Se
 
 
 def toml_of(settings: Sequence[Setting]) -> Iterator[str]:
-    """Lines of a TOML file with every key; beside what is not the default, where it comes from and the default."""
+    """TOML lines of every key; changed ones with source and default."""
     for section, setting in _with_sections(settings):
         yield from section
         changed = f"  # {setting.source} (default: {toml_value(setting.default)})"
@@ -72,7 +68,7 @@ def toml_of(settings: Sequence[Setting]) -> Iterator[str]:
 
 
 def template_of(settings: Sequence[Setting]) -> Iterator[str]:
-    """Lines of a TOML file that sets nothing: every default as a comment, below its meaning and what it may be."""
+    """TOML lines of every default as a comment, with meaning and range."""
     for section, setting in _with_sections(settings):
         yield from section
         yield f"# {setting.declared.reason}; {setting.declared.expected}"
@@ -80,14 +76,12 @@ def template_of(settings: Sequence[Setting]) -> Iterator[str]:
 
 
 def toml_value(value: Value) -> str:
-    """A value as TOML writes it."""
     if isinstance(value, tuple):
         return f"[{', '.join(map(repr, value))}]"
     return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
 def _with_sections(settings: Sequence[Setting]) -> Iterator[tuple[list[str], Setting]]:
-    """Each setting, with the heading of its section before the first."""
     before = ""
     for setting in settings:
         blank = [""] if before else []

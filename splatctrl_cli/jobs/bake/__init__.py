@@ -1,1 +1,1 @@
-"""Distance fields baked on a grid."""
+"""Bakes of distance grids."""

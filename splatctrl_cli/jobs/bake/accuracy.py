@@ -1,4 +1,4 @@
-"""The report and verdict of a baked field, and its errors against a truth, a mesh and held-out depth."""
+"""Report and verdict of a baked field, and its errors against references."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -39,25 +39,25 @@ SUMMARY_METRICS = {
     **dict.fromkeys(("voxel", "length_scale", "median_radius", "median_spacing"), LENGTH),
     **dict.fromkeys(("never_seen_share", "over_estimating_share"), BAD_SHARE),
     "num_warnings": FAULTS,
-}  # and how two runs are compared by them
+}  # comparison scales of the summary's figures
 POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 
 
 @dataclass(frozen=True, kw_only=True)
 class Accuracy:
-    """How far a field is from what it was compared with; None for what nobody asked for."""
+    """Errors of a field against its references; None for those not requested."""
 
     truth: TruthComparison | None = None
     reference_mesh: MeshComparison | None = None
     held_out_depth: HeldOutComparison | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as written to ``field.json``."""
+        """Plain values for ``field.json``."""
         return {name: compared.as_dict() for name, compared in vars(self).items() if compared is not None}
 
 
 def accuracy_of(grid: DistanceGrid, spheres: Spheres, source: BakeSource, request: BakeRequest) -> Accuracy:
-    """The field of `spheres` beside all that the request names. Raises NotEvaluableError where nothing is near."""
+    """Compare the field with its references. Raises NotEvaluableError without overlap."""
     mesh, held_out = request.reference_mesh, request.held_out
     return Accuracy(
         truth=None if request.truth is None else _beside_truth(grid, spheres, source, request),
@@ -67,7 +67,7 @@ def accuracy_of(grid: DistanceGrid, spheres: Spheres, source: BakeSource, reques
 
 
 def check_references(request: BakeRequest, source: BakeSource) -> None:
-    """Raise for what cannot be compared with, before a bake that may take long."""
+    """Raise for unusable references before a long bake."""
     for path in (request.truth, request.seen_by, request.reference_mesh):
         if path is not None and not path.exists():
             raise InputError(f"{path}: no such file or folder", remedy="check the path")
@@ -76,7 +76,7 @@ def check_references(request: BakeRequest, source: BakeSource) -> None:
 
 
 def _beside_truth(grid: DistanceGrid, spheres: Spheres, source: BakeSource, request: BakeRequest) -> TruthComparison:
-    """The comparison at drawn cells; the robot is in neither the field nor the truth."""
+    """Compare drawn cells with the truth; neither contains the robot."""
     assert request.truth is not None and request.seen_by is not None
     truth = load_truth(request.truth)
     stamp_ns = int(truth.stamps[-1]) if source.stamp_ns is None else source.stamp_ns
@@ -104,7 +104,7 @@ def _beside_truth(grid: DistanceGrid, spheres: Spheres, source: BakeSource, requ
 
 
 def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
-    """What the grid holds at drawn cells, whole channels of which may not fit the memory: hard, sdf."""
+    """Values of hard and sdf at drawn cells; whole channels may not fit the memory."""
     channels: dict[str, NDArray[np.generic]] = {
         name: grid.channels[name].reshape(-1)[drawn].astype(np.float32)
         for name in ("sdf", "hard", "bound")
@@ -115,7 +115,7 @@ def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
 
 
 def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator[RgbdFrame]:
-    """Frames of the scene's training cameras (of every camera for a bare splat set), up to its stamp."""
+    """Frames of training cameras (of all if unknown) up to a stamp."""
     for record in open_source(log).records():
         if record.stamp_ns > until_ns:
             return
@@ -124,10 +124,9 @@ def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator
 
 
 def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request: BakeRequest) -> HeldOutComparison:
-    """The field beside the newest depth, not later than the scene's stamp, of each camera that was held out.
+    """Compare with the newest held-out depth not later than the scene's stamp.
 
-    Pixels do not count that show what is outside the box of the scene, or, where a URDF says where it is, the robot:
-    neither is in the field.
+    Pixels outside the scene's box or on the robot do not count: the field has neither.
     """
     recording = open_source(log)
     cameras = _held_out_cameras(recording, request, source.cameras)
@@ -159,9 +158,9 @@ def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request:
 def _held_out_cameras(
     recording: RecordSource, request: BakeRequest, trained: Sequence[str] | None
 ) -> tuple[str, ...]:
-    """Those named, or every one that did not train the scene (as far as that is known).
+    """Return the named cameras, or all not known to have trained.
 
-    Raises UsageError for a camera that trained or is not there, or where none is left.
+    Raises UsageError for a training or missing camera, or without any.
     """
     log, names, known = request.held_out, request.held_out_cameras, recording.cameras
     wrong = [name for name in names if name not in known]
@@ -178,7 +177,7 @@ def _held_out_cameras(
 
 @dataclass(frozen=True, kw_only=True)
 class FieldReport:
-    """A baked grid with its statistics, and what an update changed."""
+    """A baked grid, its statistics, and an update's changes."""
 
     grid: DistanceGrid
     statistics: GridStatistics
@@ -186,7 +185,7 @@ class FieldReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about the splats' health, and about a box far from every splat."""
+        """Warnings about splat health, and a box far from all splats."""
         health, lowest = self.grid.header["health"], self.statistics.lowest
         assert isinstance(health, dict)
         if lowest is None or lowest <= FAR_GRID:
@@ -195,7 +194,7 @@ class FieldReport:
         return (*health["warnings"], far)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as written to ``field.json``: the grid's header and place first."""
+        """Plain values for ``field.json``, header and place first."""
         grid, changes, update = self.grid, self.changes, {}
         if changes is not None:
             why = {"why_all": changes.reason} if changes.reason else {}
@@ -212,7 +211,7 @@ class FieldReport:
         }
 
     def summary(self) -> dict[str, Any]:
-        """The figures that are printed; --json adds the accuracy to them."""
+        """Printed figures, without accuracy."""
         header: Mapping[str, Any] = self.grid.header
         num_used, health = sum(header["splats_used"].values()), header["health"]
         # cells where the kernel field of sdf, alone, exceeds the exact distance
@@ -237,13 +236,13 @@ class FieldReport:
 
 
 def metrics_of(summary: Mapping[str, Any], accuracy: Accuracy) -> dict[str, float | None]:
-    """Numbers a gate can name: those of the summary, ``seen.hard.0_2cm.rmse`` and so on, ``over_estimate.*``."""
+    """Figures a gate can name: of the summary, ``seen.hard.0_2cm.rmse`` and so on, ``over_estimate.*``."""
     of_truth = {} if accuracy.truth is None else accuracy.truth.accuracy.figures()
     return {name: summary[name] for name in SUMMARY_METRICS} | of_truth
 
 
 def counts_of(metrics: Mapping[str, float | None]) -> dict[str, int]:
-    """The cells that each of the metrics rests on: those of its band or of the over-estimate, else all."""
+    """Number of cells behind each metric."""
     of_bands = {name: f"{name.rpartition('.')[0]}.count" for name in metrics if not name.endswith(".count")}
     counted = {name: of_bands[name] if of_bands.get(name) in metrics else "num_cells" for name in metrics}
     return {name: int(metrics[count] or 0) for name, count in counted.items()}
@@ -252,7 +251,7 @@ def counts_of(metrics: Mapping[str, float | None]) -> dict[str, int]:
 def bake_verdict(
     request: BakeRequest, report: FieldReport, metrics: Mapping[str, float | None], *, has_occupancy: bool
 ) -> Verdict:
-    """Judge what the channels lose of the distance [m], whether a camera saw the box, and each ``--require``."""
+    """Judge the channels' loss of distance [m], unobserved boxes, and each ``--require``."""
     statistics, voxel = report.statistics, report.grid.voxel
     num_cells, loss = statistics.num_cells, LOSS * voxel
     reasons = [

@@ -1,4 +1,4 @@
-"""A bake from its request to its result: a scene's splats as a distance grid, slab by slab onto the disk."""
+"""A bake: splats to a distance grid, slab by slab on disk."""
 
 import shutil
 from collections.abc import Collection, Mapping, Sequence
@@ -62,11 +62,10 @@ VDB_COPIES = 7  # of the channels, in memory: 454 MiB were measured for one of 6
 def bake_to_disk(
     job: "_Job", kept: Kept | None, unknown: UnknownSpace | None, partial: Path, progress: Progress
 ) -> GridSlabs:
-    """The channels in ``partial/channels``; the baker's counts are then those of all that was baked.
+    """Bake the channels into ``partial/channels``; the baker's counts then cover all slabs.
 
-    kept: what an update keeps; unknown: what is done with unknown space. With --resume it goes on after the last slab
-    that an interrupted bake of the same settings left. Raises UsageError for one of other settings, and where the
-    disk or the memory has no room.
+    kept: unchanged cells of an update; unknown: treatment of unobserved space. --resume continues after the last
+    slab. Raises UsageError if that bake had other settings, or without room on disk or in memory.
     """
     baker, request, folder = job.baker, job.request, partial / FOLDER
     layout, config = baker.layout, request.config
@@ -76,7 +75,7 @@ def bake_to_disk(
         voxel=layout.voxel,
         shape=layout.shape,
         channels=baker.channels,
-        settings={  # everything that decides the bytes beside the grid and its channels
+        settings={  # everything else that decides the bytes
             **deciding_versions(),
             **{f"field.{name}": value for name, value in asdict(config.field).items()},
             **{f"occupancy.{name}": value for name, value in asdict(config.occupancy).items()},
@@ -111,14 +110,14 @@ def bake_to_disk(
 
 
 def clear_leftovers(partial: Path) -> None:
-    """Remove what an interrupted run had written beside the channels: all of it is written again."""
+    """Remove everything but the channels of an interrupted bake: it is written again."""
     for path in partial.iterdir():
         if path.name != FOLDER:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
-    """Raise UsageError where the channels and the files made of them do not fit the disk."""
+    """Raise UsageError if channels and output files do not fit the disk."""
     per_cell = bytes_per_cell(channels)
     copies = sum(FORMATS[name].size_per_cell(per_cell) for name in formats)
     needed = (per_cell + copies) * layout.num_cells + (1 << 26)  # bytes for what is small
@@ -133,7 +132,7 @@ def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], form
 
 
 def check_vdb(layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
-    """Raise UsageError where OpenVDB is asked for and cannot hold the grid in memory, as its library does."""
+    """Raise UsageError if OpenVDB, which holds the grid in memory, lacks room."""
     if "vdb" in formats:
         remedy = "leave it out of --formats (nrrd needs no memory), or give a larger --voxel or fewer --channels"
         check_room("format vdb:", VDB_COPIES * bytes_per_cell(channels) * layout.num_cells, remedy)
@@ -144,9 +143,7 @@ EXACT = frozenset({"bound", "hard"})
 
 @dataclass(frozen=True, kw_only=True)
 class BakeResult:
-    """The field folder `out`; summary: what a person wants to know of the field; metrics: the figures that a gate can
-    name, as in ``run.json``, whose counts of cells the verdict has. seconds: of each stage.
-    """
+    """A baked field in `out`; metrics can be gated on, seconds are by stage."""
 
     __repr__ = brief
 
@@ -159,10 +156,7 @@ class BakeResult:
 
 
 def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
-    """Bake into the output folder, or go on with what an interrupted bake left of it.
-
-    Raises SplatCtrlError for what cannot be baked, compared with or written.
-    """
+    """Bake into the output folder, or continue an interrupted bake. Raises SplatCtrlError."""
     check_request(request)
     stopwatch, out = Stopwatch(), request.out
     checkpoint = partial_path(out) / CHECKPOINT
@@ -213,7 +207,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
 
 
 def check_request(request: BakeRequest) -> None:
-    """Raise UsageError for cells that are too coarse, options that belong together, and gates on unknown figures."""
+    """Raise UsageError for too coarse cells, incomplete options, and gates on unknown figures."""
     check_loss(request.config.field.voxel, request.config.field.max_loss)
     if (request.truth is None) != (request.seen_by is None):
         raise UsageError("--truth and --seen-by: expected both or neither")
@@ -233,8 +227,6 @@ def _tell_of_partial(request: BakeRequest, checkpoint: Path, progress: Progress)
 
 @dataclass(frozen=True, kw_only=True)
 class _Job:
-    """What was read, and what is to be baked of it."""
-
     request: BakeRequest
     source: BakeSource
     previous: Previous | None
@@ -244,12 +236,11 @@ class _Job:
 
     @property
     def digests(self) -> dict[str, str]:
-        """sha256 of every file that was read."""
+        """sha256 of all input files."""
         return self.source.digests | ({} if self.previous is None else self.previous.digests)
 
 
 def _read(request: BakeRequest, stopwatch: Stopwatch, progress: Progress) -> _Job:
-    """Read the splats, and check that the field can be made of them and written."""
     config, previous = request.config, None
     with stopwatch.stage("read"):
         source = read_bake_source(request.scene, request.at)
@@ -278,7 +269,7 @@ def _read(request: BakeRequest, stopwatch: Stopwatch, progress: Progress) -> _Jo
 
 
 def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...]:
-    """The channels to bake, in their order. Raises UsageError where another one is needed for what is asked."""
+    """Channels to bake, in order. Raises UsageError if a request needs another."""
     usual = DEFAULT_CHANNELS if previous is None else tuple(previous.grid.channels)
     names = {"sdf", *(usual if request.channels is None else request.channels)}
     names |= {"probability"} if request.with_probability else set()
@@ -299,7 +290,6 @@ def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...
 
 
 def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, Changes | None]:
-    """The grid, its channels on disk; of an update, also what changed."""
     baker, previous, source, config = job.baker, job.previous, job.source, job.request.config
     changes = kept = old = None
     if previous is not None:
@@ -334,7 +324,6 @@ def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, 
 
 
 def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence[float]) -> None:
-    """Slices through `point` [m], the gradient, and the grid's other channels."""
     folder.mkdir()
     grid, lengths = report.grid, report.statistics.gradient
     slices_picture(folder / "slices.png", grid, point)
@@ -348,7 +337,7 @@ def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence
 
 
 def _middle(job: _Job) -> list[float]:
-    """Where slices are shown: in the middle of the splats in the grid but for the outermost, or of the grid [m]."""
+    """Point [m] where slices are drawn: the middle of the splats without outliers."""
     box, centers = job.baker.layout.box, job.obstacles.splats.centers
     inside = centers[box.contains(centers)]
     lower, upper = np.percentile(inside, (5, 95), axis=0) if len(inside) else (box.lower, box.upper)

@@ -1,4 +1,4 @@
-"""What a bake is asked for, and what it reads: the scene, and for an update the field baked before."""
+"""A bake's request and input: the scene, and an update's previous field."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -30,15 +30,13 @@ NOT_COMPARED = ("voxel", "padding", "max_loss")  # voxel is compared with the gr
 
 @dataclass(frozen=True, kw_only=True)
 class BakeRequest(RunOptions):
-    """One bake of `scene`, a folder that reconstruct wrote or a file of splats, into the folder `out`.
+    """One bake of `scene` (reconstruct's folder, or a splat file) into the folder `out`.
 
-    at: the scene as known that long after its start [s], None for its end. labels: of the splats in the field. The
-    grid covers `box`, or the reach of the robot of `urdf` and `spheres`, or the splats. channels: beside sdf, None
-    for the usual ones, or those of `update`; with_probability adds that one. The field is compared with `truth` where
-    the cameras of `seen_by` looked, with `reference_mesh`, and with the depth in the log `held_out` of the cameras
-    `held_out_cameras`, none for all that did not train. update: a field baked from `previous_scene` (None: `scene`),
-    of which only what changed is baked anew. resume: go on with what an interrupted bake left. require: gates.
-    device: where to compute, as of --device.
+    at: time after the scene's start [s], None for its end. labels: of the splats in the field. The grid covers `box`,
+    or the robot's reach, or the splats. channels: besides sdf, None for the usual ones or those of `update`.
+    References: `truth`, where cameras of `seen_by` looked; `reference_mesh`; depth in the log `held_out`
+    (`held_out_cameras`, by default all that did not train). update: a field baked from `previous_scene` (None:
+    `scene`), to bake only changes. resume: continue an interrupted bake.
     """
 
     scene: Path
@@ -65,17 +63,14 @@ class BakeRequest(RunOptions):
 
     @property
     def label_names(self) -> list[str]:
-        """As a field's header has them."""
         return sorted(label.name.lower() for label in self.labels)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BakeSource:
-    """Splats, and the occupancy of the same moment where there is one.
+    """Splats with the occupancy of the same moment; None (empty) if a bare file lacks it.
 
-    unrepresented: the occupied voxels without a splat; stamp_ns: when the splats were so; workspace: the box outside
-    which the scene keeps no splats; cameras: those that made it; made_from: the scene's.
-    Each None (empty) where it is not known (a bare splat file).
+    unrepresented: occupied voxels without a splat. workspace: the box outside which no splats are kept.
     """
 
     splats: SplatSet
@@ -89,10 +84,9 @@ class BakeSource:
 
 
 def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
-    """The splats at `path`, as known `at_seconds` after the scene's first snapshot (None: at its end).
+    """Read the splats at `path`, as known `at_seconds` after the first snapshot (None: the end).
 
-    Raises InputError for what is not there or not a scene, UsageError for a time in a bare file, NotEvaluableError
-    for a time before the first snapshot.
+    Raises InputError without a scene, UsageError for a time in a bare file, NotEvaluableError for too early a time.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="give what reconstruct wrote, or a splats.ply")
@@ -115,9 +109,7 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
         then = scene.snapshot_at(wanted_ns)
         files = [then.path, then.occupancy_path]
     occupancy = final if wanted_ns is None else then.occupancy()
-    lower = (
-        final.origin + 0.5 * final.voxel
-    )  # less a voxel at every border: a surface there may have splats beyond it
+    lower = final.origin + 0.5 * final.voxel  # without the border voxels: a surface there may have splats beyond it
     upper = lower + final.voxel * (np.array(final.log_odds.shape) - 2)
     return BakeSource(
         splats=then.splats(),
@@ -133,7 +125,7 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
 
 @dataclass(frozen=True, kw_only=True)
 class Previous:
-    """A baked field, the configuration it was baked with (`run`: the folder's run.json), and its splats' source."""
+    """A baked field with its run.json and the source of its splats."""
 
     path: Path
     grid: DistanceGrid
@@ -143,16 +135,15 @@ class Previous:
 
     @property
     def box(self) -> Box:
-        """The box of the cell centres: a grid over it, with the same voxel, has the same cells."""
+        """Box of the cell centres: with the same voxel it gives the same cells."""
         x, y, z = self.grid.channels["sdf"].shape
         return GridLayout(origin=self.grid.origin, voxel=self.grid.voxel, shape=(x, y, z)).box
 
 
 def read_previous(path: Path, scene: Path) -> Previous:
-    """The field in folder `path`, with the splats of `scene` that it was baked from.
+    """Read the field in folder `path` and the splats of `scene` it was baked from.
 
-    Raises InputError for a field that is not there, damaged or foreign, UsageError where the scene is not its own or
-    another version baked it.
+    Raises InputError for a missing, damaged or foreign field, UsageError for another scene or version.
     """
     if not path.is_dir():
         raise InputError(f"--update {path}: no such folder", remedy="give a folder that sdf-bake wrote")
@@ -180,7 +171,7 @@ def read_previous(path: Path, scene: Path) -> Previous:
 def check_same(
     previous: Previous, layout: GridLayout, config: FieldConfig, channels: tuple[str, ...], labels: list[str]
 ) -> None:
-    """Raise UsageError naming what differs between the bake before and this one."""
+    """Raise UsageError naming settings that differ from the previous bake."""
     grid = previous.grid
     used = previous.run.get("config", {}).get("field", {})
     settings = {name: value for name, value in vars(config).items() if name not in NOT_COMPARED}
@@ -202,8 +193,9 @@ def check_same(
 
 
 def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
-    """The splats of `scene` at the grid's time. Raises UsageError, beginning with `where`, where they are not those
-    that it was baked from.
+    """Read the splats of `scene` at the grid's time.
+
+    Raises UsageError, starting with `where`, if the grid was not baked from them.
     """
     digests, stamp_ns = grid.header.get("digests"), grid.header.get("stamp_ns")
     wanted = next(iter(digests.values()), None) if isinstance(digests, dict) else None
@@ -222,7 +214,7 @@ def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
 
 
 def covered(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:
-    """What the grid covers: the box, the reach of the robot, the field before, or the splats and a margin."""
+    """Box of the grid: as given, or of robot, previous field, or splats with padding."""
     if request.box is not None:
         return request.box
     if request.urdf is not None:
@@ -233,7 +225,7 @@ def covered(request: BakeRequest, source: BakeSource, previous: Previous | None)
 
 
 def device_for(request: BakeRequest, layout: GridLayout, num_splats: int, progress: Progress) -> Device:
-    """Where to bake; an update always on the processor. Raises UsageError for a card that cannot be used."""
+    """Choose the device; updates bake on the processor. Raises UsageError for an unusable card."""
     if request.update is not None:
         if request.device.startswith(CUDA):
             raise UsageError(f"--device {request.device}: --update bakes on the processor", remedy=TO_CPU)

@@ -1,1 +1,1 @@
-"""Many recordings through many commands: a suite, its graph, the processes that run it, the ledger of runs."""
+"""Batches: suite, graph, processes, and ledger of runs."""

@@ -1,4 +1,4 @@
-"""A batch from its request to its verdict: read the suite, run its graph, write batch.json."""
+"""A batch: read the suite, run its graph, write batch.json."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,9 +40,10 @@ CONNECT_S = 10.0  # to a scheduler
 
 @dataclass(frozen=True, kw_only=True)
 class BatchRequest:
-    """Run a suite's file. out: its folder (default: what the suite says); workers: processes at once; shard: (i, n),
-    every n-th recording from the i-th on; dask: the address of a Dask scheduler that runs the nodes instead; again:
-    also what is done.
+    """Run a suite's file into `out` (default: the suite's).
+
+    shard: (i, n) runs every n-th recording from the i-th on. dask: address of a scheduler. again: rerun finished
+    nodes.
     """
 
     suite: Path
@@ -55,7 +56,7 @@ class BatchRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchResult:
-    """The run of every node, in the order of the graph; num_kept of them stood from before. jobs: the suite's."""
+    """Runs of all nodes in graph order; num_kept of them from before."""
 
     out: Path
     suite: str
@@ -66,7 +67,7 @@ class BatchResult:
 
 
 def batch(request: BatchRequest, command_line: CommandLine, progress: Progress = SILENT) -> BatchResult:
-    """Run what is not done. Raises UsageError for a suite that makes no graph, InputError for files that lack."""
+    """Run unfinished nodes. Raises UsageError for an invalid suite, InputError for missing files."""
     suite, every, out = planned(request, command_line)
     nodes = of_shard(every, request.shard)
     with (
@@ -94,8 +95,9 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
 
 
 def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, list[Node], Path]:
-    """The suite, its nodes of every shard after those they need, and where they write. Raises UsageError for a shard
-    without a recording.
+    """The suite, its nodes of every shard in order of need, and the output folder.
+
+    Raises UsageError for a shard without a recording.
     """
     suite = read_suite(request.suite, COMMANDS)
     out = (request.out or suite.out).absolute()
@@ -109,7 +111,7 @@ def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, li
 
 
 def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node, str]]:
-    """Every node and whether it would run; nothing is written but a ledger's digests."""
+    """Every node with "done" or "to do"; writes nothing but a ledger's digests."""
     _, every, out = planned(request, command_line)
     nodes = of_shard(every, request.shard)
     with Ledger(out) as ledger:
@@ -125,7 +127,7 @@ def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node
 
 
 def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
-    """A reason for each node: passed where it ended as expected."""
+    """Judge a batch, with a reason for each node."""
     num = len({run.recording for run in runs})
     damaged = dict.fromkeys(run.recording for run in runs if _is_damaged(run))
     return verdict_of(
@@ -139,7 +141,6 @@ def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
 
 
 def _is_damaged(run: Run) -> bool:
-    """Whether damage is to be said of a run: it ended as expected, and damage was not what was expected."""
     return run.state == DONE and run.expect != f"exit {DAMAGED}" and bool(run.damage)
 
 
@@ -157,7 +158,7 @@ def _reason(run: Run) -> Reason:
 
 
 def suites_of(result: BatchResult) -> list[Suite]:
-    """What CI systems are told: a suite for each recording, with the cases of its nodes."""
+    """JUnit suites, one for each recording."""
     suites = list[Suite]()
     for recording in dict.fromkeys(run.recording for run in result.runs):
         runs = [run for run in result.runs if run.recording == recording]
@@ -192,9 +193,9 @@ def _cases_of(run: Run, out: Path) -> list[Case]:
 def write_batch(
     out: Path, suite: Asked, nodes: Sequence[Node], latest: Mapping[str, Run], keys: Mapping[str, str]
 ) -> None:
-    """batch.json: the state of every node that has a key, and the last of each other (of another shard) that has run.
+    """Write batch.json: every node with a key, and the last run of others.
 
-    A node that was not come to is to do.
+    Nodes not reached are to do.
     """
     found = list[Run]()
     for node in nodes:
@@ -213,9 +214,7 @@ def write_batch(
 
 
 def check_same_asked(out: Path, name: str, asked: Mapping[str, Any], *, what: str) -> None:
-    """Raise UsageError where a folder is of a sweep or study (`what`) that was asked for something else, or of
-    something else altogether; its file `name` has what it was asked for. InputError where that cannot be read.
-    """
+    """Raise UsageError if a folder is of another sweep or study (`what`); InputError if unreadable."""
     file = out / name
     if not file.is_file():
         if any((out / other).exists() for other in (*MARKERS, FILE)):
@@ -236,7 +235,7 @@ def check_same_asked(out: Path, name: str, asked: Mapping[str, Any], *, what: st
 def scheduling(
     ledger: Ledger, entry: str, progress: Progress, *, workers: int, dask: str | None, again: bool = False
 ) -> Iterator[Scheduler]:
-    """What runs nodes: processes of this machine, or a Dask cluster. Raises UsageError where none answers."""
+    """Yield a scheduler of local processes or a Dask cluster. Raises UsageError if none answers."""
     scheduler = partial(Scheduler, ledger=ledger, entry=entry, progress=progress, again=again)
     if dask is None:
         with local_executor(workers) as executor:

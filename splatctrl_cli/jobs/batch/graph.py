@@ -1,4 +1,4 @@
-"""The graph of a suite: a node for each recording, job and variant, with the words that run it."""
+"""The graph of a suite: nodes of recording, job and variant."""
 
 import itertools
 import re
@@ -12,11 +12,11 @@ from typing import Any, Protocol
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.batch.suite import Job, Limits, Recording, Suite, Table, jobs_for
 
-RECORDING, NAME = "recording", "name"  # what {…} in an option may stand for, beside the jobs
+RECORDING, NAME = "recording", "name"  # placeholders {…} in an option, besides job names
 ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name
 WITHOUT_OUTPUT = ("check", "info")
 CAPTURE, SCENE = "ingest", "reconstruct"
-ROLES: Mapping[str, Mapping[str, str]] = {  # what an option is where the suite does not say: of a command's only job
+ROLES: Mapping[str, Mapping[str, str]] = {  # default sources of options: a command's only job, or the recording
     "simulate": {},
     "ingest": {"source": RECORDING},
     "check": {"source": RECORDING},
@@ -28,7 +28,7 @@ ROLES: Mapping[str, Mapping[str, str]] = {  # what an option is where the suite 
     "replay": {"log": CAPTURE, "scene": SCENE},
 }
 COMMANDS = tuple(ROLES)
-TABLES = ("set", "perturb")  # options of which a matrix varies one entry: set.SECTION.KEY, perturb.NAME
+TABLES = ("set", "perturb")  # options a matrix varies by entry: set.SECTION.KEY, perturb.NAME
 _PLACE = re.compile(r"\{([\w.+-]+)\}")
 _LONGEST = 120  # characters of a node's name
 
@@ -36,28 +36,28 @@ Variant = Mapping[str, Any]
 
 
 class CommandLine(Protocol):
-    """What a batch knows of the command line that runs its nodes; `entry` is MODULE:FUNCTION, words to exit code."""
+    """Command line of a batch's nodes; `entry` is MODULE:FUNCTION, from words to exit code."""
 
     entry: str
 
     def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
-        """Words for options, paths of which count from `folder`, and the files among them that are read.
+        """Words for options, with paths from `folder`, and the files they read.
 
-        Raises UsageError for what is not an option.
+        Raises UsageError for an unknown option.
         """
         ...
 
     def options_of(self, words: Sequence[str]) -> dict[str, Any]:
-        """The options that a command's words say, as `parsed` takes them, but those that a batch gives itself."""
+        """Options in a command's words, as `parsed` takes them, without those a batch gives."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """One command on one recording. name: RECORDING/JOB; variant: by JOB.OPTION what a matrix chose here or before.
+    """One command on one recording; name: RECORDING/JOB.
 
-    words: its command line; inputs: the files in it that decide what comes out; needs: names of nodes before it; out:
-    what it writes, None for a command that only prints.
+    variant: matrix choices so far, by JOB.OPTION. words: the command line. inputs: files that decide the result.
+    needs: nodes before it. out: None for a command that only prints.
     """
 
     name: str
@@ -74,9 +74,9 @@ class Node:
 
 
 def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
-    """Every node, by recording in the order of the suite's jobs as far as each comes after those it needs.
+    """All nodes, by recording, each after those it needs.
 
-    Raises UsageError for jobs that need each other, placeholders without a job, and options that a command lacks.
+    Raises UsageError for a cycle, an unknown placeholder or option.
     """
     nodes: list[Node] = []
     for recording in sorted(suite.recordings, key=lambda each: each.name):
@@ -87,20 +87,19 @@ def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
 
 
 def of_shard(nodes: Sequence[Node], shard: tuple[int, int]) -> list[Node]:
-    """Those of every n-th recording from the i-th on."""
+    """Nodes of every n-th recording from the i-th on."""
     index, count = shard
     chosen = set(list(dict.fromkeys(node.recording for node in nodes))[index - 1 :: count])
     return [node for node in nodes if node.recording in chosen]
 
 
 def columns_of(columns: Iterable[tuple[str, str]], jobs: Sequence[str]) -> list[str]:
-    """Of a table of nodes, from the job and the name of each: once each, by job, then as they come."""
+    """Distinct columns of a table of nodes, given as (job, column), by job."""
     job_of = {name: job for job, name in columns}
     return sorted(job_of, key=lambda name: jobs.index(job_of[name]) if job_of[name] in jobs else len(jobs))
 
 
 def _with_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
-    """With the options that follow from the other jobs, where the suite does not give them."""
     given = {*job.options, *job.matrix}
     given |= {"field", "lockstep"} & given and {"scene"}  # either stands for its scene
     roles = {option: role for option, role in ROLES[job.command].items() if option not in given}
@@ -126,7 +125,6 @@ def _filled(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> s
 
 
 def _in_order(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, tuple[str, ...]]]:
-    """Jobs with the names of those that they need, which come first."""
     needs = {name: _needs(job, jobs, recording) for name, job in jobs.items()}
     try:
         TopologicalSorter(needs).prepare()
@@ -202,7 +200,6 @@ def _nodes_of(
 
 
 def _short(values: Sequence[Any]) -> list[str]:
-    """The values of a matrix in names: of paths only what is not the same in all."""
     parts = [_text(value).strip("/").split("/") for value in values]
     least = min(map(len, parts)) - 1
     first = min(_num_alike(parts), least)
@@ -211,7 +208,6 @@ def _short(values: Sequence[Any]) -> list[str]:
 
 
 def _num_alike(lists: Sequence[Sequence[str]]) -> int:
-    """How many of their first elements all lists share."""
     return sum(1 for _ in itertools.takewhile(lambda each: len(set(each)) == 1, zip(*lists, strict=False)))
 
 
@@ -222,7 +218,7 @@ def _text(value: Any) -> str:
 
 
 def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
-    """What matrices chose, in a name: each option, with its job where two jobs have it."""
+    """Matrix choices in a name; with the job where two share an option."""
     chosen = {
         f"{job.name}.{option}": (option.removeprefix("set."), values)
         for job in jobs
@@ -255,7 +251,7 @@ def _node(recording: Recording, job: Job, variant: Variant, suffix: str, before:
 
 
 def _joined(variants: Sequence[Variant]) -> Variant | None:
-    """All of them as one; None where two chose differently."""
+    """Union of variants; None if two choose differently."""
     joined: dict[str, Any] = {}
     for variant in variants:
         if any(joined.setdefault(key, value) != value for key, value in variant.items()):
@@ -264,7 +260,7 @@ def _joined(variants: Sequence[Variant]) -> Variant | None:
 
 
 def _merged(options: Table, chosen: Variant) -> dict[str, Any]:
-    """Options with what a matrix chose; its key ``set.SECTION.KEY`` adds to the settings, and so of `TABLES`."""
+    """Add matrix choices to options; ``set.SECTION.KEY`` adds to the settings, likewise `TABLES`."""
     merged = dict(options)
     for key, value in chosen.items():
         table, dot, entry = key.partition(".")
@@ -277,7 +273,7 @@ def _merged(options: Table, chosen: Variant) -> dict[str, Any]:
 
 
 def _placed(value: Any, filled: Callable[[str], Any]) -> Any:
-    """With each {place} filled; a text that is one place alone becomes what stands for it, a list too."""
+    """Fill each {place}; a text that is one place becomes its value, even a list."""
     if isinstance(value, str):
         alone = _PLACE.fullmatch(value)
         return filled(alone[1]) if alone else _PLACE.sub(lambda match: _one(filled(match[1])), value)

@@ -1,5 +1,6 @@
-"""What ran in a folder, by node and key, in one SQLite file; who runs what now; digests of inputs; and what a node's
-result depends on, as one key: its words, the content of its inputs, and the code.
+"""Runs by node and key in SQLite, with claims and input digests.
+
+A key covers a node's words, the content of its inputs, and the code.
 """
 
 import csv
@@ -29,7 +30,7 @@ from splatctrl_cli.jobs.batch.graph import Node
 NAME, OWNERS = "ledger.sqlite", ".owners"
 FILE, FORMAT, FILE_VERSION = "batch.json", "splatctrl-batch", 1  # what a batch says of itself
 VERSION = 1  # of the tables
-BUSY_S, WAIT_S = 30.0, 0.02  # to wait for another process that writes, and before it is asked again
+BUSY_S, WAIT_S = 30.0, 0.02  # longest wait for another writer, and between attempts
 _COMPARISON = re.compile(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)")
 WITHOUT_EFFECT = ("--force", "--resume", "--quiet", "-q", "--json")
 THREADS = "--threads"  # changes no byte
@@ -40,7 +41,7 @@ _PATTERN = {"=": "GLOB", "==": "GLOB", "!=": "NOT GLOB"}  # of texts with a *
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One run of a node, as it ended; `state` is done (as expected), failed (not so), error or skipped."""
+    """One ended run of a node; `state` is done (as expected), failed, error or skipped."""
 
     node: str
     recording: str = ""
@@ -69,16 +70,16 @@ class Run:
 
     @property
     def damage(self) -> str:
-        """The mark of a run on a damaged recording, else empty."""
+        """Mark of a damaged recording, else empty."""
         return damage_mark(self.sentence, self.exit_code)
 
     @property
     def column(self) -> str:
-        """The job and its variant."""
+        """Job and variant."""
         return self.node.removeprefix(f"{self.recording}/")
 
     def document(self) -> dict[str, Any]:
-        """The run as an entry of the batch's JSON file; `run_of_document` reads it back."""
+        """The run for batch.json; `run_of_document` reads it."""
         plain = asdict(self) | {name: json.loads(getattr(self, name)) for name in _OF_JSON}
         return {"id": plain.pop("node"), **plain, "outcome": self.outcome or None}
 
@@ -97,10 +98,10 @@ CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, stamp TEXT, digest TE
 
 
 class Ledger(AbstractContextManager["Ledger"]):
-    """The ledger of the batches that write into one folder; several processes may have it open."""
+    """The ledger of batches in one folder; several processes may open it."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises InputError for a file that is no ledger, or a newer one."""
+        """Open the ledger. Raises InputError for another or a newer file."""
         folder.mkdir(parents=True, exist_ok=True)
         self.folder, self.path = folder, folder / NAME
         self._owner = f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
@@ -122,7 +123,7 @@ class Ledger(AbstractContextManager["Ledger"]):
         while base.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
             try:
                 base.execute("PRAGMA journal_mode = WAL")
-            except sqlite3.OperationalError:  # for which sqlite waits for no other, as it does for all else
+            except sqlite3.OperationalError:  # sqlite does not wait for other processes here
                 if time.monotonic() > until:
                     raise
                 time.sleep(WAIT_S)
@@ -132,7 +133,7 @@ class Ledger(AbstractContextManager["Ledger"]):
         return base
 
     def __exit__(self, *_: object) -> None:
-        """Give up what is claimed."""
+        """Release all claims."""
         if self._lock is not None:
             with suppress(sqlite3.Error):
                 self._base.execute("DELETE FROM claims WHERE owner = ?", (self._owner,))
@@ -141,7 +142,7 @@ class Ledger(AbstractContextManager["Ledger"]):
         self._base.close()
 
     def claim(self, node: str) -> bool:
-        """Whether this process may run a node: nobody alive does."""
+        """Claim a node for this process; False if another live one has it."""
         with self._transaction():
             row = self._base.execute("SELECT owner FROM claims WHERE node = ?", (node,)).fetchone()
             if row is not None and row["owner"] != self._owner and self._is_alive(row["owner"]):
@@ -151,7 +152,7 @@ class Ledger(AbstractContextManager["Ledger"]):
         return True
 
     def record(self, run: Run) -> None:
-        """A run that ended; its node is free again."""
+        """Store an ended run, and release its node."""
         places = ", ".join("?" * len(COLUMNS))
         with self._transaction():
             self._base.execute(
@@ -160,26 +161,22 @@ class Ledger(AbstractContextManager["Ledger"]):
             self._base.execute("DELETE FROM claims WHERE node = ?", (run.node,))
 
     def release(self, node: str) -> None:
-        """A node that was claimed and need not be run."""
+        """Release a claimed node."""
         self._base.execute("DELETE FROM claims WHERE node = ? AND owner = ?", (node, self._owner))
 
     def last(self, node: str) -> Run | None:
-        """The last run of a node."""
         return next(self.runs([f"node={node}"]), None)
 
     def latest(self) -> dict[str, Run]:
-        """The last run of each node."""
         return {run.node: run for run in self.runs()}
 
     def mean_seconds(self) -> dict[str, float]:
-        """Of runs that ended by themselves, by job."""
+        """Mean time of runs that ended by themselves, by job."""
         rows = self._base.execute("SELECT job, avg(seconds) AS mean FROM runs WHERE cause = '' GROUP BY job")
         return {row["job"]: float(row["mean"]) for row in rows}
 
     def runs(self, conditions: Sequence[str] = (), *, only_last: bool = True) -> Iterator[Run]:
-        """Runs for which conditions hold, such as "job=audit", "node=a/*" or "seconds>10". Raises UsageError for what
-        is none.
-        """
+        """Runs that meet conditions like "job=audit", "node=a/*", "seconds>10". Raises UsageError."""
         clauses, values = ["id IN (SELECT max(id) FROM runs GROUP BY node)"] if only_last else [], []
         for condition in conditions:
             match = _COMPARISON.fullmatch(condition.strip())
@@ -195,7 +192,7 @@ class Ledger(AbstractContextManager["Ledger"]):
             yield Run(**plain | {"exit_code": None if plain["exit_code"] is None else int(plain["exit_code"])})
 
     def digest(self, path: Path) -> str:
-        """sha256 of a file, or of a folder's names and files; read again only where sizes or times changed."""
+        """sha256 of a file, or a folder's names and files; cached by sizes and times."""
         stamp = _stamp_of(path)
         key = str(path.resolve())
         row = self._base.execute("SELECT stamp, digest FROM digests WHERE path = ?", (key,)).fetchone()
@@ -217,7 +214,7 @@ class Ledger(AbstractContextManager["Ledger"]):
         self._base.execute("COMMIT")
 
     def _hold(self) -> None:
-        """A lock on a file of this process, which ends with it."""
+        """Lock a file of this process, until it ends."""
         if self._lock is None:
             place = self.folder / OWNERS / self._owner
             place.parent.mkdir(exist_ok=True)
@@ -238,8 +235,6 @@ class Ledger(AbstractContextManager["Ledger"]):
 
 
 def write_csv(path: Path, runs: Iterable[Run]) -> None:
-    """Runs as a table with a header."""
-
     def write(place: Path) -> None:
         with place.open("w", encoding="utf-8", newline="") as stream:
             writer = csv.writer(stream, lineterminator="\n")
@@ -250,10 +245,7 @@ def write_csv(path: Path, runs: Iterable[Run]) -> None:
 
 
 def run_of_document(plain: Mapping[str, Any]) -> Run:
-    """The run of an entry of the batch's JSON file, of this or another version.
-
-    Raises TypeError, KeyError or AttributeError for anything else.
-    """
+    """Run of an entry of batch.json. Raises TypeError, KeyError or AttributeError."""
     known = {name: value for name, value in plain.items() if name in COLUMNS and value is not None}
     return Run(node=plain["id"], **known | {name: json.dumps(known[name]) for name in _OF_JSON if name in known})
 
@@ -276,12 +268,11 @@ def _stamp_of(path: Path) -> str:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files below a folder; of a file there are none."""
     return sorted(place for place in folder.rglob("*") if place.is_file())
 
 
 def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]:
-    """A key for each node, of nodes after those that they need. Raises InputError for an input that is not there."""
+    """Key of each node, in order of need. Raises InputError for a missing input."""
     code, digests = code_version(), dict[Path, str]()
     keys: dict[str, str] = {}
     outs = {node.name: str(node.out) for node in nodes}
@@ -297,7 +288,7 @@ def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]
 
 @cache
 def code_version() -> str:
-    """A digest of the package's files, and the versions of the libraries that decide figures."""
+    """Digest of the package's files and the versions that decide figures."""
     folder, found = Path(splatctrl_cli.__file__).parent, hashlib.sha256()
     for place in sorted(place for place in folder.rglob("*") if place.suffix in _CODE):
         found.update(f"{place.relative_to(folder)}\0".encode() + place.read_bytes())
@@ -307,7 +298,7 @@ def code_version() -> str:
 
 
 def _said(words: Sequence[str], named: Mapping[str, str]) -> Iterator[str]:
-    """Words without those that change no result, paths replaced by what they hold."""
+    """Words that change results, with paths replaced by digests."""
     longest_first = sorted(named, key=len, reverse=True)
     skip = False
     for word in words:
@@ -324,7 +315,7 @@ def _said(words: Sequence[str], named: Mapping[str, str]) -> Iterator[str]:
 
 
 def _digest(path: Path, ledger: Ledger) -> str:
-    """Of an input and what it names: the folder of an image folder's description, the meshes of a URDF."""
+    """Digest of an input and what it names: an image folder, a URDF's meshes."""
     try:
         digest = ledger.digest(path.parent if path.suffix == ".toml" and path.parent != Path() else path)
         if path.suffix != ".urdf":
@@ -336,7 +327,7 @@ def _digest(path: Path, ledger: Ledger) -> str:
 
 
 def _meshes(urdf: Path) -> Iterator[Path]:
-    """Where the meshes that a URDF names may be: beside it, or below one of the folders above."""
+    """Possible places of a URDF's meshes: next to it, or below a parent."""
     for name in dict.fromkeys(_MESH.findall(urdf.read_text(encoding="utf-8", errors="replace"))):
         if "://" not in name:
             yield urdf.parent / name

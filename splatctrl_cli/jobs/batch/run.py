@@ -1,4 +1,4 @@
-"""Nodes through processes, in the order of their graph: what is done is kept, what changed is run again."""
+"""Nodes through processes in graph order; unchanged results are kept."""
 
 import json
 import os
@@ -21,18 +21,18 @@ from splatctrl_cli.jobs.batch.task import End, Task, last_lines, read_end, run_t
 from splatctrl_cli.jobs.running.progress import Progress, duration
 
 DONE, FAILED, ERROR, SKIPPED, TO_DO = "done", "failed", "error", "skipped", "to do"
-NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes of a command that came to none
+NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes without a verdict
 AGAIN_S = 0.5  # between looks at what another batch runs
-STILL_S = 60.0  # without an end, after which it is said what is waited for
+STILL_S = 60.0  # without an ended node, until a log line names what runs
 MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes, when nothing here asked for it
 DISK_FULL = 6
 UNRUN = "has not run since the suite, its inputs or the program changed"
-PRINTED = "printed"  # stands for the stamp of an output that there is none of
+PRINTED = "printed"  # stamp of a node that only prints
 
 
 @dataclass(kw_only=True)
 class Scheduler:
-    """Runs nodes with an executor of `slots` places, and keeps the ledger. hint: why a wait may be in vain."""
+    """A runner of nodes on an executor of `slots` places; hint: cause of a wait."""
 
     ledger: Ledger
     entry: str
@@ -46,7 +46,7 @@ class Scheduler:
     num_kept: int = 0
 
     def run(self, nodes: Sequence[Node]) -> dict[str, Run]:
-        """The run of each node, by its name: the one that stands from before, or a new one."""
+        """The run of each node by name, kept or new."""
         keys, latest = keys_of(nodes, self.ledger, self.entry), self.ledger.latest()
         self.keys = keys
         waiting = {node.name: node for node in nodes}
@@ -98,7 +98,7 @@ class Scheduler:
         return {node.name: self.runs[node.name] for node in nodes}
 
     def _without_running(self, node: Node, key: str, before: Run | None) -> Run | None:
-        """The run that stands: that of before, one that ended unrecorded, or none, for want of what it needs."""
+        """The run that stands: an earlier one, an unrecorded one, or skipped for a missing need."""
         lacking = [need for need in node.needs if not self.runs[need].stamp]
         if lacking:
             cause = f"needs {lacking[0]}, which left nothing"
@@ -109,7 +109,7 @@ class Scheduler:
         if self.again:
             return None
         is_same = before is not None and before.key == key and before.state in (DONE, FAILED)
-        # neither stamp is there where an error was expected
+        # both stamps are empty after an expected error
         if before is not None and is_same and (node.out is None or before.stamp == stamp_of(node.out)):
             self.num_kept += 1
             judged = _judged_again(before, node)
@@ -149,7 +149,7 @@ class Scheduler:
 
 
 def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
-    """What a run came to, by how it ended and what it printed."""
+    """Build a run from its end and output."""
     place = folder / node.name
     verdict = verdict_in(Path(f"{place}.json")) if end.exit_code is not None else {}
     code, outcome, label = end.exit_code, verdict.get("outcome", ""), verdict.get("label", "")
@@ -186,7 +186,6 @@ def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
 
 
 def _judged_again(run: Run, node: Node) -> Run:
-    """With the state that the node's expectation makes of it."""
     if run.cause:
         return replace(run, state=ERROR)
     is_expected = node.expect in {run.label, run.outcome, f"exit {run.exit_code}"}
@@ -195,7 +194,6 @@ def _judged_again(run: Run, node: Node) -> Run:
 
 
 def told(run: Run) -> str:
-    """A run in a few words."""
     if run.state == SKIPPED:
         return f"skipped: {run.cause}"
     what = run.cause or (run.label.upper() if run.outcome else run.label)
@@ -205,7 +203,7 @@ def told(run: Run) -> str:
 
 @contextmanager
 def local_executor(workers: int) -> Iterator[Executor]:
-    """Processes on this machine; they end with the block, however it ends, and with this process."""
+    """Yield an executor of local processes that end with the block and this process."""
     executor = ThreadPoolExecutor(workers, thread_name_prefix="node")
     before = None
     if threading.current_thread() is threading.main_thread():
@@ -224,7 +222,7 @@ def local_executor(workers: int) -> Iterator[Executor]:
 
 
 class Clock:
-    """How many nodes have passed, and about how long the others take, by how long their jobs took."""
+    """Count of finished nodes, and the time left by the mean of each job."""
 
     def __init__(self, nodes: Sequence[Node], means: Mapping[str, float], slots: int) -> None:
         self.started = time.time()
@@ -234,14 +232,14 @@ class Clock:
         self._seen: dict[str, list[float]] = {}
 
     def passed(self, run: Run) -> str:
-        """How many have, with this one."""
+        """Count a run."""
         self._left[run.job] -= 1
         if run.started >= self.started and run.state != SKIPPED:
             self._seen.setdefault(run.job, []).append(run.seconds)
         return f"[{self._total - self._left.total()}/{self._total}]"
 
     def left(self) -> str:
-        """At least so long where a job comes that has not run yet; nothing where none has run."""
+        """The time left: "over" if a job has no mean; empty without any."""
         means = self._means | {job: sum(each) / len(each) for job, each in self._seen.items()}
         known = Counter({job: count for job, count in self._left.items() if count and job in means})
         if not known:
@@ -251,7 +249,6 @@ class Clock:
 
 
 def _end_of(future: "Future[End]") -> End:
-    """How a task ended; one that never came back is lost."""
     try:
         return future.result()
     except Exception as error:  # of the executor: a worker that died, a machine that is gone
@@ -259,7 +256,7 @@ def _end_of(future: "Future[End]") -> End:
 
 
 def verdict_in(result: Path) -> dict[str, Any]:
-    """The verdict in a command's JSON, empty where it has none."""
+    """Verdict in a command's JSON, else empty."""
     with suppress(OSError, ValueError):
         document = json.loads(result.read_bytes())
         verdict = document.get("verdict") if isinstance(document, dict) else None
@@ -268,5 +265,4 @@ def verdict_in(result: Path) -> dict[str, Any]:
 
 
 def not_run(node: Node, key: str, folder: Path, *, state: str, cause: str) -> Run:
-    """Of a node that has not run, and why."""
     return replace(run_of(node, key, End.without_one(key, cause), folder), state=state)

@@ -1,4 +1,4 @@
-"""SUITE.toml: recordings, and the commands that each goes through."""
+"""SUITE.toml: recordings, and their commands."""
 
 import glob
 import os
@@ -22,13 +22,13 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
     *("controller failed", "goal not reached", "gate failed"),
 )
 _NAME = re.compile(r"[\w][\w.+-]*")
-_COMMON = ("log", "capture", "recording", "data")  # names of thousands, to which that of the folder is added
+_COMMON = ("log", "capture", "recording", "data")  # common names, which get the folder's name in front
 _ENDINGS = (".mcap", ".bag", ".db3", ".toml", ".capture")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What a job may take: wall time [s] and memory [bytes], 0 for any; retries after causes that may pass."""
+    """Limits of a job: wall time [s], memory [bytes] (0: none), and retries after transient errors."""
 
     timeout: float = 0.0
     memory: int = 0
@@ -37,9 +37,9 @@ class Limits:
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One command of a suite. options: by their long names; matrix: values by option, each combination a variant.
+    """One command of a suite; options by long name, matrix: values by option, combined to variants.
 
-    expect: the verdict's label or outcome, or "exit N".
+    expect: a verdict's label or outcome, or "exit N".
     """
 
     name: str
@@ -52,8 +52,9 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """One recording: its files (several are read as one session), the jobs that it goes through, empty for all, and
-    what a job has otherwise for it.
+    """One recording of one file, or several of a session.
+
+    only: its jobs, empty for all. overrides: options by job.
     """
 
     name: str
@@ -64,7 +65,7 @@ class Recording:
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """A suite as its file has it; `folder` is that of the file, from which its paths count."""
+    """A suite's file; its paths are relative to `folder`."""
 
     name: str
     folder: Path
@@ -74,10 +75,7 @@ class Suite:
 
 
 def read_suite(path: Path, commands: Sequence[str]) -> Suite:
-    """The suite in a file. Raises InputError for a file that is none, UsageError for what it says.
-
-    commands: those that a job may have.
-    """
+    """Read a suite; commands: allowed ones. Raises InputError, or UsageError for its content."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -101,7 +99,7 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
 
 
 def jobs_for(recording: Recording, jobs: Sequence[Job], commands: Sequence[str]) -> list[Job]:
-    """The jobs of a recording, as it has them. Raises UsageError for what an override says."""
+    """Jobs of a recording with its overrides. Raises UsageError for an invalid one."""
     chosen = [job for job in jobs if job.name in recording.only or not recording.only]
     own = [_job(job.name, recording.overrides.get(job.name, {}), commands, job) for job in chosen]
     return [
@@ -150,7 +148,6 @@ _LIMITS = tuple(each.name for each in fields(Limits))
 
 
 def _recordings(folder: Path, table: Table) -> list[Recording]:
-    """Those of one [[recordings]]: one for each file that is found, or one of a session."""
     where = "[[recordings]]"
     if not isinstance(table, Mapping):
         raise UsageError(f"{where}: expected a table, got {shown(table)}", remedy="give it paths = [...]")
@@ -169,7 +166,6 @@ def _recordings(folder: Path, table: Table) -> list[Recording]:
 
 
 def _found(folder: Path, where: str, pattern: object) -> list[Path]:
-    """What a pattern matches, sorted; a path without * is itself."""
     places = sorted(glob.glob(_worded(where, "paths", pattern), root_dir=folder, recursive=True))  # noqa: PTH207
     if not places:
         raise InputError(f"{where}: nothing matches {pattern!r} in {folder}", remedy="check the pattern")
@@ -177,9 +173,7 @@ def _found(folder: Path, where: str, pattern: object) -> list[Path]:
 
 
 def _named(recordings: Sequence[Recording]) -> list[Recording]:
-    """With a name where the suite has none: of the file, after those of its folders that tell it from others of the
-    name; with its ending where only that does.
-    """
+    """Name the recordings by file, with as many folders, or the ending, as distinguish them."""
     files = [Path(os.path.normpath(each.paths[0])) for each in recordings]
     beside = Counter(map(_without_ending, set(files)))
     places = [path if beside[_without_ending(path)] > 1 else _without_ending(path) for path in files]
@@ -263,7 +257,7 @@ def _tables(where: str, table: Table, key: str) -> dict[str, Table]:
 
 
 def _amount(where: str, table: Table, key: str, units: Mapping[str, int], default: float) -> float:
-    """A number, or text such as "10 min" or "4GiB"."""
+    """Parse a number, or text such as "10 min" or "4GiB"."""
     value = table.get(key, default)
     match = re.fullmatch(r"\s*([\d.]+)\s*(\w+)\s*", value) if isinstance(value, str) else None
     try:

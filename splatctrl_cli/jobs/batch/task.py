@@ -1,7 +1,7 @@
-"""One node's run in a process of its own: a forked child under limits, its log, its result, and how it ended.
+"""One node's run in a forked child under limits, with log, result and end.
 
-A runner process has the commands imported, so that a node costs a fork and not a start of Python; it has one thread
-and runs one node at a time, told by lines of JSON on its stdin. When stdin ends, so does what runs.
+A runner has imported the commands, so a node costs a fork, not a start of Python. It runs one node at a time in one
+thread, read as JSON lines from stdin. When stdin ends, so does the run.
 """
 
 import contextlib
@@ -31,23 +31,23 @@ POLL = 0.02  # [s] between looks at a child's memory
 STOP = 2.0  # [s] for a runner to see that its stdin ended, before it is killed
 GRACE = 10.0  # [s] from asking a child to end to ending it
 PAGE = os.sysconf("SC_PAGE_SIZE")
-PR_SET_PDEATHSIG = 1  # of prctl(2): what a child gets when its parent dies
-RESUME = "--resume"  # left out where there is nothing to go on from
+PR_SET_PDEATHSIG = 1  # of prctl(2): the signal a child gets when its parent dies
+RESUME = "--resume"  # omitted without a partial output
 PART = ".part"  # ends the name of a result that is not whole
-_LAST = 4096  # bytes of a log that are looked at for its last lines
-_local = threading.local()  # a runner for each thread that has run a task
+_LAST = 4096  # bytes of a log searched for its last lines
+_local = threading.local()  # each thread's runner
 _runners: list["subprocess.Popen[str]"] = []
 _numbers = itertools.count()  # of the runners
 VISIBLE, CARD = "CUDA_VISIBLE_DEVICES", "SPLATCTRL_CARD_OF_RUNNER"  # a runner's card, where there are several
-BY_THE_BATCH = ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY")  # what a batch tells of, and its nodes do not
+BY_THE_BATCH = ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY")  # reported by the batch, not by its nodes
 WROTE = (0, 1, 3, 5)  # exit codes of a command that left its output
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What a runner is to do: call `entry` with `words`, and leave `result` (stdout), `log` (stderr) and `end`.
+    """Work of a runner: call `entry` with `words`, write `result` (stdout), `log` (stderr), `end`.
 
-    key: of the node, kept in `end`; timeout [s] and memory [bytes], 0 for any. All plain values, for other machines.
+    timeout [s], memory [bytes]: 0 for none. Plain values, for other machines.
     """
 
     entry: str
@@ -63,8 +63,9 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class End:
-    """How a run ended: its exit code, None where it was killed and `cause` says why; seconds of wall time from
-    `started` [s since 1970]; peak memory [MB]; stamp: of the output, which changes when somebody writes it.
+    """The end of a run; exit_code is None if it was killed, for `cause`.
+
+    started [s since 1970]. stamp: of the output, changes when rewritten.
     """
 
     key: str
@@ -77,18 +78,18 @@ class End:
 
     @classmethod
     def without_one(cls, key: str, cause: str) -> "End":
-        """Of a task that never ran to an end."""
+        """End of a task that never completed."""
         return cls(key=key, exit_code=None, cause=cause, started=time.time(), seconds=0.0, peak_mb=0.0, stamp="")
 
 
 def run_task(task: Task) -> End:
-    """Run a task in this thread's runner, unless it has already ended, and say how it ended.
+    """Run a task in this thread's runner, unless it already ended.
 
-    A runner that was killed is started once more; one that `stop_runners` ended is not.
+    A killed runner is started once more, but not after `stop_runners`.
     """
     known = read_end(Path(task.end), task.key)
     if known is not None and known.exit_code is not None and known.stamp in ("", stamp_of(Path(task.out))):
-        return known  # by a worker that was lost before it could say so
+        return known  # ended by a worker that was lost before it reported
     for _ in range(2):
         runner = getattr(_local, "runner", None)
         if runner is None or runner.poll() is not None:
@@ -110,7 +111,7 @@ def run_task(task: Task) -> End:
 
 
 def stop_runners() -> None:
-    """End every runner of this process, and what it runs."""
+    """End every runner of this process, and its run."""
     while _runners:
         runner = _runners.pop()
         assert runner.stdin is not None and runner.stdout is not None
@@ -125,7 +126,7 @@ def stop_runners() -> None:
 
 
 def read_end(path: Path, key: str) -> End | None:
-    """How the run of a node with this key ended, None where none did."""
+    """End of a node's run with this key, None without one."""
     try:
         end = End(**json.loads(path.read_bytes()))
     except (OSError, ValueError, TypeError):
@@ -134,7 +135,7 @@ def read_end(path: Path, key: str) -> End | None:
 
 
 def stamp_of(out: Path) -> str:
-    """Of an output: size and time of its run.json, or of the file itself; empty where there is none."""
+    """Size and time of an output's run.json, or of the file; empty without."""
     for place in (out / "run.json", out / "capture.json", out):
         with contextlib.suppress(OSError):
             found = place.stat()
@@ -143,7 +144,7 @@ def stamp_of(out: Path) -> str:
 
 
 def last_lines(log: Path, number: int = 5) -> list[str]:
-    """The end of a log, without control characters."""
+    """Last lines of a log, without control characters."""
     try:
         with log.open("rb") as stream:
             stream.seek(max(log.stat().st_size - _LAST, 0))
@@ -167,7 +168,7 @@ def _started(entry: str) -> "subprocess.Popen[str]":
 
 
 def main(entry: str) -> None:
-    """A runner: tasks from stdin, ends to stdout, until stdin ends."""
+    """Run tasks from stdin, ends to stdout, until stdin ends."""
     module = importlib.import_module(entry.partition(":")[0])
     function: Entry = getattr(module, entry.partition(":")[2])
     getattr(module, "preload", lambda: None)()
@@ -183,12 +184,11 @@ def main(entry: str) -> None:
         end = _run(function, Task(**json.loads(line)))
         try:
             os.write(1, (json.dumps(asdict(end)) + "\n").encode())
-        except BrokenPipeError:  # nobody waits for it any more; the end is in its file
+        except BrokenPipeError:  # its reader is gone; the end is in its file
             return
 
 
 def _run(function: Entry, task: Task) -> End:
-    """Fork, wait within the limits, and write `task.end`."""
     Path(task.end).parent.mkdir(parents=True, exist_ok=True)
     _clear(task)
     started, start = time.time(), time.perf_counter()
@@ -215,7 +215,7 @@ def _run(function: Entry, task: Task) -> End:
 
 
 def _clear(task: Task) -> None:
-    """Remove what a run with another key left, whole or not, so that nobody takes it for this one's."""
+    """Remove outputs of another key, lest they be taken for this run's."""
     begun = Path(task.end).with_suffix(".begun")
     if begun.is_file() and begun.read_text() != task.key and task.out:
         remove(Path(task.out))
@@ -224,7 +224,7 @@ def _clear(task: Task) -> None:
 
 
 def _be_child(function: Entry, task: Task) -> NoReturn:
-    """Run the words as a process of its own session would, and leave."""
+    """Run the words in a session of their own, and exit."""
     code = 70
     try:
         os.setsid()
@@ -250,7 +250,7 @@ def _be_child(function: Entry, task: Task) -> NoReturn:
 
 
 def _wait(pid: int, task: Task) -> str:
-    """Until the child has ended or was made to; why, if it was. Leaves this process where stdin ends."""
+    """Wait for the child, or end it and return why. Exits if stdin ends."""
     start, asked, cause = time.monotonic(), 0.0, ""
     ended, look = os.pidfd_open(pid), POLL if task.memory else 1.0
     try:
@@ -258,7 +258,7 @@ def _wait(pid: int, task: Task) -> str:
             ready, _, _ = select.select([ended, 0], [], [], look)
             if ended in ready:
                 return cause
-            if 0 in ready and not os.read(0, 1):  # nobody waits for this any more
+            if 0 in ready and not os.read(0, 1):  # its reader is gone
                 _signal(pid, signal.SIGKILL)
                 os._exit(1)
             if task.memory and _memory_of(pid) > task.memory:
@@ -274,7 +274,7 @@ def _wait(pid: int, task: Task) -> str:
 
 
 def _signal(pid: int, number: signal.Signals) -> None:
-    """To a child and what it started; to itself alone as long as it has no group."""
+    """Signal a child's group, or the child alone before it has one."""
     try:
         os.killpg(pid, number)
     except ProcessLookupError:
@@ -282,7 +282,7 @@ def _signal(pid: int, number: signal.Signals) -> None:
 
 
 def _memory_of(pid: int) -> int:
-    """Bytes of memory that a process has to itself or shares, 0 where it is gone."""
+    """Resident memory of a process [bytes], 0 if gone."""
     try:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE
     except (OSError, IndexError):

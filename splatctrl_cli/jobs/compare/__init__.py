@@ -1,1 +1,1 @@
-"""Two runs, or two batches, and what got worse."""
+"""Comparisons of runs and batches."""

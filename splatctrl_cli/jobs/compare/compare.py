@@ -1,4 +1,4 @@
-"""A comparison from its request to its result: what got worse between two runs, two batches, or since a baseline."""
+"""A comparison: regressions between runs, batches, or since a baseline."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +28,7 @@ ROUNDING = 1e-9  # relative: baselines have nine digits
 
 
 class Change(StrEnum):
-    """What became of a figure or a verdict."""
+    """Change of a figure or verdict."""
 
     WORSE = "worse"
     BETTER = "better"
@@ -38,9 +38,9 @@ class Change(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class CompareRequest:
-    """Compare two folders, `runs`, the earlier first; or one with the stored baseline `against`.
+    """Compare two folders, the earlier first, or one with the baseline `against`.
 
-    update_baseline: a file to write the last of `runs` into, which may then be the only one.
+    update_baseline: file for the last of `runs`, which may then be the only one.
     """
 
     runs: tuple[Path, ...]
@@ -50,9 +50,10 @@ class CompareRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class FigureChange:
-    """One figure of one run; `after` is None where it has no value any more. allowed: its tolerance, in `unit`.
+    """One figure of one run; `after` is None if it lost its value.
 
-    share: by how many tolerances it is worse, infinite without one; where: of a replay, the worst state by it.
+    allowed: tolerance, in `unit`. share: tolerances it is worse by, infinite without one. where: worst state of a
+    replay.
     """
 
     run: str
@@ -70,7 +71,6 @@ class FigureChange:
 
     @property
     def sentence(self) -> str:
-        """Which recording went from what to what, and what was allowed."""
         unit = f" {self.unit}" if self.unit else ""
         if self.after is None:
             return f"{self.recording} had {self.before:.6g}{unit} and has no value any more"
@@ -81,7 +81,7 @@ class FigureChange:
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictChange:
-    """The verdict of a run before and after, by label."""
+    """Verdict labels of a run before and after."""
 
     run: str
     recording: str
@@ -92,7 +92,7 @@ class VerdictChange:
 
 @dataclass(frozen=True, kw_only=True)
 class JobChange:
-    """One figure of a job over the recordings: the mean change for the worse, and the recording that lost most."""
+    """One figure of a job over the recordings: mean harm, and the worst recording."""
 
     job: str
     metric: str
@@ -103,10 +103,10 @@ class JobChange:
 
 @dataclass(frozen=True, kw_only=True)
 class CompareResult:
-    """What changed. figures: of each run, those that got worse first; jobs: over recordings, where there are enough,
-    which then decide instead; differences: settings, versions and inputs by name, before and after; only_after: runs
-    that were not there before; only_before: runs that are not there now and are not compared. metrics: how
-    many of each.
+    """Changes of figures, verdicts and jobs, regressions first.
+
+    jobs: over enough recordings; they then decide in place of the figures. differences: settings, versions and
+    inputs, before and after. only_before: not compared.
     """
 
     __repr__ = brief
@@ -146,9 +146,9 @@ class CompareResult:
 
 
 def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResult:
-    """Compare, and write the baseline that was asked for.
+    """Compare, and write a requested baseline.
 
-    Raises UsageError for a request of another form, InputError for what cannot be read or was not run alike.
+    Raises UsageError for another form of request, InputError for unreadable or unlike runs.
     """
     num_needed = 1 if request.against is not None else 2
     if len(request.runs) != num_needed and not (len(request.runs) == 1 and request.update_baseline is not None):
@@ -164,7 +164,7 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
 
 
 def _check_alike(before: Judged, after: Judged) -> None:
-    """Raise InputError for what was not run alike: a run and a batch, other commands, no recording in common."""
+    """Raise InputError for runs of another kind or command, or without a common recording."""
     if before.kind != after.kind:
         raise InputError(f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}")
     if before.kind == "run" and before.runs.keys() != after.runs.keys():
@@ -239,7 +239,6 @@ def _compared(before: Judged, after: Judged) -> CompareResult:
 
 
 def _overall(metrics: Mapping[str, int]) -> Reason:
-    """Whether there was anything to compare."""
     num_figures, num_verdicts = metrics["num_figures"], metrics["num_verdicts"]
     if not num_figures and not num_verdicts:
         return lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides")
@@ -258,7 +257,6 @@ def _verdict_change(old: JudgedRun, new: JudgedRun) -> VerdictChange | None:
 
 
 def _figure_changes(old: JudgedRun, new: JudgedRun) -> Iterator[FigureChange]:
-    """Of the figures that had a value and are still there, by name."""
     for metric, before in old.metrics.items():
         if before is None or metric not in new.metrics or not new.outcome:
             continue
@@ -281,7 +279,7 @@ def _figure_changes(old: JudgedRun, new: JudgedRun) -> Iterator[FigureChange]:
 
 
 def _judged(scale: Scale, before: float, after: float | None) -> tuple[Change, float]:
-    """What became of a figure, and by how many tolerances it is worse; one that is lost is worse, too."""
+    """Change of a figure, and tolerances it is worse by; a lost value is worse."""
     if after is None:
         return (Change.OTHER, 0.0) if scale.better is Better.NEITHER else (Change.WORSE, math.inf)
     harm, allowed = scale.harm(before, after), scale.tolerance(before)
@@ -293,8 +291,9 @@ def _judged(scale: Scale, before: float, after: float | None) -> tuple[Change, f
 
 
 def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
-    """Of the figures of a job that enough recordings have: worse, or better, where the whole interval is and the mean
-    is beyond the mean tolerance.
+    """Changes of figures with enough recordings.
+
+    Worse or better if the whole interval is, and the mean exceeds the mean tolerance.
     """
     by_job: dict[tuple[str, str], list[FigureChange]] = {}
     for one in found:
@@ -316,7 +315,6 @@ def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
 
 
 def _of_verdicts(verdicts: Sequence[VerdictChange], after: Judged) -> Iterator[Reason]:
-    """A regression of each verdict that was right, with what decided it now; a note of each other change."""
     for one in verdicts:
         words = f"{one.run}: the verdict went from '{one.before}' to '{one.after}'"
         if one.change is not Change.WORSE:
@@ -369,7 +367,6 @@ def _of_job(one: JobChange) -> Reason:
 
 
 def _of_single(jobs: Sequence[JobChange]) -> Iterator[Reason]:
-    """A note where single recordings lost more than their tolerance, and the mean did not."""
     single = [one for one in jobs if one.change is not Change.WORSE and one.worst.change is Change.WORSE]
     if single:
         first = single[0]
@@ -378,7 +375,7 @@ def _of_single(jobs: Sequence[JobChange]) -> Iterator[Reason]:
 
 
 def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tuple[str, str]]:
-    """Settings, versions and inputs that differ, by name: before and after; of several runs, in the first."""
+    """Differing settings, versions and inputs of the first run: before and after."""
     found: dict[str, tuple[str, str]] = {}
     for old, new in pairs:
         for name in [name for name in old.settings if name in new.settings]:
@@ -389,6 +386,5 @@ def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tupl
 
 
 def _named(names: Sequence[str]) -> str:
-    """The first few, and how many more."""
     more = len(names) - MOST_NAMES
     return ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")

@@ -1,6 +1,4 @@
-"""Runs that were judged, read back to be compared: a command's folder, a batch, or a stored baseline; the figures
-that each command declares, and the state of a replay that is worst by one.
-"""
+"""Judged runs to compare: of a folder, a batch, or a baseline."""
 
 import json
 import math
@@ -33,7 +31,7 @@ REPLAY_FIELDS = ("exact", "barrier", "certified")
 
 @cache
 def scales() -> Mapping[str, Mapping[str, Scale]]:
-    """How two runs are compared by each figure, by command and name."""
+    """Comparison scale of each figure, by command and name."""
     replay: dict[str, Scale] = {}
     for mode in MODES:
         replay |= metric_scales(mode, REPLAY_FIELDS, has_truth=True, has_twists=True)
@@ -49,7 +47,7 @@ def scales() -> Mapping[str, Mapping[str, Scale]]:
 
 @cache
 def shown() -> Mapping[str, Shown]:
-    """Where the ``steps.csv`` of a replay shows its figures, by name."""
+    """Columns of a replay's ``steps.csv`` for its figures."""
     return {name: where for mode in MODES for name, where in shown_metrics(mode, REPLAY_FIELDS).items()}
 
 
@@ -61,11 +59,10 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 @dataclass(frozen=True, kw_only=True)
 class JudgedRun:
-    """One run: what it came to, its figures by name, and where its output is.
+    """One run with its verdict, figures and output folder.
 
-    name: tells it from the others of its batch; job: alike runs of other recordings have the same. outcome: of the
-    verdict, empty where it came to none; is_green: it ended as it should. settings: configuration, versions and
-    inputs, by name. reasons: of the verdict, as in ``run.json``.
+    name: unique in its batch. job: equal for like runs of other recordings. outcome: empty without a verdict.
+    is_green: ended as expected. settings: configuration, versions, inputs.
     """
 
     name: str
@@ -83,7 +80,7 @@ class JudgedRun:
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """What is compared: runs by name. kind: "run", of which there is one, or "batch"."""
+    """Runs to compare, by name; kind: "run" (a single one) or "batch"."""
 
     path: Path
     kind: str
@@ -92,7 +89,7 @@ class Judged:
 
 
 def read_judged(path: Path) -> Judged:
-    """A folder that a command that judges or a batch wrote. Raises InputError for anything else."""
+    """Read the folder of a judging command or a batch. Raises InputError for others."""
     has_batch, has_run = is_batch(path), (path / "run.json").is_file()
     is_begun = not has_batch and not has_run and path.with_name(path.name + PARTIAL).exists()
     if path.name.endswith(PARTIAL) or is_begun:
@@ -115,7 +112,7 @@ def read_judged(path: Path) -> Judged:
 def _judged_run(
     name: str, recording: str, job: str, command: str, document: Mapping[str, Any], folder: Path | None
 ) -> JudgedRun:
-    """The run of a document: a command's ``run.json``, or what it printed with --json (`folder` is None)."""
+    """Run of ``run.json``, or of --json output (`folder` is None)."""
     verdict, known = document["verdict"], scales().get(command, {})
     metrics = document["metrics"] if isinstance(document.get("metrics"), dict) else {}
     return JudgedRun(
@@ -138,7 +135,6 @@ def _judged_run(
 
 
 def _nodes_of(batch: BatchFolder) -> Iterator[JudgedRun]:
-    """The judged run of each node, from its folder, or else from the JSON that it printed."""
     for ran in batch.runs:
         variant = ", ".join(f"{key}={value}" for key, value in sorted(json.loads(ran.variant).items()))
         job = f"{ran.job} ({variant})" if variant else ran.job
@@ -163,7 +159,6 @@ def _nodes_of(batch: BatchFolder) -> Iterator[JudgedRun]:
 
 
 def _settings(document: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
-    """Configuration, seed, versions and the start of the inputs' digests, by flat names."""
     for section, values in (document.get("config") or {}).items():
         if isinstance(values, dict):
             yield from ((f"{section}.{key}", value) for key, value in values.items())
@@ -178,7 +173,7 @@ def _settings(document: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
 
 
 def read_baseline(path: Path) -> Judged:
-    """A stored baseline. Raises InputError for another file, a newer one, and figures that no command has now."""
+    """Read a baseline. Raises InputError for another or newer file, or unknown figures."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -211,8 +206,9 @@ def read_baseline(path: Path) -> Judged:
 
 
 def write_baseline(path: Path, judged: Judged) -> None:
-    """Write the figures that have a direction, a line each, in order of their names. Raises UsageError where `path`
-    is another file, or a run came to no verdict.
+    """Write the figures that have a direction, sorted, one a line.
+
+    Raises UsageError if `path` is another file.
     """
     if path.exists() and (not path.is_file() or BASELINE.encode() not in path.read_bytes()[:200]):
         raise UsageError(f"{path}: exists, and is no baseline", remedy="give another --update-baseline")
@@ -235,7 +231,7 @@ def _key(name: str) -> str:
 
 
 def _toml(value: object) -> str:
-    """Nine digits, as in ``steps.csv``."""
+    """Format a value with nine digits, as in ``steps.csv``."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int | float):
@@ -245,7 +241,7 @@ def _toml(value: object) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class WorstState:
-    """A state by its row, from 0, and its time [s] as in ``steps.csv``; the nearest sphere, and what it is near."""
+    """A state by row (from 0) and time [s] in ``steps.csv``."""
 
     state: int
     time_s: float
@@ -253,13 +249,12 @@ class WorstState:
     obstacle: str = ""
 
     def __str__(self) -> str:
-        """As words of a report."""
         near = f", {self.sphere}" if self.sphere else ""
         return f"state {self.state}{near}" + (f" near {self.obstacle}" if self.obstacle else "")
 
 
 def worst_state(folder: Path | None, metric: str) -> WorstState | None:
-    """Where the replay in `folder` shows a metric; None where its states do not, or are not there."""
+    """Worst state of a replay by a metric; None if its states do not show it."""
     where = shown().get(metric)
     if where is None or folder is None or not (folder / "steps.csv").is_file():
         return None
@@ -279,7 +274,7 @@ def worst_state(folder: Path | None, metric: str) -> WorstState | None:
 
 
 def _badness(where: Shown, text: str) -> float:
-    """Smaller is worse; infinite where the cell does not count."""
+    """Rank a cell: smaller is worse, infinite does not count."""
     if where.pick not in ("least", "largest"):
         return 0.0 if text == where.pick else math.inf
     if not text:

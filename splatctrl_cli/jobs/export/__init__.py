@@ -1,1 +1,1 @@
-"""Splats and judged runs for other programs."""
+"""Exports for viewers."""

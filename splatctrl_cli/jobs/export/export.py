@@ -1,5 +1,6 @@
-"""An export from its request to its result: splats in a viewer's format, read back and rendered before they count;
-and a run as an MCAP of Foxglove's schemas.
+"""An export: splats in a viewer's format, or a run as Foxglove MCAP.
+
+Written splats are read back and rendered before they count.
 """
 
 import math
@@ -42,7 +43,7 @@ from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Lab
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render
 
-LAYOUT_COMMENTS = frozenset({"splat", "label"})  # say how a PLY holds its values: not true of the next file
+LAYOUT_COMMENTS = frozenset({"splat", "label"})  # describe a PLY's layout: wrong for the next file
 IMAGE_SIZE = (320, 240)
 
 Splats = SplatSet | GaussianSet
@@ -50,10 +51,10 @@ Splats = SplatSet | GaussianSet
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRequest:
-    """One export of `scene`, a scene folder or a file of splats, into the file `out`, whose suffix is the format.
+    """One export of a scene folder or splat file; the suffix of `out` is the format.
 
-    out: None for a PLY beside the scene. labels: of the splats to write, None for all. layout: of a PLY, "short" or
-    "full", None for the one that loses nothing. isotropic: make anisotropic Gaussians round.
+    out: None for a PLY next to the scene. labels: None for all. layout: of a PLY, "short" or "full", None for the
+    lossless one. isotropic: make anisotropic Gaussians round.
     """
 
     scene: Path
@@ -66,14 +67,12 @@ class ExportRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportResult:
-    """The file, and what it keeps of its source.
+    """The written file and its differences from the source.
 
-    num_left_out: splats of other labels. origin: what was taken off every centre [m], in words, None for nothing.
-    not_kept: what the format has no place for; num_outside: Gaussians with a
-    sigma or colour beyond its range, which are put at its edge. differences, and what the format allows of them. Over
-    the pixels of all views around the scene: largest_pixel_difference of a colour, an opacity, or a depth over the
-    scene's size; psnr [dB], None where the colours are the same; covered_share, where anything shows. isotropic_psnr:
-    likewise of what `was_rounded` beside the source.
+    origin: subtracted from every centre [m], in words. not_kept: attributes the format lacks. num_outside: Gaussians
+    with sigma or colour clamped to its range. allowed: the format's rounding. Over the pixels of all views:
+    largest_pixel_difference in colour, opacity, or depth over scene size; psnr [dB], None if equal; covered_share.
+    isotropic_psnr: of the rounded splats to the source.
     """
 
     file: Path
@@ -101,8 +100,8 @@ class ExportResult:
 def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     """Write the splats, read them back and compare.
 
-    Raises UsageError, InputError or NotEvaluableError for what cannot be written so, and WriteError, leaving no file,
-    where a value is farther off than the format's rounding, or an exact format looks different.
+    Raises UsageError, InputError or NotEvaluableError for unsuitable splats. Raises WriteError, leaving no file, for
+    errors above the format's rounding, or an exact format that looks different.
     """
     source = _splat_file(request.scene)
     out = request.out or _beside(request.scene)
@@ -110,7 +109,7 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     if os.path.realpath(out) == os.path.realpath(source):
         raise UsageError(f"{out}: is the input itself", remedy="give another --out")
     splats, comments, exact = read_source(source)
-    check_no_shell(source, comments)  # most formats would lose what tells it from surfaces
+    check_no_shell(source, comments)  # most formats would lose the mark that separates it from surfaces
     _check_colors(source, splats)
     is_chosen = np.isin(splats.labels, [*Label] if request.labels is None else list(request.labels))
     selected, exact = (splats, exact) if request.labels is None else (splats.select(is_chosen), exact[is_chosen])
@@ -174,7 +173,7 @@ def _format(out: Path, layout: str | None) -> SplatFormat:
 
 
 def _check_colors(source: Path, splats: Splats) -> None:
-    """Raise InputError naming the first splat whose colour no picture has: beside it float32 loses the others."""
+    """Raise InputError for a colour so large that float32 would lose the others."""
     colors = splats.colors if isinstance(splats, SplatSet) else splats.harmonics.reshape(len(splats), -1)
     largest = np.abs(colors).max(axis=1, initial=0.0)
     refuse(str(source), "colour", largest, largest > EXPORT_MAX_COLOR, f"at most {EXPORT_MAX_COLOR:g}")
@@ -183,7 +182,7 @@ def _check_colors(source: Path, splats: Splats) -> None:
 def _written(
     partial: Path, kind: SplatFormat, splats: Splats, comments: Mapping[str, str]
 ) -> tuple[Splats, Comments]:
-    """Write the splats and return what reads back; isotropic ones in a PLY keep their density."""
+    """Write the splats and read them back; isotropic ones in a PLY keep their density."""
     if isinstance(splats, SplatSet) and kind is FORMATS[".ply"]:
         write_ply(partial, splats, comments)
         return read_ply(partial)
@@ -220,7 +219,6 @@ def _checked_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) ->
 
 
 def _not_kept(source: Splats, back: Splats, held: GaussianSet) -> list[str]:
-    """What the source has and the format has no place for."""
     lost = []
     if (source.labels != back.labels).any():
         lost.append("labels")
@@ -238,7 +236,7 @@ def _num_outside(source: GaussianSet, held: GaussianSet) -> int:
 
 
 def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
-    """Render both sets from around `a`: their largest difference, PSNR and covered share, as in `ExportResult`."""
+    """Render both sets around `a`: largest difference, PSNR, covered share."""
     intrinsics, poses, size = _views(a.centers)
     largest, covered, squared = 0.0, 0.0, 0.0
     for T_world_camera in poses:
@@ -257,7 +255,7 @@ def _render(splats: Splats, intrinsics: Intrinsics, T_world_camera: Float64) -> 
 
 
 def _views(centers: Float32) -> tuple[Intrinsics, Sequence[Float64], float]:
-    """Cameras evenly around the box that holds most of the splats, from above, and that box's diagonal [m]."""
+    """Cameras around and above the box of most splats, and its diagonal [m]."""
     lower, upper = np.percentile(centers.astype(np.float64), [2, 98], axis=0)
     middle, size = (lower + upper) / 2, max(float(np.linalg.norm(upper - lower)), 0.1)
     width, height = IMAGE_SIZE
@@ -267,26 +265,26 @@ def _views(centers: Float32) -> tuple[Intrinsics, Sequence[Float64], float]:
     return intrinsics, [look_at(middle + size * direction, middle) for direction in directions], size
 
 
-FREE_BELOW, OCCUPIED_ABOVE = 0.3, 0.7  # of snapshots, whose log-odds say nothing finer
+FREE_BELOW, OCCUPIED_ABOVE = 0.3, 0.7  # for snapshots, whose log-odds are coarse
 CLOUD, SPACE, DISTANCE, TRANSFORMS = "/splats", "/known_space", "/distance", "/tf"
 MESHES, EVENTS, CLEARANCE = "/arm", "/events", "/clearance"
-Later = tuple[int, int, Callable[[FoxgloveLog], None]]  # stamp [ns], place among those of one stamp, what to write
+Later = tuple[int, int, Callable[[FoxgloveLog], None]]  # stamp [ns], order within a stamp, writer
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRunRequest(FolderRequest):
-    """One export of `path`, the folder of a replay, a scene or a field, into the MCAP `out`, None for PATH.mcap."""
+    """One export of a replay, scene or field folder to MCAP; out: None for PATH.mcap."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRunResult(WrittenFile):
-    """The file, and how many messages each topic has."""
+    """The file, and its messages by topic."""
 
     messages: dict[str, int]
 
 
 def export_run(request: ExportRunRequest) -> ExportRunResult:
-    """Write the MCAP. Raises InputError for a folder of another kind, and UsageError where a library is missing."""
+    """Write the MCAP. Raises InputError for another folder, UsageError for a missing library."""
     parts = sorted(_parts(open_run(request.path), request.roots), key=lambda part: part[:2])
     name = request.path.absolute()
     out = request.out or name.with_name(f"{name.name}.mcap")
@@ -337,7 +335,6 @@ def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> It
 
 
 def _known_parts(known: Sequence[tuple[int, Snapshot]]) -> Iterator[Later]:
-    """The splats of every snapshot from a stamp [ns] on, and of a few of them, evenly, what is known of space."""
     few = {known[i][0] for i in spread([1e-9 * (stamp - known[0][0]) for stamp, _ in known], math.inf)}
     for stamp, snapshot in known:
         yield stamp, 0, partial(_cloud, stamp, snapshot)

@@ -1,1 +1,1 @@
-"""Distances at given points."""
+"""Queries of fields."""

@@ -1,4 +1,4 @@
-"""A query from its request to its result: what a field or a scene answers at the points of a table."""
+"""A query: answers of a field or scene at points of a table."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -48,12 +48,11 @@ _DECIMALS = 7  # of a length [m]: finer than float32
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Answers at Q points, world frame: None where no point has one, NaN or -1 where a single point has none.
+    """Answers at Q points, world; None if unavailable, NaN or -1 where a point has none.
 
-    in_box (Q,): in the box that was asked; distance (Q,) [m] and its gradient (Q, 3); bound (Q,) [m]: a lower
-    bound on the exact distance to the splats; probability (Q,) of collision; label (Q,) `Label` and splat (Q,), the
-    index in the scene's file, of the nearest sphere; observed (Q,) `VoxelState`; surface (Q, 3) [m], where sphere
-    marching ended, and rest (Q,) [m], what the field reads there.
+    in_box (Q,). distance (Q,) [m], gradient (Q, 3). bound (Q,) [m]: lower bound of the exact distance to the splats.
+    probability (Q,) of collision. label (Q,) `Label` and splat (Q,), file index, of the nearest sphere. observed (Q,)
+    `VoxelState`. surface (Q, 3) [m]: end of sphere marching, where the field reads rest (Q,) [m].
     """
 
     in_box: Bool | None = None
@@ -69,7 +68,7 @@ class Answers:
 
 
 class SceneAnswers:
-    """The splats of a scene, and balls around occupied voxels that have no splat, as a field by `config`."""
+    """A scene's splats and balls around unrepresented voxels, as a field by `config`."""
 
     def __init__(
         self,
@@ -79,8 +78,9 @@ class SceneAnswers:
         threads: int,
         device: Memory | None = None,
     ) -> None:
-        """device: a card that computes the distances. Raises UsageError where unknown space is to count as something:
-        only a grid knows it.
+        """Build the fields, on the card `device` if given.
+
+        Raises UsageError if unknown space counts: only a grid has it.
         """
         if config.field.unknown != "free":
             raise UsageError(
@@ -107,7 +107,7 @@ class SceneAnswers:
         self._reach = float(np.abs(splats.centers - self._spheres.points.anchor).max())
 
     def at(self, points: Float64) -> Answers:
-        """All answers at points (Q, 3) [m], world."""
+        """Answer at points (Q, 3) [m], world."""
         distance, gradient = self._field.query(points)
         nearest = self._exact.nearest(points)
         walked = march(self._field, self._exact, points, steps=MARCH_STEPS)
@@ -126,7 +126,7 @@ class SceneAnswers:
         )
 
     def complete(self, points: Float64, of_grid: Answers) -> Answers:
-        """Add the scene's answers to those of a grid; the probability is that of the grid's distance."""
+        """Add the scene's answers to a grid's; probability is at the grid's distance."""
         mine = self.at(points)
         probability = self._probability.at(points, of_grid.distance)
         return replace(
@@ -140,10 +140,10 @@ class SceneAnswers:
 
 
 class GridAnswers:
-    """The channels of a baked grid: distances between its cells' centres, labels and observations of the nearest."""
+    """Channels of a baked grid: interpolated distances, labels and observations of the nearest cell."""
 
     def __init__(self, grid: DistanceGrid, where: str) -> None:
-        """Raises InputError as `GridField` does, and for a cell with an unknown label or state."""
+        """Read the channels. Raises InputError as `GridField` does, and for unknown labels or states."""
         self._field = GridField(grid)
         self.box = self._field.box
         self._has_bound = "bound" in grid.channels
@@ -158,7 +158,7 @@ class GridAnswers:
             self._cells[name] = partial(observed_at, values, grid.origin, grid.voxel)
 
     def at(self, points: Float64) -> Answers:
-        """The grid's answers at points (Q, 3) [m], world; none outside the box of the cell centres."""
+        """Answer at points (Q, 3) [m], world; none outside the box of cell centres."""
         inside = self._field.contains(points)
         distance, gradient = self._field.query(points)
         probability = None if self._probability is None else self._probability.query(points)[0]
@@ -178,7 +178,7 @@ class GridAnswers:
 
 
 def rows_of(points: Float64, answers: Answers) -> str:
-    """Lines of CSV, a cell for each of `TITLES`, empty where the answer is not known."""
+    """CSV lines with a cell for each of `TITLES`, empty where unknown."""
     length, a = f"%.{_DECIMALS}f", answers
     bound = None if a.bound is None else np.floor(a.bound * 10**_DECIMALS) / 10**_DECIMALS  # in print a bound still
     splat = None if a.splat is None else np.where(a.splat < 0, "", a.splat.astype(str))
@@ -201,7 +201,7 @@ def rows_of(points: Float64, answers: Answers) -> str:
 
 
 STANDARD_INPUT = "standard input"
-OF_GRID = {  # settings of the field by the name that a grid's header gives them
+OF_GRID = {  # field settings: name and type in a grid's header
     "distance": ("distance", str),
     "length_scale": ("length_scale", float),
     "noise": ("noise", float),
@@ -212,12 +212,11 @@ OF_GRID = {  # settings of the field by the name that a grid's header gives them
 
 @dataclass(frozen=True, kw_only=True)
 class QueryRequest(RunOptions):
-    """One table of points to ask `source`, a field folder, a ``field.npz``, a scene folder or a file of splats.
+    """One table of points for `source`: a field folder, ``field.npz``, scene folder or splat file.
 
-    points: a CSV file with columns x, y, z [m], world, or an open text. out: the CSV of the answers, None for the
-    figures alone. scene: of a field, the scene that it was baked from, which knows what the grid does not. at: the
-    scene as known that long after its start [s], None for its end. labels: of the splats that count; of a field those
-    that it was baked of. device: where a scene's distances are computed, as of --device.
+    points: a CSV with columns x, y, z [m], world, or an open text. out: None for figures alone. scene: source of the
+    field, for what the grid lacks. at: time after the scene's start [s], None for its end. labels: of the splats that
+    count; a field has its own. device: for a scene's distances.
     """
 
     source: Path
@@ -230,9 +229,10 @@ class QueryRequest(RunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class QueryResult:
-    """kind: scene, field, or field and scene. metrics: num_points, num_answered (with a distance), num_outside the
-    box, num_in_collision (at a distance of 0 or less), num_never_seen (None where it is not known), min_distance,
-    mean_distance and min_bound [m], None without any. notes: what a person should know; seconds: of each stage.
+    """A query's figures; kind: scene, field, or field and scene.
+
+    metrics: num_points; num_answered, with a distance; num_outside the box; num_in_collision, at a distance of at
+    most 0; num_never_seen; min_distance, mean_distance and min_bound [m]. None if unknown.
     """
 
     out: Path | None
@@ -243,9 +243,9 @@ class QueryResult:
 
 
 def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
-    """Answer the points, and write the answers where they are asked for.
+    """Answer the points, and write the answers to `out`.
 
-    Raises SplatCtrlError for a source or a table that cannot be read or answered, and then leaves no file.
+    Raises SplatCtrlError, leaving no file, for an unreadable source or table.
     """
     stopwatch, figures = Stopwatch(), _Figures()
     with ExitStack() as stack:
@@ -276,9 +276,7 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
 
 @dataclass(frozen=True, kw_only=True)
 class _Asked:
-    """The source of the answers: its kind, its box if any, whether it is a grid (no distance outside its box), and
-    the device of a scene.
-    """
+    """Source of the answers; a grid has no distance outside its box."""
 
     kind: str
     at: Callable[[Float64], Answers]
@@ -323,12 +321,11 @@ def _asked(request: QueryRequest, progress: Progress) -> _Asked:
 
 
 def _is_enough(points: Path | TextIO) -> bool:
-    """Whether the table has enough points for a card to be faster."""
     return isinstance(points, Path) and points.is_file() and points.stat().st_size >= CARD_LEAST_TABLE
 
 
 def _grid_file(source: Path) -> Path | None:
-    """The ``field.npz`` of a field; None for what is to be a scene. Raises InputError for a field without one."""
+    """``field.npz`` of a field, None for a scene. Raises InputError for a field without it."""
     if source.is_file() and source.suffix == ".npz":
         return source
     file = source / "field.npz"
@@ -347,7 +344,6 @@ def _scene(
 
 
 def _blocks(points: Path | TextIO, progress: Progress) -> Iterator[Float64]:
-    """The points of a table; a bar shows how much of a file is read."""
     hidden = True if progress.is_quiet else None
     if not isinstance(points, Path):
         with tqdm(unit=" points", disable=hidden) as bar:
@@ -371,15 +367,12 @@ def _blocks(points: Path | TextIO, progress: Progress) -> Iterator[Float64]:
 
 
 class _Figures:
-    """Counts and extremes over the blocks."""
-
     def __init__(self) -> None:
         self._num = Counter[str]()
         self._sum, self._least, self._least_bound = 0.0, np.inf, np.inf
         self._knows_seen = True
 
     def add(self, answers: Answers) -> None:
-        """Count a block."""
         distance = answers.distance[~np.isnan(answers.distance)]
         bounds = distance[:0] if answers.bound is None else answers.bound[~np.isnan(answers.bound)]
         self._num.update(
@@ -395,7 +388,6 @@ class _Figures:
         self._least_bound = min(self._least_bound, float(bounds.min(initial=np.inf)))
 
     def metrics(self) -> dict[str, float | None]:
-        """The metrics of `QueryResult`."""
         num = self._num
         return {
             "num_points": num["points"],
@@ -409,7 +401,6 @@ class _Figures:
         }
 
     def notes(self, asked: _Asked) -> tuple[str, ...]:
-        """Notes about points without a distance, and about points that no camera saw."""
         num, notes = self._num, []
         if num["outside"] and asked.box is not None:
             lower, upper = (", ".join(f"{x:.4g}" for x in corner) for corner in (asked.box.lower, asked.box.upper))

@@ -1,1 +1,1 @@
-"""Maps made of recordings."""
+"""Reconstructions of recordings."""

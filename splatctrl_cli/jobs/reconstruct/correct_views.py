@@ -1,4 +1,4 @@
-"""``--refine-poses`` and ``--refine-exposure``: views of a still scene corrected by each other."""
+"""``--refine-poses`` and ``--refine-exposure``: correct a still scene's views by each other."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ from splatctrl_cli.scene.scale import RecordedDepth
 
 @dataclass(frozen=True, kw_only=True)
 class Corrections:
-    """What of the views of a still scene is corrected."""
+    """Kinds of correction of a still scene's views."""
 
     poses: bool = False
     exposure: bool = False
@@ -36,7 +36,7 @@ class Corrections:
 
     @property
     def options(self) -> str:
-        """As they are given."""
+        """Command-line form."""
         return " ".join(
             n for n, given in (("--refine-poses", self.poses), ("--refine-exposure", self.exposure)) if given
         )
@@ -52,10 +52,9 @@ class Corrections:
     def of(
         self, frames: Sequence[RgbdFrame], name: str, console: Progress, *, has_robot: bool = False
     ) -> tuple[list[RgbdFrame], dict[str, Any]]:
-        """The corrected frames, and what ``run.json`` says of it. name: of the recording. has_robot: what is judged
-        by the map, so that depth stays as it was measured.
+        """Correct the frames; also return the facts for ``run.json``.
 
-        Raises InputError where there is no depth that could tell.
+        has_robot: depth stays as measured, since the map will judge. Raises InputError without depth.
         """
         if not self:
             return list(frames), {}
@@ -113,7 +112,7 @@ def _posed(
 
 
 def _told(bends: FoundBends, scale: float, apart: float, after: float, console: Progress) -> dict[str, Any]:
-    """What is said of the bends; apart, after [m]: the views by poses alone, and with the bends."""
+    """Log and describe depth bends; apart, after [m]: residuals without and with them."""
     depth = scale * fixed.SCALE_DEPTH
     rows = {
         camera: {
@@ -147,7 +146,7 @@ def _gains(frames: list[RgbdFrame], scale: float, console: Progress) -> Float64:
 
 
 def corrected(frame: RgbdFrame, corrections: Mapping[tuple[str, int], ViewCorrection]) -> RgbdFrame:
-    """The frame as a scene's training corrected it, where it did."""
+    """Apply a scene's training correction to a frame, if any."""
     row = corrections.get((frame.camera, frame.stamp_ns))
     if row is None:
         return frame
@@ -159,9 +158,7 @@ def corrected(frame: RgbdFrame, corrections: Mapping[tuple[str, int], ViewCorrec
 def corrected_among(
     frame: RgbdFrame, others: Sequence[RgbdFrame], corrections: Mapping[tuple[str, int], ViewCorrection]
 ) -> RgbdFrame:
-    """The frame corrected in the same respects by other views, which are corrected and stay; its own correction where
-    it trained.
-    """
+    """Correct a frame against already corrected views; a training frame gets its own correction."""
     if (frame.camera, frame.stamp_ns) in corrections:
         return corrected(frame, corrections)
     depth = RecordedDepth.of(others)
@@ -181,7 +178,7 @@ def corrected_among(
 def _bend_of(
     frame: RgbdFrame, others: Sequence[RgbdFrame], corrections: Mapping[tuple[str, int], ViewCorrection]
 ) -> Float64 | None:
-    """That of the frame's own camera; of a view held out, that of the only camera with its intrinsics."""
+    """Bend of the frame's camera; held-out views use the only camera with their intrinsics."""
     cameras = {other.camera for other in others if other.intrinsics == frame.intrinsics}
     camera = frame.camera if frame.camera != HOLDOUT or len(cameras) != 1 else cameras.pop()
     return next((row.bend for (name, _), row in corrections.items() if name == camera), None)

@@ -1,6 +1,6 @@
-"""Which time steps leave a map: those that are due, and those that show something new.
+"""Time steps that leave a map: those due, and those with a new obstacle.
 
-A thing that comes and goes between two maps would be in neither of them, and a replay would call safe what it hit.
+An obstacle present only between two maps would otherwise escape a replay.
 """
 
 from dataclasses import dataclass
@@ -22,16 +22,14 @@ from splatctrl_cli.voxels import Balls, OccupancyGrid
 
 
 class KeptMaps:
-    """Decides over the snapshots of a writer; of what was kept it knows no more than the files, so that a run that
-    was interrupted goes on as it would have.
-    """
+    """Decisions on snapshots by written files alone, so a resumed run decides the same."""
 
     def __init__(self, writer: SceneWriter, config: Config) -> None:
         self._writer, self._config = writer, config
         self._last: _Map | None = None
 
     def is_due(self, index: int, stamp_ns: int) -> bool:
-        """Every `snapshot_every` time steps, and then only if a multiple of `snapshot_period` has passed since."""
+        """True every `snapshot_every` steps, once per `snapshot_period`."""
         scene, taken = self._config.scene, self._writer.snapshots
         if index % scene.snapshot_every:
             return False
@@ -42,8 +40,9 @@ class KeptMaps:
         return (stamp_ns - first) // period_ns > (last - first) // period_ns
 
     def shows_news(self, fitter: SceneFitter) -> bool:
-        """Whether the map has at least `NEWS_LEAST` spheres that may be a new thing: they stand out of those of the
-        last map that was kept by more than half a voxel, in voxels that were free in it.
+        """True if at least `NEWS_LEAST` spheres may be a new obstacle.
+
+        They exceed the last kept map's by half a voxel, in voxels free there.
         """
         if not self._writer.snapshots:
             return False
@@ -58,7 +57,7 @@ class KeptMaps:
 
 @dataclass(frozen=True, kw_only=True)
 class _Map:
-    """One that was kept; without a field where it holds no obstacle."""
+    """A kept map; no field without obstacles."""
 
     path: Path
     field: SphereField | None
@@ -70,7 +69,6 @@ class _Map:
         return cls(path=path, field=field, states=states)
 
     def num_new(self, spheres: SplatSet) -> int:
-        """How many of later spheres are new to it."""
         grid, centers = self.states, spheres.centers.astype(np.float64)
         cells = np.floor((centers - grid.origin) / grid.voxel + 0.5).astype(np.int64)
         is_inside = np.all((cells >= 0) & (cells < grid.log_odds.shape), axis=1)
@@ -83,7 +81,6 @@ class _Map:
 
 
 def _spheres(splats: SplatSet, balls: Balls | None) -> SplatSet | None:
-    """The obstacles of a map, None where it has none."""
     try:
         return obstacle_spheres(splats, balls).splats
     except NotEvaluableError:

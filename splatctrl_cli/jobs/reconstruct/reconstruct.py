@@ -1,4 +1,4 @@
-"""A reconstruction from its request to its result: a recording into splats, occupancy, audit and snapshots."""
+"""A reconstruction: recording to splats, occupancy, audit and snapshots."""
 
 from collections.abc import Mapping
 from contextlib import closing
@@ -29,9 +29,7 @@ from splatctrl_cli.robot.urdf import UrdfFile
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructResult:
-    """The scene folder `out`, its metrics and verdict as in ``run.json``, splats removed by reason, and wall time by
-    stage [s].
-    """
+    """The scene folder, metrics, verdict, removed splats by reason, and seconds by stage."""
 
     __repr__ = brief
 
@@ -43,10 +41,7 @@ class ReconstructResult:
 
 
 def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> ReconstructResult:
-    """Reconstruct into the output folder, or go on with what an interrupted run left of it.
-
-    Raises SplatCtrlError for a recording that cannot be reconstructed.
-    """
+    """Reconstruct into the output folder, or continue an interrupted run. Raises SplatCtrlError."""
     check_gate_names(request.require, GATED)
     training_cameras(request.source)
     device = FitDevice(request.device)
@@ -127,10 +122,9 @@ def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[st
 def _learned(
     robot: RobotModel | None, request: ReconstructRequest, folder: Path, progress: Progress, *, is_new: bool
 ) -> tuple[RobotModel | None, dict[str, dict[str, Any]]]:
-    """The robot with its self-model, and `displaced_cameras`.
+    """Add the self-model to the robot, and find `displaced_cameras`.
 
-    The self-model is kept in the scene's folder: the one given, or that of the run that goes on, or what the
-    recording shows.
+    The scene's folder keeps the self-model: the given one, the resumed run's, or what the recording shows.
     """
     if robot is None:
         return None, {}
@@ -150,7 +144,7 @@ def _learned(
 
 
 def declarations_of(path: Path | None, robot: RobotModel | None) -> Declarations:
-    """What a file declares; nothing without one. Raises UsageError where there is no robot that it could be of."""
+    """Read declarations, none without a file. Raises UsageError without a robot."""
     if path is None:
         return Declarations()
     if robot is None:
@@ -159,7 +153,6 @@ def declarations_of(path: Path | None, robot: RobotModel | None) -> Declarations
 
 
 def _goes_on(request: ReconstructRequest, checkpoint_file: Path, progress: Progress) -> bool:
-    """Whether there is a checkpoint to go on from, and that was asked for."""
     partial = partial_path(request.out)
     if request.resume and not checkpoint_file.is_file():
         progress.log(f"{partial}: has no checkpoint to continue from; starts at the beginning")
@@ -169,7 +162,6 @@ def _goes_on(request: ReconstructRequest, checkpoint_file: Path, progress: Progr
 
 
 def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None:
-    """The request's robot, with what a person should know of it said."""
     urdf = urdf_of(request.urdf, [request.recording] if request.recording else [], progress)
     if urdf is None:
         for option, path in (("spheres", request.spheres), ("self-model", request.self_model)):
@@ -204,7 +196,7 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
 
 
 def _check_fits(urdf: UrdfFile, source: RecordSource) -> None:
-    """Raise InputError where a robot that nobody named would stand elsewhere than it did, or would not move."""
+    """Raise InputError if the log's own robot would stand elsewhere or not move."""
     if words := other_frame(urdf, source):
         raise InputError(
             f"{urdf.path}: {words}", remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one"

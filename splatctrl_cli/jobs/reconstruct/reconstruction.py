@@ -1,4 +1,4 @@
-"""The fitter over a source's time steps, with what is written on the way and the checkpoints to go on from."""
+"""The fitter over a source's time steps, with outputs and checkpoints."""
 
 import math
 import time
@@ -34,13 +34,13 @@ from splatctrl_cli.scene.scale import RecordedDepth, fitted_to, in_words
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import AuditRow, TimeStep, cloud_box, depth_box, time_steps
 
-LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
+LONGEST_SHARE = 50  # a checkpoint waits 50 times as long as the last one took: below 2 % of the run
 
-KEPT = ("num_read", "is_refined", "first_frames", "corrected")  # attributes that a checkpoint keeps as they are
+KEPT = ("num_read", "is_refined", "first_frames", "corrected")  # attributes a checkpoint stores unchanged
 
 
 def training_cameras(source: RecordSource) -> list[str]:
-    """The cameras that may train. Raises UsageError where there are none."""
+    """Cameras that may train. Raises UsageError without any."""
     cameras = [camera for camera in source.cameras if camera != "holdout"]
     if not cameras:
         raise UsageError(f"{source.name}: no camera is left to train on", remedy="camera 'holdout' is kept for score")
@@ -51,12 +51,10 @@ def training_cameras(source: RecordSource) -> list[str]:
 class ReconstructRequest(RunOptions):
     """One reconstruction of `source` into the folder `out`.
 
-    urdf, spheres: the robot, whose splats are told apart and whose reach is the workspace unless `box` is given;
-    without urdf the one that the log `recording` describes, where it does. points: a coloured cloud to start from,
-    instead of depth. declare: a TOML of what the robot carries. corrections: of the views of a still scene, by
-    each other. resume: go on with what an interrupted run left. device: where to compute, as of --device. require:
-    gates on its metrics. options: what else decides the bytes, by the names of the options: a run that is resumed
-    must have the same.
+    urdf, spheres: the robot, segmented from the splats; its reach is the workspace without `box`. By default it is
+    the robot of the log `recording`, if any. points: a coloured cloud to start from instead of depth. declare: a TOML
+    of carried objects. corrections: of a still scene's views. resume: continue an interrupted run. options: what else
+    decides the bytes, by option name; a resumed run must have the same.
     """
 
     source: RecordSource
@@ -78,11 +76,10 @@ class ReconstructRequest(RunOptions):
 
 
 class Reconstruction:
-    """One run of a request into `folder`; with `checkpoint` it goes on where that was written.
+    """One run of a request into `folder`, continued from `checkpoint` if given.
 
-    declared: what the robot carries. identity: plain values that a run which goes on must have in common with this
-    one. device: the processor unless given. observe: is shown every frame of the source on its way into time steps.
-    cameras_off: `displaced_cameras`, which are placed as they are corrected.
+    identity: plain values a continued run must share. observe: called with every frame of the source. cameras_off:
+    `displaced_cameras`, placed as corrected.
     """
 
     def __init__(
@@ -104,7 +101,7 @@ class Reconstruction:
         self.cloud = None if request.points is None else read_points(request.points)  # instead of depth
         self.identity = identity
         self.declared = declared or Declarations()
-        self._first_state_ns: int | None = None  # from which declared times count
+        self._first_state_ns: int | None = None  # declared times are relative to it
         self.cameras = training_cameras(self.source)
         comments = {"format": FORMAT, "frame": "world", "units": "m", "source": self.source.name}
         self.writer = SceneWriter(folder, comments, checkpoint)
@@ -112,13 +109,13 @@ class Reconstruction:
         self.fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []
         self.stamps: list[int] = []
-        self.repeats: Counter[str] = Counter()  # by camera, frames whose depth was that of the frame before
-        self.first_frames: dict[str, dict[str, Any]] = {}  # of each camera, what tells this recording from another
-        self.num_read = 0  # time steps of the source, those that were left out included
+        self.repeats: Counter[str] = Counter()  # frames with stale depth, by camera
+        self.first_frames: dict[str, dict[str, Any]] = {}  # by camera, to recognise this recording
+        self.num_read = 0  # time steps of the source, skipped ones included
         self.is_refined = False
-        self.corrected: dict[str, Any] = {}  # what was corrected of the views
-        self._early: TimeStep | None = None  # the first that said nothing of the workspace
-        self.depth: RecordedDepth | None = None  # by which the map's lengths were chosen
+        self.corrected: dict[str, Any] = {}  # corrections of the views
+        self._early: TimeStep | None = None  # the first step without a workspace
+        self.depth: RecordedDepth | None = None  # that chose the map's lengths
         allowed, still, guess = request.allow_disagreement, not self.source.has_clock, guessed_unit(self.source)
         self.agreement = CameraAgreement(self.source, is_allowed=allowed, is_still=still, guess=guess)
         self._saved_at, self._save_time = -float("inf"), 0.0
@@ -127,7 +124,7 @@ class Reconstruction:
             self._restore(checkpoint)
 
     def run(self, console: Progress) -> None:
-        """Step through what is left of the log."""
+        """Process the remaining log."""
         if self.fitter is not None:
             self.device.give(self.fitter, [view.frame for view in self.fitter.window.newest], console)
         self._step_through(console)
@@ -137,9 +134,9 @@ class Reconstruction:
             self._refine(self.fitter, console)
 
     def check_found(self) -> None:
-        """Raise InputError where the time steps so far gave no splat."""
+        """Raise InputError if no splat was made so far."""
         if self.fitter is None and self._early is not None:
-            self._workspace(self._early)  # says that there is no depth
+            self._workspace(self._early)  # raises: there is no depth
         if self.fitter is None:
             raise InputError(
                 f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
@@ -169,9 +166,7 @@ class Reconstruction:
             self._save_if_due()
 
     def take(self, step: TimeStep, console: Progress) -> AuditRow | None:
-        """Take in the next time step, with its snapshot where one is due; None for one that does not say yet where
-        the workspace is.
-        """
+        """Process the next time step, with a snapshot if due; None while the workspace is unknown."""
         index, self.num_read = self.num_read, self.num_read + 1
         needs_depth = self.request.box is None and self.robot is None and self.cloud is None  # for the workspace
         if self.fitter is None and not step.has_depth and needs_depth:
@@ -220,14 +215,14 @@ class Reconstruction:
         return row
 
     def _begin(self, step: TimeStep, console: Progress) -> SceneFitter:
-        """A fitter whose first time step this is to be."""
         fitter = self._new_fitter(self._workspace(step))
         self.device.give(fitter, step.frames, console)
         return fitter
 
     def _grow_budget(self, row: AuditRow, console: Progress) -> bool:
-        """Beside a robot, give a budget left at its default what the first time step lacked, and a quarter more; says
-        whether it did. What has no splat there is taken for a whole voxel.
+        """Enlarge a default budget that the first step exceeded next to a robot; True if so.
+
+        Without a splat, a whole voxel counts as occupied.
         """
         least = SceneConfig().max_splats
         if self.robot is None or not row.unmet or self.config.scene.max_splats != least:
@@ -245,14 +240,13 @@ class Reconstruction:
         self.is_refined = True
 
     def finish(self) -> None:
-        """Write what the end of the log left."""
+        """Write the final map."""
         assert self.fitter is not None
         fitter, stamp_ns = self.fitter, self.rows[-1].stamp_ns
         self.writer.finish(stamp_ns, fitter.splats(), fitter.known_voxels(), fitter.shell_splats())
         self._save(is_last=True)
 
     def metrics(self) -> dict[str, object]:
-        """For ``run.json`` and gates."""
         assert self.fitter is not None
         last = self.rows[-1]
         learned = None if self.robot is None else self.robot.self_model
@@ -301,7 +295,6 @@ class Reconstruction:
         self.writer.audit(row)
 
     def snapshot(self, stamp_ns: int) -> None:
-        """Write the map as it is."""
         assert self.fitter is not None
         known, thresholds = self.fitter.known_voxels(), self.config.occupancy
         states = known.grid.states(thresholds.free_below, thresholds.occupied_above)
@@ -347,7 +340,7 @@ class Reconstruction:
         restore_fitter(self.fitter, checkpoint.state)
 
     def time_steps(self) -> Iterator[TimeStep]:
-        """Those of the source, from its beginning."""
+        """Time steps of the source, from its start."""
         records, has_clock = self.source.records(), self.source.has_clock
         steps = time_steps(records, self.cameras, has_clock=has_clock, observe=self._see, repeats=self.repeats)
         return steps if self.cloud is None else (step.without_depth() for step in steps)
@@ -360,7 +353,7 @@ class Reconstruction:
             self._first_state_ns = record.stamp_ns
 
     def _fit_to(self, depth: RecordedDepth | None, console: Progress = SILENT) -> None:
-        """Choose the map's lengths, or beside a robot its sensor's error, by the first frames that have depth."""
+        """Choose map lengths, or a robot's sensor error, by the first frames with depth."""
         if depth is None:
             return
         self.depth, before = depth, self.config
@@ -394,12 +387,11 @@ class Reconstruction:
         return posture_of(robot, robot.positions_of(names, step.position), at_frames, carried)
 
     def _seconds(self, stamp_ns: int) -> float:
-        """Since the first joint state, which time steps with a posture come after."""
+        """Time since the first joint state, which precedes steps with a posture."""
         assert self._first_state_ns is not None
         return (stamp_ns - self._first_state_ns) * 1e-9
 
     def _count_carried(self, step: TimeStep, posture: RobotPosture | None) -> None:
-        """Count which declared boxes the frames needed."""
         if posture is None or not self.declared.carried or self.robot is None:
             return
         seconds = self._seconds(step.stamp_ns)

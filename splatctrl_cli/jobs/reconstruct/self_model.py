@@ -1,4 +1,4 @@
-"""The job of `robot learn`: it chooses frame sets in which the arm has moved, and fuses what they show of it."""
+"""Learning a robot's own surface: choose frame sets of distinct postures, and fuse them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -29,14 +29,14 @@ from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.sphere_files import own_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 
-MOST_MOMENTS = 2000  # of a recording, among which those are chosen that are read
+MOST_MOMENTS = 2000  # of a recording, to choose from
 
 
 @dataclass(frozen=True, kw_only=True)
 class LearnRequest(RobotOptions):
-    """Learn the self-model of the robot `urdf` from `log` into the file `out`.
+    """Learn the self-model of the robot `urdf` from `log` into `out`.
 
-    reach [m]: how far outside of a link's visual surface its parts are looked for.
+    reach [m]: how far outside a link's visual surface parts are sought.
     """
 
     log: Path
@@ -48,7 +48,7 @@ class LearnRequest(RobotOptions):
 
 
 def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel:
-    """Learn and write the self-model. Raises InputError for a recording that shows no link moving."""
+    """Learn and write the self-model. Raises InputError if no link moves."""
     model = RobotModel.from_urdf(
         request.urdf,
         request.spheres or own_spheres(read_urdf(request.urdf)),
@@ -69,13 +69,14 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
 
 
 def arm_of(model: RobotModel, source: FrameSource) -> Arm:
-    """The robot with the joint positions of a log that moves its joints."""
+    """The robot with a log's joint positions."""
     return Arm(model, source.states.of_log(*model.joint_columns(source.joint_names)).postures(STATES_CLOSE_NS))
 
 
 def arm_seen(model: RobotModel, source: RecordSource, progress: Progress) -> tuple[Arm, list[RgbdFrame]] | None:
-    """`arm_of` a log and `frames_of` it; None where meshes do not draw the robot, no log moves it, or no frame shows
-    it posed, which is said.
+    """`arm_of` a log and its `frames_of`.
+
+    None without meshes, a log that moves the robot, or posed frames (logged).
     """
     if not isinstance(source, LOGGED) or not source.joint_names or not model.surface.trees:
         return None
@@ -88,14 +89,15 @@ def arm_seen(model: RobotModel, source: RecordSource, progress: Progress) -> tup
 
 
 def learn_from(arm: Arm, frames: Sequence[RgbdFrame], name: str, reach: float = REACH) -> SelfModel:
-    """The self-model by frames that the arm is posed in. Raises InputError where no link can be learned."""
+    """Learn the self-model from posed frames. Raises InputError if no link can be learned."""
     poses = np.array([arm.surface_poses(frame.stamp_ns) for frame in frames])
     return learn(arm.surface, arm.model.urdf.links, frames, poses, name=name, reach=reach)
 
 
 def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> list[RgbdFrame]:
-    """Frames of the moments between which the arm moved farthest, by stamp. Raises InputError where it is posed in
-    none.
+    """Frames of the moments with the most motion between them, by stamp.
+
+    Raises InputError if no frame is posed.
     """
     stamps = stamps_by_camera(source)
     stamps = {camera: its for camera, its in stamps.items() if camera in training_cameras(source)}

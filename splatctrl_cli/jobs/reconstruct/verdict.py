@@ -1,4 +1,4 @@
-"""The verdict of a reconstruction: whether there is a map, and what speaks against it, with when and where."""
+"""The verdict of a reconstruction."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from splatctrl_cli.records import LossReport
 from splatctrl_cli.robot.declared_contact import carried_words
 from splatctrl_cli.scene.time_steps import AuditRow
 
-UNREPRESENTED = Scale(better=Better.LOWER, absolute=8, relative=0.05)  # voxels; by six four seeds are apart
+UNREPRESENTED = Scale(better=Better.LOWER, absolute=8, relative=0.05)  # voxels; four seeds differ by six
 GATED = {
     **dict.fromkeys(("time_steps", "iterations", "splats", "robot_splats", "added", "relocated"), DESCRIBES),
-    **dict.fromkeys(("unmet", "evicted"), DESCRIBES),  # more iterations ask for more slots
+    **dict.fromkeys(("unmet", "evicted"), DESCRIBES),  # more iterations need more slots
     "unrepresented_voxels": UNREPRESENTED,
     "unrepresented_volume": Scale(unit="m3", better=Better.LOWER, absolute=1e-4, relative=0.05),
     "max_unrepresented_voxels": UNREPRESENTED,
@@ -28,15 +28,13 @@ GATED = {
     "exposure_spread": DESCRIBES,
     "loss": Scale(better=Better.LOWER, absolute=1e-3, relative=0.02),
     "psnr": DECIBELS,
-}  # what --require can name, and how two runs are compared by it
+}  # figures --require can name, with their comparison scales
 LONGEST_BLIND = 1.0  # [s] as long as a replay takes what it knows for evidence
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstructed:
-    """What the criteria look at: the metrics of ``run.json``, the audit's rows, and what the input lost. is_seeded:
-    from points, so that nobody looked at depth.
-    """
+    """Input of the criteria; is_seeded: from points, so depth was not used."""
 
     metrics: Mapping[str, Any]
     rows: Sequence[AuditRow]
@@ -46,12 +44,12 @@ class Reconstructed:
     learned: Sequence[str] = ()
 
     def seconds(self, stamp_ns: int) -> float:
-        """From the first time step [s]."""
+        """Time since the first step [s]."""
         return (stamp_ns - self.rows[0].stamp_ns) * 1e-9
 
 
 def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
-    """The verdict on a reconstruction: every criterion, and each ``--require``."""
+    """Judge a reconstruction by every criterion and each ``--require``."""
     metrics, counts = made.metrics, counts_of(made)
     reasons = [reason for criterion in (_map, _blind, _calibration, _inside) for reason in criterion(made)]
     return verdict_of(
@@ -69,7 +67,7 @@ def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
 
 
 def counts_of(made: Reconstructed) -> dict[str, int]:
-    """What each of `GATED` rests on: time steps, or pixels of the robot."""
+    """Time steps or robot pixels behind each of `GATED`."""
     links = made.metrics["self_mask"].values()
     seen = [row["num_pixels"] for row in links]
     return dict.fromkeys(GATED, len(made.rows)) | {
@@ -83,9 +81,6 @@ def counts_of(made: Reconstructed) -> dict[str, int]:
 
 
 def _notes(metrics: Mapping[str, Any], loss: LossReport) -> Iterator[Reason]:
-    """The views whose poses could not be put right, the cameras whose depth is not what they measured, and what the
-    input lost.
-    """
     held = metrics.get("poses", {}).get("held", [])
     if held:
         shown = ", ".join(held[:3]) + (f" and {len(held) - 3} more" if len(held) > 3 else "")
@@ -98,7 +93,6 @@ def _notes(metrics: Mapping[str, Any], loss: LossReport) -> Iterator[Reason]:
 
 
 def _map(made: Reconstructed) -> Iterator[Reason]:
-    """Whether there is anything that a distance could be taken to: splats, and occupied voxels without one."""
     metrics, num = made.metrics, made.metrics["unrepresented_voxels"]
     num_splats = metrics["splats"] - metrics["robot_splats"]
     is_empty = num_splats + num == 0
@@ -125,7 +119,7 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
 
 
 def _blind(made: Reconstructed) -> Iterator[Reason]:
-    """Cameras that repeated their depth, or returned none for longer than evidence lasts."""
+    """Cameras with stale depth, or none for longer than evidence lasts."""
     for camera, num in made.metrics["repeated_frames"].items():
         yield noted("depth", f"camera {camera}: {num} frames repeat the depth of the one before: left out")
     without = made.metrics["frames_without_depth"]
@@ -152,7 +146,7 @@ def _blind(made: Reconstructed) -> Iterator[Reason]:
 
 
 def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
-    """By camera, the first and last stamp [ns] of its longest stretch of time steps without any depth."""
+    """First and last stamp [ns] of each camera's longest stretch without depth."""
     since: dict[str, int] = {}
     longest: dict[str, tuple[int, int]] = {}
     for row in rows:
@@ -165,7 +159,7 @@ def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
 
 
 def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
-    """The note on one of `displaced_cameras` that is off as recorded, corrected or not."""
+    """Note on a displaced camera, corrected or not."""
     sentence = f"{camera} sees the robot {row['distance_mm']:.1f} mm from where its joints put it"
     if is_corrected(row):
         sentence += f"; its pose is corrected to within {row['left_mm']:.1f} mm"
@@ -182,7 +176,6 @@ def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
 
 
 def _calibration(made: Reconstructed) -> Iterator[Reason]:
-    """Measured against rendered depth of the robot, by camera and by link."""
     for camera, row in made.metrics["displaced_cameras"].items():
         if is_displaced(row):
             yield displaced_camera(camera, row)
@@ -209,7 +202,6 @@ def _calibration(made: Reconstructed) -> Iterator[Reason]:
 
 
 def _inside(made: Reconstructed) -> Iterator[Reason]:
-    """Measured points inside the robot that its surface does not explain."""
     num, link = made.metrics["inside_robot_points"], made.metrics["inside_robot_first_link"]
     if num:
         yield note(

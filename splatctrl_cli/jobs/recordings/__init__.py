@@ -1,1 +1,1 @@
-"""Which recording a job reads, and whether a scene was made from it."""
+"""Recordings of jobs, and their match with scenes."""

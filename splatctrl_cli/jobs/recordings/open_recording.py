@@ -1,4 +1,4 @@
-"""Which recording a job trains on or compares with, how it is opened, and whether what its cameras saw agrees."""
+"""Recordings opened to train on or score, and checked for agreement."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
@@ -27,12 +27,11 @@ from splatctrl_cli.scene.time_steps import TimeStep
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingRequest:
-    """path: a log, a capture or an image folder, or a DTU data set, of whose scans it is `scan` (None: the only one).
+    """A recording at `path`: log, capture, image folder, or DTU data set.
 
-    options: how it is read; of a scan, its holdout alone. protocol: which views train and which are scored. masks,
-    depths: folders with what the layout of the scan lacks. downscale: by how much its images are made smaller (None:
-    down to the size of the protocol). beside: further logs of the same session, to score views of. Raises UsageError
-    for such beside an image folder.
+    scan: None for the only one. options: for a scan its holdout alone. protocol: training and scored views. masks,
+    depths: folders with what a scan lacks. downscale: None for the protocol's size. beside: more logs of the session;
+    UsageError with an image folder.
     """
 
     path: Path
@@ -57,9 +56,10 @@ def open_to_train(
     needs_depth: bool = True,
     allowed: Collection[str] = (),
 ) -> RecordSource:
-    """The recording without the views that it holds out. Raises UsageError for options that do not belong to it, and
-    InputError for a scan without depth, for a camera that jumps farther than `max_pose_jump` [m], and for what
-    `check` calls an error, but for `allowed` codes.
+    """Open the recording without held-out views.
+
+    Raises UsageError for foreign options. Raises InputError for a scan without depth, a camera jump above
+    `max_pose_jump` [m], and errors of `check`, except `allowed` codes.
     """
     if recording.is_dtu:
         scan = open_dtu(recording)
@@ -76,13 +76,12 @@ def open_to_train(
     check_pose_jumps(source, max_pose_jump)
     if needs_depth:
         jumps = () if max_pose_jump == POSE_JUMP else ("pose-jump",)
-        later = "agreement"  # asked by `CameraAgreement`, of the poses that the map is made with
+        later = "agreement"  # `CameraAgreement` checks it, with the map's poses
         refuse_errors(recording.path, recording.options, "reconstruct", (*allowed, *jumps, later))
     return source
 
 
 def open_dtu(recording: RecordingRequest) -> DtuSource:
-    """A scan of a DTU data set."""
     return DtuSource(
         recording.path,
         recording.scan,
@@ -97,7 +96,7 @@ def open_dtu(recording: RecordingRequest) -> DtuSource:
 def open_held_out(
     recording: RecordingRequest, *, needs_depth: bool = False
 ) -> tuple[FrameSource, ScoreProtocol, Split]:
-    """An image folder with the views held out that the protocol holdout:RULE names, by their places in it."""
+    """Open an image folder with the views of the protocol holdout:RULE held out, by position."""
     name, path = recording.protocol or "", recording.path
     protocol = score_protocol(name)
     if not is_folder_of_views(path) or not name.startswith("holdout:"):
@@ -116,24 +115,24 @@ def open_held_out(
 
 
 def is_folder_of_views(path: Path) -> bool:
-    """Whether a recording is images in a folder, by a TOML or in a dataset's layout; not a log, not a capture."""
+    """True for images in a folder, by a TOML or a dataset's layout."""
     return path.suffix == ".toml" or (not is_capture(path) and has_views(path))
 
 
 def guessed_unit(source: RecordSource) -> str:
-    """In which unit other than metres a recording's lengths look to be, in words; empty for most."""
+    """Guessed unit of lengths other than metres, in words; usually empty."""
     return source.guess if isinstance(source, ImageFolderSource) else ""
 
 
 def refuse_scan_options(recording: RecordingRequest) -> None:
-    """Raise UsageError for what belongs to a DTU scan where there is none."""
+    """Raise UsageError for DTU options without a DTU scan."""
     for name in ("scan", "depths", "downscale", "masks"):
         if getattr(recording, name):
             raise UsageError(f"--{name} {getattr(recording, name)}: only with --dtu", remedy="leave it out")
 
 
 def check_pose_jumps(source: FrameSource, limit: float) -> None:
-    """Raise InputError for a camera that is suddenly elsewhere; where nobody knows when, views may lie anywhere."""
+    """Raise InputError for a camera that jumps; views without times may lie anywhere."""
     if not limit > 0:
         raise UsageError(f"--max-pose-jump: expected metres, got {limit}")
     jump = largest_jump(source.poses()) if source.has_clock else None
@@ -148,10 +147,10 @@ def check_pose_jumps(source: FrameSource, limit: float) -> None:
 
 
 class CameraAgreement:
-    """disagreement [m]: of each pair of cameras that see enough of the same, how far apart they see it.
+    """Agreement of cameras; disagreement [m]: of each pair with enough shared view.
 
-    source: the recording. is_allowed: what does not fit is said, not refused. is_still: the scene does not move, so
-    that all views of a time step show the same. guess: in words, that the unit of lengths was guessed.
+    is_allowed: warn instead of refusing. is_still: views of a step show the same scene. guess: a guessed unit, in
+    words.
     """
 
     def __init__(self, source: RecordSource, *, is_allowed: bool, is_still: bool, guess: str = "") -> None:
@@ -160,9 +159,9 @@ class CameraAgreement:
         self._is_allowed, self._is_still, self._guess = is_allowed, is_still, guess
 
     def check(self, step: TimeStep, limits: OccupancyConfig, console: Progress) -> None:
-        """Compare once each pair of cameras, and of a still scene whether another depth scale would fit the views.
+        """Compare each pair of cameras once, and in a still scene the depth scale.
 
-        Raises InputError where cameras place surfaces too far apart, or views fit at another scale of depth only.
+        Raises InputError for surfaces too far apart, or views that fit at another depth scale only.
         """
         names = sorted(frame.camera for frame in step.frames)
         if {" and ".join(dict.fromkeys(pair)) for pair in combinations(names, 2)} <= self.disagreement.keys():
@@ -204,7 +203,7 @@ class CameraAgreement:
                 console.log(f"warning: {self._name}: {finding.what}")
 
     def _units(self) -> set[float | None]:
-        """Metres per count of depth, of each camera; None for sources that do not tell."""
+        """Depth units [m per count] of the cameras; None if unknown."""
         units = dict[str, float | None]()
         for frame in self._source.stored() if isinstance(self._source, LOGGED | ImageFolderSource) else ():
             if isinstance(frame, StoredFrame):

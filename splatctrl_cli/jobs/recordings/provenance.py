@@ -1,6 +1,6 @@
-"""Whether a scene or field, a log, a truth and a robot belong together, by what they contain.
+"""Matches of scene or field, log, truth and robot by content.
 
-Cameras are called alike on every rig, so that names say nothing.
+Camera names are alike on every rig and prove nothing.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,14 +32,14 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.unrepresented import agreement_with_grid
 from splatctrl_cli.simulate.truth import Truth
 
-TILES = (6, 8)  # rows and columns of the picture that is kept of a first frame
+TILES = (6, 8)  # rows and columns of a first frame's stored picture
 
 
 def first_frame(frame: RgbdFrame) -> dict[str, Any]:
-    """What ``run.json`` keeps of the first frame that a camera trained with.
+    """Facts of a camera's first training frame for ``run.json``.
 
-    intrinsics: fx, fy, cx, cy, width, height [px]; T_world_camera: 16 numbers by row; tiles: mean colours (0 to 255)
-    of a coarse picture.
+    intrinsics [px]: fx, fy, cx, cy, width, height; T_world_camera: 16 numbers by row; tiles: coarse colours (0 to
+    255).
     """
     k = frame.intrinsics
     return {
@@ -52,9 +52,9 @@ def first_frame(frame: RgbdFrame) -> dict[str, Any]:
 
 
 def differences(recorded: Sequence[Mapping[str, Any]], records: Iterator[Record]) -> list[str]:
-    """Sentences on how `records` differ from a scene's first frames `recorded`; empty where they agree.
+    """Describe how `records` differ from a scene's first frames; empty if alike.
 
-    Reads until each frame was met, or passed by.
+    Reads until each frame was found or passed.
     """
     wanted = {str(first["camera"]): first for first in recorded}
     last = max(int(first["stamp_ns"]) for first in recorded)
@@ -76,7 +76,7 @@ def differences(recorded: Sequence[Mapping[str, Any]], records: Iterator[Record]
 
 
 def changed_files(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """A sentence on files of the same name but another digest than `then`; descriptions (.toml) may change."""
+    """Describe files of equal name but another digest; descriptions (.toml) may change."""
     common = [name for name in then if name in now and not name.endswith(".toml")]
     changed = [name for name in common if then[name] != now[name]]
     if not changed:
@@ -109,7 +109,6 @@ def _differences(first: Mapping[str, Any], frame: RgbdFrame) -> list[str]:
 
 
 def _tiles(color: UInt8) -> list[float]:
-    """Mean colour of each tile, by row."""
     rows, columns = (
         np.linspace(0, size, num + 1).astype(int) for size, num in zip(color.shape[:2], TILES, strict=True)
     )
@@ -126,7 +125,7 @@ S = TypeVar("S", SceneConfig, OccupancyConfig)
 
 @dataclass(frozen=True, kw_only=True)
 class Mismatch:
-    """What does not fit, as a sentence, and what to do about it."""
+    """A mismatch as a sentence, and its remedy."""
 
     sentence: str
     remedy: str
@@ -135,10 +134,7 @@ class Mismatch:
 def scene_mismatches(
     scene: SceneFolder, source: RecordSource, states: StateColumns, model: RobotModel
 ) -> Iterator[Mismatch]:
-    """How a reconstruction and a log with states of a robot do not belong together; nothing where they do.
-
-    By `made_from_mismatches`, the times that both cover, and whether its parts agree.
-    """
+    """Mismatches of a reconstruction with a log and robot: provenance, times, and its own parts."""
     if not scene.has_digests:
         yield Mismatch(
             sentence=f"{scene.path} is of an earlier version: nothing tells whether its files are as written",
@@ -161,10 +157,10 @@ def scene_mismatches(
 def made_from_mismatches(
     path: Path, made_from: Mapping[str, Any], source: RecordSource, model: RobotModel
 ) -> Iterator[Mismatch]:
-    """How a scene or a field made from that (`SceneFolder.made_from`) does not belong to a log and a robot.
+    """Mismatches of a scene or field, by its `SceneFolder.made_from`, with a log and robot.
 
-    By the digests of files of the same names and of the calibration, each training camera's first frame, and the
-    joints and links of the robot that it was told apart from; and whether it rests on depth as it was recorded.
+    Compares digests of files and calibration, each training camera's first frame, and the segmented robot's joints
+    and links; also finds corrected depth.
     """
     files, digests = made_from.get("inputs", {}), source.digests()
     other, recorded = changed_files(files, digests), made_from.get("first_frames")
@@ -197,7 +193,7 @@ def made_from_mismatches(
 
 
 def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
-    """Names by digest of the calibrations among files that were read, and of what was done to these."""
+    """Calibrations and perturbations among the input files: names by digest."""
     return {
         digest: name.removeprefix(CALIBRATION)
         for name, digest in files.items()
@@ -206,8 +202,9 @@ def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
-    """How the robot that a scene's splats were told apart from differs from a model, in words; empty where it does
-    not. What it has and the model lacks is neither in the map nor on the robot; what only the model has is in both.
+    """Describe how a scene's segmented robot differs from a model; empty if alike.
+
+    Links only the scene's robot has are in neither map nor robot; links only the model has are in both.
     """
     joints = made_from.get("robot_joints")
     if joints is None:
@@ -229,9 +226,7 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
 
 
 def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Mismatch | None:
-    """How states at stamps (T,) [ns], T > 0, and a scene from one stamp to another share no time; None where they do,
-    or nearly.
-    """
+    """Mismatch of states at stamps (T,) [ns] and a scene's span; None if they (nearly) overlap."""
     first, last = int(states_ns[0]), int(states_ns[-1])
     apart_ns = max(scene_ns[0] - last, first - scene_ns[1])
     if apart_ns <= RECORDINGS_APART_NS:
@@ -245,7 +240,7 @@ def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Mismatch | None
 
 
 def _map_mismatches(scene: SceneFolder) -> Iterator[Mismatch]:
-    """Splats that are not those of their occupancy grid: of another scale, moved, or taken away."""
+    """Splats unlike their occupancy grid: rescaled, moved, or removed."""
     known = scene.known() if scene.has_digests else None
     if known is None:
         return
@@ -263,14 +258,13 @@ def _map_mismatches(scene: SceneFolder) -> Iterator[Mismatch]:
 
 
 def _used(section: type[S], values: object) -> S:
-    """The section of a configuration that a ``run.json`` has; the default where it has none."""
     known = {field.name for field in fields(section)}
     given = values if isinstance(values, dict) else {}
     return section(**{name: value for name, value in given.items() if name in known})
 
 
 def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Mismatch | None:
-    """How a truth file and a log with states are of different recordings, by the clearance that the truth has."""
+    """Mismatch of a truth file and logged states, by the truth's clearance."""
     stamps = states.stamp_ns
     shared = np.intersect1d(truth.stamps, stamps)
     if not len(shared):

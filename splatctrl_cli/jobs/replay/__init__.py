@@ -1,1 +1,1 @@
-"""What a replay is made of: what it is asked, reads, knows of the scene, does, finds, concludes and writes."""
+"""A replay: request, inputs, known scene, modes, evidence, verdict and files."""

@@ -1,4 +1,4 @@
-"""The input of a replay's criteria, and the criteria of time and of the controller."""
+"""Input of a replay's criteria; criteria of time and of the controller."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayReques
 from splatctrl_cli.records import Float64
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
-BROKEN, UNKNOWN = "failed", "*not evaluable*"  # as the table of the criteria has them
+BROKEN, UNKNOWN = "failed", "*not evaluable*"  # in the table of criteria
 SLOW = "log joint states more often"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """The input of every criterion of a replay."""
+    """The input of a replay's criteria."""
 
     request: ReplayRequest
     inputs: ReplayInputs
@@ -32,17 +32,16 @@ class Judged:
 
     @property
     def threshold(self) -> float:
-        """The margin [m], less what solver and rounding may leave."""
+        """The margin [m] less solver and rounding error."""
         return self.replay.margin - SLIGHTLY_UNDER
 
     @property
     def num_states(self) -> int:
-        """Number of judged states."""
         return len(self.replay.audit.stamp_ns)
 
     @property
     def past_end_s(self) -> float:
-        """How long a driven motion goes on after the log's last state [s]."""
+        """Driven time after the log's last state [s]."""
         return max(int(self.replay.audit.stamp_ns[-1]) - int(self.inputs.states.stamp_ns[-1]), 0) * 1e-9
 
 
@@ -60,7 +59,7 @@ def time_of_least(judged: Judged, values: np.ndarray[tuple[int], np.dtype[np.flo
 
 
 def seconds_at(judged: Judged, index: int) -> float:
-    """Time [s] of a state since the first one."""
+    """Time [s] since the first state."""
     stamps = judged.replay.audit.stamp_ns
     return float(stamps[index] - stamps[0]) * 1e-9
 
@@ -70,15 +69,15 @@ def mm(metres: float) -> str:
 
 
 def nearby(judged: Judged, values: Float64) -> tuple[float, float, int] | None:
-    """The largest of values (T,) about the arm, when [s], and over how many states; None without one."""
+    """Largest of values (T,) about the arm, its time [s], and their count; None without any."""
     num = int(np.isfinite(values).sum())
     return (float(np.nanmax(values)), seconds_at(judged, int(np.nanargmax(values))), num) if num else None
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
-    """The depth about the arm is at most `--max-map-age` old, none is newer than the state that it judges, and where
-    there was none for half a second the next shows nothing in the arm's place of that time. Frames without depth do
-    not count; a baked field does not say when it was seen (a note).
+    """The depth about the arm is at most `--max-map-age` old and not newer than the state it judges. After half a
+    second without any, the next depth shows nothing where the arm was. Frames without depth do not count; a baked
+    field has no times (a note).
     """
     first_ns, margin = int(judged.replay.audit.stamp_ns[0]), judged.replay.margin
     for found in judged.replay.unwatched:
@@ -94,7 +93,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             count=judged.num_states,
         )
     ahead = nearby(judged, judged.replay.near["ahead"])
-    allowed = SAME_MOMENT_NS / 1e9  # the frames of one time step lie apart
+    allowed = SAME_MOMENT_NS / 1e9  # frames of one time step differ in time
     if ahead is not None and ahead[0] > allowed:
         yield lacking(
             sentence=f"the newest depth near the arm is {ahead[0]:.2f} s later than the state that it judges",
@@ -125,9 +124,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
 
 
 def _after_end(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
-    """First words and the remedy where evidence of an age [s] at a time is too old because the log had ended; else
-    empty.
-    """
+    """First words and remedy if the evidence is too old because the log had ended; else empty."""
     lasts = float(judged.replay.audit.stamp_ns[-1] - judged.replay.audit.stamp_ns[0]) * 1e-9 - judged.past_end_s
     if not judged.past_end_s or (age - (time_s - lasts)) > judged.request.max_map_age + SAME_MOMENT_NS / 1e9:
         return "", ""
@@ -136,9 +133,9 @@ def _after_end(judged: Judged, age: float, time_s: float) -> tuple[str, str]:
 
 
 def map_age(judged: Judged) -> Iterator[Reason]:
-    """The map is at most `--max-map-age` old (of a baked field, the time from its moment), and newer depth shows
-    nothing within the margin of a state: depth of its own time that a late map (`--latency`) did not have yet, or the
-    next depth after the last state.
+    """The map is at most `--max-map-age` old (a baked field: from its moment). Newer depth shows nothing within the
+    margin: depth of a state's own time that a late map (`--latency`) did not contain, or the next after the last
+    state.
     """
     yield from _overtaken(judged)
     ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age
@@ -170,7 +167,6 @@ def map_age(judged: Judged) -> Iterator[Reason]:
 
 
 def _overtaken(judged: Judged) -> Iterator[Reason]:
-    """The worst state in depth of its own time, and the last state in the next depth."""
     first_ns, margin = int(judged.replay.audit.stamp_ns[0]), judged.replay.margin
     found = sorted(judged.replay.overtaken, key=lambda each: each.clearance)
     for worst in [each for each in found if each.depth_ns <= each.stamp_ns][:1]:
@@ -200,7 +196,7 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
 
 def judged_time(judged: Judged) -> Iterator[Reason]:
     """No gap longer than `verdict.longest_interval` in which the arm could reach the margin within its velocity
-    limits; no state without a distance or dropped for its stamp (*judged states*); at most `verdict.lead_in` before
+    limits. No state without a distance or dropped for its stamp (*judged states*). At most `verdict.lead_in` before
     the first map.
     """
     config, stamps = judged.request.config.verdict, judged.replay.audit.stamp_ns
@@ -241,7 +237,6 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
 
 
 def _gaps(judged: Judged) -> Iterator[Reason]:
-    """Between states too far apart to bound the motion."""
     replay, config = judged.replay, judged.request.config.verdict
     stamps, unbounded = replay.audit.stamp_ns, replay.between["unbounded"]
     duration = max(float(stamps[-1] - stamps[0]) * 1e-9, 1e-9)
@@ -282,7 +277,7 @@ def clocks(judged: Judged) -> Iterator[Reason]:
 
 
 def controller(judged: Judged) -> Iterator[Reason]:
-    """Closed loop: every step is solved; a user's controller gives a valid answer every time."""
+    """Closed loop: every step is solved; a user's controller always answers validly."""
     if judged.replay.outside is not None:
         yield _answers(judged, judged.replay.outside)
         return
@@ -309,7 +304,6 @@ def controller(judged: Judged) -> Iterator[Reason]:
 
 
 def _answers(judged: Judged, outside: OutsideController) -> Reason:
-    """Judge whether a user's controller gave a valid answer every time."""
     num, failure = outside.num_answers, outside.failure
     if failure is None:
         return held(f"all {num} steps answered", 0.0, 0.0, "", num)
@@ -360,7 +354,7 @@ def goal(judged: Judged) -> Iterator[Reason]:
 
 
 def commanded(judged: Judged) -> Reason | None:
-    """The reason where a user's controller commands more than the limits, else None."""
+    """A reason if a user's controller commands more than the velocity limits."""
     replay = judged.replay
     if replay.outside is None or replay.kept_steps is None:
         return None

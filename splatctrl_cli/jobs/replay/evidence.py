@@ -1,11 +1,9 @@
-"""The references of a replay: held-out depth (``--evidence``), and the truth of a simulated log.
+"""References of a replay: held-out depth (``--evidence``), and the truth of a simulated log.
 
-The field's value at a surface point is how far the map misses it. Where a sphere's true clearance is d and p the
-true surface point nearest to it, the map's clearance is at most d plus the miss at p, because the exact distance is
-1-Lipschitz. So if no surface within `verdict.evidence_reach` of the motion is missed by more than b, the true
-clearance is at least the map's less b, or more than that reach.
-
-`evaluate.conformal` says how b follows from the misses, what it promises and what it cannot.
+The field's value at a surface point is the map's miss there. Let a sphere's true clearance be d, and p the true
+surface point nearest to it. The exact distance is 1-Lipschitz, so the map's clearance is at most d plus the miss at
+p. If no surface within `verdict.evidence_reach` of the motion is missed by more than b (`evaluate.conformal`), the
+true clearance is at least the map's less b, or more than that reach.
 """
 
 from collections.abc import Iterable, Iterator
@@ -39,12 +37,12 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep, time_steps
 from splatctrl_cli.simulate.truth import distance_to
 
-EVERY = "held_out_every"  # the metric of a scene in lockstep that says which frame sets did not train it
+EVERY = "held_out_every"  # metric of a lockstep scene: its held-out frame sets
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """Where held-out frame sets come from: all of `cameras`, or (every: k) the k-th, 2k-th, ... of them."""
+    """A source of held-out frame sets: all of `cameras`, or with `every` k each k-th."""
 
     source: RecordSource
     cameras: tuple[str, ...]
@@ -52,22 +50,21 @@ class Evidence:
     every: int | None = None
 
     def frame_sets(self) -> Iterator[TimeStep]:
-        """Those that did not train, by time."""
         return held_out(time_steps(self.source.records(), self.cameras, has_clock=True), self.every)
 
 
 def held_out(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
-    """Of all frame sets those that are evidence: each `every`-th, None: all."""
+    """Select each `every`-th frame set, the held-out ones; None selects all."""
     return islice(iter(steps), None if every is None else every - 1, None, every or 1)
 
 
 def trained(steps: Iterable[TimeStep], every: int | None) -> Iterator[TimeStep]:
-    """The others, None: all."""
+    """Select the training frame sets; None selects all."""
     return (step for number, step in enumerate(steps, start=1) if every is None or number % every)
 
 
 def every_of(evidence: str | None) -> int | None:
-    """k, where every k-th frame set is evidence. Raises UsageError for a k that leaves nothing to train on."""
+    """Parse k from ``--evidence k``, None for a camera. Raises UsageError if k leaves nothing to train on."""
     try:
         every = int(evidence or "")
     except ValueError:
@@ -81,7 +78,7 @@ def every_of(evidence: str | None) -> int | None:
 
 
 def check_evidence(request: ReplayRequest) -> None:
-    """Raise UsageError for evidence that trained the map, as far as the request and its scene say that."""
+    """Raise UsageError for evidence that trained the map, if request or scene show it."""
     if request.evidence is None:
         return
     every, asked = every_of(request.evidence), f"--evidence {request.evidence}"
@@ -106,8 +103,9 @@ def check_evidence(request: ReplayRequest) -> None:
 
 
 def training_options(request: ReplayRequest, cameras: tuple[str, ...]) -> SourceOptions:
-    """How a lockstep reads the log: of its cameras without the one that is evidence. Raises UsageError where that is
-    the only one.
+    """Log options of a lockstep without the held-out camera.
+
+    Raises UsageError without another one.
     """
     others = tuple(camera for camera in cameras if camera != request.evidence)
     if not others:
@@ -119,9 +117,9 @@ def training_options(request: ReplayRequest, cameras: tuple[str, ...]) -> Source
 
 
 def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
-    """The log once more, with the held-out cameras alone; None where the request names none.
+    """Open the log again with the held-out cameras; None without ``--evidence``.
 
-    Raises InputError where the log has no such camera, or that has no depth.
+    Raises InputError if the log has no depth from them.
     """
     if request.evidence is None:
         return None
@@ -145,7 +143,7 @@ def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
 
 
 def map_error(evidence: Evidence, inputs: ReplayInputs, audit: StoredAudit, config: VerdictConfig) -> MapError:
-    """How far the map misses what the held-out frame sets within the judged time show near the judged motion."""
+    """Bound the map's miss near the judged motion."""
     found = misses_of(evidence.frame_sets(), inputs, audit, config.evidence_reach)
     bound = conformal_bound(found.distance, config.confidence)
     error = MapError(
@@ -168,8 +166,10 @@ def map_error(evidence: Evidence, inputs: ReplayInputs, audit: StoredAudit, conf
 
 @dataclass(frozen=True, kw_only=True)
 class Misses:
-    """Of T frame sets: stamp_ns (T,), the largest miss distance (T,) [m], NaN where none of its points counts, and
-    its place (T, 3) [m]; num_points that count in all.
+    """Misses of T frame sets.
+
+    stamp_ns (T,). distance (T,) [m]: the largest miss, NaN if no point counts; place (T, 3) [m]. num_points: that
+    count.
     """
 
     stamp_ns: Stamps
@@ -179,11 +179,11 @@ class Misses:
 
 
 def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: StoredAudit, reach: float) -> Misses:
-    """The largest miss of the map on surface within `reach` [m] of the audited motion that is not the robot, for each
-    frame set within the audited time. One set is held at a time.
+    """Largest miss of each held-out frame set near the motion, without the robot.
 
-    The map is the one that states just before the set were judged by: it is oldest then. One that has taken in what
-    other cameras saw at the same moment is better than any that a state is judged by until the next.
+    Near is within `reach` [m]; sets count within the audited time. One at a time is in memory. Each is compared with
+    the map that judged the states just before it, when that map is oldest. A newer map may contain other cameras of
+    the same moment.
     """
     swept, cameras = Swept.of(inputs.model, audit, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
@@ -212,16 +212,15 @@ def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: Store
 
 
 def surface_points(frame: RgbdFrame) -> Float64:
-    """The points (Q, 3) [m], world, that a frame measured, those at edges of its depth left out: they may lie between
-    two surfaces, where there is nothing.
-    """
+    """Back-project a frame to points (Q, 3) [m], world, without mixed pixels at depth edges."""
     is_chosen = (frame.depth > 0) & ~depth_edges(frame.depth)
     return transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[is_chosen])
 
 
 def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
-    """Those of points (Q, 3) [m] that cannot be the robot at q (J,): farther than ROBOT_MARGIN from its spheres and
-    what these leave of it uncovered.
+    """Keep points (Q, 3) [m] that cannot be the robot at q (J,).
+
+    They are over ROBOT_MARGIN from its spheres and what these leave uncovered.
     """
     if not len(points):
         return points
@@ -231,7 +230,7 @@ def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
 
 
 def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
-    """(4,) the largest distance [m] of points (Q, 3) to the map, and the point; NaN without points."""
+    """Largest distance [m] of points (Q, 3) to the map, and its point: (4,); NaN without points."""
     if not len(points):
         return np.full(4, np.nan)
     values = distance(points)
@@ -240,10 +239,10 @@ def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
 
 
 class Swept:
-    """Places within `reach` [m] of where an arm's moving spheres were, or up to SPHERE_CELL beyond."""
+    """Space within `reach` [m] of an arm's moving spheres, up to SPHERE_CELL more."""
 
     def __init__(self, cells: Float64, radii: Float64, reach: float) -> None:
-        """cells (K, 3): whole numbers of SPHERE_CELL; radii (K,) [m]: of the largest sphere that was there."""
+        """Enclose cells (K, 3), whole numbers of SPHERE_CELL, by radii (K,) [m], the largest in each."""
         centers, self._reach = (cells + 0.5) * SPHERE_CELL, reach
         enlarged = radii + 0.5 * SPHERE_CELL * 3**0.5
         self._field = SphereField(centers, enlarged)
@@ -252,7 +251,7 @@ class Swept:
 
     @classmethod
     def of(cls, model: RobotModel, audit: StoredAudit, reach: float) -> "Swept":
-        """Of every audited state; memory grows with the space that the arm passed, not with its states."""
+        """Sweep every audited state; memory grows with the space passed alone."""
         moving = np.flatnonzero(model.moving_spheres)
         cells, radii = np.zeros((0, 3)), np.zeros(0)
         for first, last in ranges(len(audit.stamp_ns)):
@@ -266,13 +265,13 @@ class Swept:
         return cls(cells, radii, reach)
 
     def near(self, points: Float64) -> Float64:
-        """Those of points (Q, 3) [m] that are."""
+        """Keep the points (Q, 3) [m] inside the swept space."""
         inside = points[self._box.contains(points)]
         return inside[self._field.query(inside)[0] <= self._reach] if len(inside) else inside
 
 
 class TrueSurfaces:
-    """The true surface points (T, 3) [m] nearest to each state's spheres, and which of them a camera saw by then."""
+    """True surface points (T, 3) [m] nearest to each state; `seen` by a camera so far."""
 
     def __init__(self, points: Rows, stamp_ns: Stamps, inputs: ReplayInputs) -> None:
         self._points, self._stamp_ns = points, stamp_ns
@@ -280,7 +279,7 @@ class TrueSurfaces:
         self.seen = np.zeros(len(stamp_ns), dtype=np.bool_)
 
     def watching(self, frames: Iterable[RgbdFrame]) -> Iterator[RgbdFrame]:
-        """Yield the same frames, and mark what those of the scene's cameras see."""
+        """Yield the frames; mark what the scene's cameras see in them."""
         for frame in frames:
             if self._cameras is None or frame.camera in self._cameras:
                 mark_seen(self.seen, self._points, self._stamp_ns, frame, has_clock=self._has_clock)
@@ -288,7 +287,7 @@ class TrueSurfaces:
 
 
 def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfaces | None]:
-    """Add the true clearance of every state and its events; also the true surfaces, None without a truth."""
+    """Add true clearances and their events; the surfaces are None without a truth."""
     if inputs.truth is None:
         return replay, None
     model, trace = inputs.model, replay.audit
@@ -316,7 +315,7 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfac
 
 
 def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
-    """Add how an audit agrees with the truth near surfaces that a camera saw; call it after the last frame."""
+    """Compare the audit with the truth near seen surfaces, after the last frame."""
     truth = np.asarray(replay.true_clearance)
     agreement = {
         name: clearance_agreement(of.distance, truth, surfaces.seen, replay.median_radius)
@@ -328,7 +327,6 @@ def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
 def _unexpected(
     inputs: ReplayInputs, moving: NDArray[np.intp], gap: Float64, points: Float64, stamp_ns: int, margin: float
 ) -> Float64:
-    """True clearances (M,) of the moving spheres to points (M, 3), infinite where the contact is declared."""
     if not inputs.declared.expected_contact:
         return gap
     links, seconds = inputs.model.sphere_set.links, (stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
@@ -340,7 +338,6 @@ def _unexpected(
 
 
 def _true_events(inputs: ReplayInputs, replay: Replay, clearance: Float64, spheres: Rows) -> tuple[Event, ...]:
-    """Intervals (of T states) below the margin, and in contact, by the truth."""
     model, truth, audit = inputs.model, inputs.truth, replay.audit
     assert truth is not None
     names = sphere_names(model.sphere_set)

@@ -1,4 +1,4 @@
-"""Criteria of a replay's verdict: whether the evidence reaches."""
+"""Criteria of the evidence behind a replay's verdict."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -38,9 +38,9 @@ from splatctrl_cli.voxels import EvidenceClass
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """A row of the table of evidence. asked: of what, in the documentation's words, and why. column: of
-    `NEAR_COLUMNS`, with the classes of which the least counts; most: the largest share allowed, or least [m]: the
-    least distance (0: the margin); words, remedy: what is said.
+    """A row of the evidence table; column: of `NEAR_COLUMNS`, for `parts` the least of their classes.
+
+    most: largest share allowed; least [m]: smallest distance (0: the margin); asked, why: for the documentation.
     """
 
     asked: str
@@ -54,22 +54,21 @@ class Limit:
 
     @property
     def name(self) -> str:
-        """That of the class it limits, else of its column."""
         return self.parts[0].name.lower() if self.parts else self.column
 
     def values(self, near: Figures) -> Float64:
-        """What it limits, at each state (T,); NaN where the space about the arm was not looked at."""
+        """The limited column (T,); NaN where space about the arm was not evaluated."""
         values = near[self.column]
         return values[:, self.parts].min(axis=1) if self.parts else values
 
     def is_broken(self, near: Figures, margin: float) -> bool:
-        """Whether any state breaks it; margin [m]."""
+        """True if any state breaks it; margin [m]."""
         values = self.values(near)
         return bool(np.any(values <= (self.least or margin)) if self.most is None else np.any(values > self.most))
 
     @property
     def docs(self) -> str:
-        """The row of the documentation's table, its cells separated by |."""
+        """Row of the documentation's table, its cells separated by |."""
         within = f"at most {100 * self.most:g} %" if self.most is not None else ""
         distance = f"more than {1e3 * self.least:g} mm" if self.least else "more than the margin"
         return f"{self.asked} | {within or distance} | {self.why}"
@@ -147,7 +146,7 @@ PROOF = Limit(
 
 def known_space(judged: Judged) -> Iterator[Reason]:
     """Every point within the margin of the arm has one class of evidence, and each class keeps its limit (the table
-    below); at most `--max-unknown` of the sphere centres are in space never seen. A baked field needs its channel
+    below); at most `--max-unknown` of the sphere centres are in unobserved space. A baked field needs its channel
     `observed`.
     """
     for limit in LIMITS:
@@ -160,9 +159,7 @@ def known_space(judged: Judged) -> Iterator[Reason]:
 
 
 def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
-    """The reason that a limit gives: it is kept, or the state that breaks it most, as a reason of the kind `broken`.
-    What was not recorded proves nothing.
-    """
+    """Yield that a limit is kept, or its worst state as `broken`."""
     near = judged.replay.near
     values = limit.values(near)
     if limit is PROOF and np.isnan(near["assumed"]).all():
@@ -206,7 +203,6 @@ def _within(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lackin
 
 
 def _unknown_share(judged: Judged) -> Iterator[Reason]:
-    """Of the sphere centres, in space that no camera saw and the robot never was in."""
     share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
     if share is None:
         yield lacking(sentence="what cameras saw is not recorded")
@@ -229,8 +225,8 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
 def map_error(judged: Judged) -> Iterator[Reason]:
     """With `--evidence`: the surface clearance less the bound on the map's error is at least 0.
 
-    With a smaller clearance no contact was seen, but the map cannot exclude one: not
-    evaluable, unless another measure fails. So is evidence that is too little for a bound.
+    A smaller clearance shows no contact, but the map cannot exclude one: not evaluable, unless another criterion
+    fails. The same holds for too little evidence.
     """
     found, surface = judged.replay.map_error, least_of(judged.replay.between["surface"])
     if found is None:
@@ -248,7 +244,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
         return
     value = found.bound.bound
     if surface is None:
-        return  # no distance at any state, which is said of them
+        return  # no distance at any state: other criteria report it
     if surface >= value:
         yield held(bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
         return
@@ -268,7 +264,6 @@ def map_error(judged: Judged) -> Iterator[Reason]:
 
 
 def bound_words(bound: ConformalBound) -> str:
-    """The bound on the map's error, and what it rests on."""
     return (
         f"map error at most {mm(bound.bound)} with {100 * bound.confidence:.3g} % confidence from "
         f"{bound.num_stretches} stretches of held-out depth"
@@ -284,7 +279,7 @@ def belonging(judged: Judged) -> Iterator[Reason]:
 
 
 def displaced(judged: Judged) -> tuple[str, float] | None:
-    """The displaced camera that is farthest off, and how far [m]; None where all of them are corrected."""
+    """The worst uncorrected displaced camera and its offset [m]; None without any."""
     rows = judged.inputs.scene.figures().get("displaced_cameras") or {}
     off = {
         camera: 1e-3 * row["distance_mm"]
@@ -333,8 +328,8 @@ def calibration(judged: Judged) -> Iterator[Reason]:
 
 
 def map_resolution(judged: Judged) -> Iterator[Reason]:
-    """The map's voxels are at most 25 mm, as what no splat stands for may be as large as one; and what was taken for
-    the robot is nearer to it than the margin, as a thing that touches it may go unseen as far.
+    """The map's voxels are at most 25 mm, since an obstacle without a splat may be that large. The robot's mask
+    reaches at most the margin, since an obstacle touching the robot may go unseen that far.
     """
     figures, margin = judged.inputs.scene.figures(), judged.replay.margin
     voxel, by_link = figures.get("voxel"), figures.get("self_mask")

@@ -1,4 +1,4 @@
-"""The files of a replay: steps, events, a summary, plots, and pictures of the moments nearest to the scene."""
+"""Files of a replay: steps, events, summary and pictures."""
 
 import math
 import re
@@ -38,12 +38,12 @@ Columns = dict[str, list[object]]
 
 
 def chunks_of(replay: Replay) -> Iterator[Columns]:
-    """`columns_of` all states, BLOCK at a time, so that a long log is never a table in memory."""
+    """Columns of all states, BLOCK at a time, to bound memory."""
     return (columns_of(replay, slice(k, k + BLOCK)) for k in range(0, len(replay.audit.stamp_ns), BLOCK))
 
 
 def columns_of(replay: Replay, rows: slice = slice(None)) -> Columns:
-    """Every column of a range of states, by name."""
+    """Columns of a range of states, by name."""
     first, last, _ = rows.indices(len(replay.audit.stamp_ns))
     audit, names = replay.audit.block(first, last), sphere_names(replay.model.sphere_set)
     columns: Columns = {
@@ -129,7 +129,7 @@ def write_replay(
     inputs: Mapping[str, str],
     stopwatch: Stopwatch,
 ) -> None:
-    """Write steps.csv, events.json, summary.json, pictures and run.json; robot: what is said of it, by subject."""
+    """Write steps.csv, events.json, summary.json, pictures and run.json; robot: sentences by subject."""
     write_steps(folder / "steps.csv", chunks_of(replay))
     write_json(folder / "events.json", events_document(replay))
     write_json(folder / "summary.json", summary_of(replay, metrics, verdict, robot))
@@ -147,7 +147,7 @@ def write_replay(
 
 
 def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, robot: Mapping[str, str]) -> dict[str, Any]:
-    """The verdict, when and why, the metrics, and the words that go with them."""
+    """Verdict, reasons, metrics and their explanations for summary.json."""
     words = {
         "mode": replay.mode,
         "outcome": str(replay.closed_loop.outcome) if replay.closed_loop else f"{replay.mode}: every state",
@@ -162,7 +162,7 @@ def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, robot: Mappin
 
 
 def events_document(replay: Replay) -> dict[str, Any]:
-    """events.json: what happened as intervals, what never moves, and where the scene changed under the arm."""
+    """Intervals, static violations and scene changes for events.json."""
     changes = () if replay.closed_loop is None else replay.closed_loop.scene_changes
     numbers = ("worst", "worst_s", "start_s", "end_s")
     return {
@@ -182,7 +182,7 @@ def events_document(replay: Replay) -> dict[str, Any]:
 
 
 def when_and_why(replay: Replay) -> list[str]:
-    """The first intervention and the first trouble in a sentence each, and how often each kind of event came up."""
+    """The first intervention and the first event of each kind, with counts, as sentences."""
     lines = []
     if replay.steps and replay.outside is None:
         first = first_intervention(replay.events)
@@ -200,7 +200,6 @@ def when_and_why(replay: Replay) -> list[str]:
 
 
 def told(event: Event, *, with_kind: bool = True) -> str:
-    """An event as a sentence: when, what and who, by how much, and what was near."""
     unit = UNITS.get(event.kind, "")
     span = f"{event.start_s:.2f} to {event.end_s:.2f} s"
     more = f" and {event.num_names - 1} more" if event.num_names > 1 else ""
@@ -213,9 +212,9 @@ def told(event: Event, *, with_kind: bool = True) -> str:
 
 
 def write_steps(path: Path, chunks: Iterable[Mapping[str, Sequence[object]]]) -> None:
-    """Write chunks of rows, each as equally long columns of the same names, as one CSV.
+    """Write chunks of equally long columns as one CSV.
 
-    Floats have nine digits; NaN and infinity are nothing.
+    Floats have nine digits; NaN and infinity are empty.
     """
     with path.open("w", encoding="utf-8", newline="") as stream:
         for index, columns in enumerate(chunks):
@@ -227,7 +226,6 @@ def write_steps(path: Path, chunks: Iterable[Mapping[str, Sequence[object]]]) ->
 
 
 def _formatted(values: Sequence[object]) -> tuple[str, Sequence[object]]:
-    """How to format a column's cells, so that a row is formatted at once, and the cells."""
     kinds = set(map(type, values))
     if kinds == {float} and all(map(math.isfinite, values)):  # type: ignore[arg-type]
         return "%.9g", values
@@ -242,7 +240,6 @@ def _formatted(values: Sequence[object]) -> tuple[str, Sequence[object]]:
 
 
 def _quoted(text: str) -> str:
-    """A cell as CSV has it: between quotes where it holds a comma, a quote or the end of a line."""
     return '"' + text.replace('"', '""') + '"' if _SPECIAL.search(text) else text
 
 
@@ -256,11 +253,7 @@ ROWS = ("scene", "self", "limit")  # kinds of rows that shape a command
 
 
 def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
-    """Write clearance.png, and evidence.png where that is known; of a controller commands.png, in open loop
-    open_loop.png, in closed loop divergence.png.
-
-    seconds: (T,) since the first state.
-    """
+    """Write the pictures the mode has; seconds (T,) since the first state."""
     curves: dict[str, FloatRows] = {name: of.rows for name, of in replay.audit.clearance.items()}
     if replay.true_clearance is not None:
         curves["truth"] = replay.true_clearance
@@ -301,7 +294,7 @@ def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
 def _intervals(
     replay: Replay, is_shown: Callable[[Event], bool], *, at_least: Sequence[str] = ()
 ) -> dict[str, list[tuple[float, float]]]:
-    """First and last time [s] of the events that are shown, by kind and measure; `at_least` these kinds, if empty."""
+    """Spans [s] of shown events, by kind and measure; kinds in `at_least` always appear."""
     found: dict[str, list[tuple[float, float]]] = {kind: [] for kind in at_least}
     for event in replay.events:
         if is_shown(event):
@@ -310,8 +303,9 @@ def _intervals(
 
 
 def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterable[RgbdFrame]) -> list[Sight | None]:
-    """The images of the moments of least clearance, by the truth where that is known, the least first; None where no
-    camera has one. Frames behind the last moment are not read.
+    """Images of the moments of least clearance, least first, by the truth if known.
+
+    None where no camera has one. Frames after the last moment are not read.
     """
     audit = replay.audit
     least = audit.clearance["exact"].distance
@@ -324,7 +318,7 @@ def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterabl
 
 
 def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | None]) -> list[str]:
-    """Write worst_1.png, worst_2.png ..., and return notes about pictures that are missing."""
+    """Write worst_1.png and so on; return notes on missing pictures."""
     seen = [sight for sight in sights if sight is not None]
     for number, sight in enumerate(seen, start=1):
         first, *rest = sight.moment.caption
@@ -342,7 +336,6 @@ def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | Non
 
 
 def _moment(inputs: ReplayInputs, replay: Replay, state: int) -> Moment:
-    """A state with the obstacle that is nearest to its nearest sphere."""
     audit, model = replay.audit, replay.model
     stamp, worst = int(audit.stamp_ns[state]), int(audit.clearance["exact"].sphere[state])
     centers = model.sphere_centers(np.asarray(audit.position[state]))

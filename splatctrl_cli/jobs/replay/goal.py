@@ -1,6 +1,4 @@
-"""What a replay's controller is asked to reach: a pose, a configuration, waypoints, or the log's own twists; and who
-commands the arm: ours, or a user's own controller.
-"""
+"""The controller of a replay and its goal."""
 
 import csv
 import math
@@ -48,7 +46,7 @@ POSE_COLUMNS = tuple(POSE.split(","))
 
 
 def check_goal(request: ReplayRequest) -> None:
-    """Raise UsageError for an option that the mode does not use."""
+    """Raise UsageError for an option the mode does not use."""
     asked, driven = ("open-loop", "closed-loop"), ("closed-loop",)
     modes: dict[str, tuple[str, ...]] = {"re_anchor": driven}
     modes |= dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), asked)
@@ -64,7 +62,7 @@ def check_goal(request: ReplayRequest) -> None:
 def goal_waypoints(
     request: ReplayRequest, model: RobotModel, frame: str, logged_end: Float64
 ) -> tuple[Waypoint, ...]:
-    """The goals that the options give, at least one; else the logged pose at the end."""
+    """The requested goals, at least one; by default the logged end pose."""
     if request.goal is not None:
         return (Waypoint(T_world_goal=transform_from(request.goal[:3], request.goal[3:])),)
     if request.goal_joints is not None:
@@ -76,10 +74,7 @@ def goal_waypoints(
 
 
 def _posture(model: RobotModel, values: Float64, logged_end: Float64) -> Float64:
-    """The configuration (J,) of --goal-joints; fingers of a gripper that have no values stay as logged at the end.
-
-    Raises InputError for another number of values, naming the joints.
-    """
+    """Configuration (J,) of --goal-joints; omitted gripper fingers stay as logged at the end."""
     is_arm = [name not in model.urdf.grippers for name in model.joint_names]
     if len(values) == sum(is_arm):
         posture = logged_end.copy()
@@ -89,10 +84,10 @@ def _posture(model: RobotModel, values: Float64, logged_end: Float64) -> Float64
 
 
 def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint, ...]:
-    """The waypoints of a file: poses (columns or keys x, y, z, qx, qy, qz, qw) or postures (one per joint name).
+    """Read poses or postures from a file.
 
-    CSV has a header; TOML an array of tables ``[[waypoint]]`` with ``pose = [...]`` or ``joints = [...]``.
-    Raises InputError, naming the waypoint.
+    Columns or keys: x, y, z, qx, qy, qz, qw, or one per joint name. CSV has a header; TOML tables ``[[waypoint]]``
+    with ``pose = [...]`` or ``joints = [...]``. Raises InputError.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -148,7 +143,7 @@ def _toml_rows(path: Path, text: str) -> Iterator[tuple[str, list[float]]]:
 
 
 def checked_pose(values: Sequence[float]) -> tuple[float, ...]:
-    """A pose as `POSE`, as it is. Raises ValueError for another number of values, or no unit quaternion."""
+    """Return the pose `POSE` unchanged. Raises ValueError for a wrong length or quaternion norm."""
     if len(values) != 7:
         raise ValueError(f"expected 7 numbers {POSE}, got {len(values)}")
     if not all(math.isfinite(value) for value in values):
@@ -160,7 +155,7 @@ def checked_pose(values: Sequence[float]) -> tuple[float, ...]:
 
 
 def check_twists(request: ReplayRequest) -> None:
-    """Raise UsageError for twists where no controller runs, or a frame without them."""
+    """Raise UsageError for twists without a controller, or a frame without twists."""
     if request.twist_topic is not None and request.mode == "audit":
         raise UsageError(
             "--twist-topic: expected --mode open-loop or closed-loop", remedy="an audit does not ask the controller"
@@ -172,9 +167,9 @@ def check_twists(request: ReplayRequest) -> None:
 def twist_track(
     request: ReplayRequest, model: RobotModel, span_ns: tuple[int, int], console: Progress
 ) -> TwistTrack | None:
-    """The twists that --twist-topic names, None without it. span_ns: first and last joint state.
+    """Read the twists of --twist-topic; span_ns: first and last joint state.
 
-    Raises InputError where they are in no frame that is known, or all at other times.
+    Raises InputError for an unknown frame, or no overlap in time.
     """
     if request.twist_topic is None:
         return None
@@ -208,8 +203,9 @@ def twist_figures(
     position: FloatRows,
     steps: Sequence[ControlStep | None],
 ) -> Mapping[str, float | None]:
-    """`TWIST_FIGURES` of a controller's T steps: the share of states where a twist holds, the share of these where it
-    was capped, and by how much [m/s, rad/s] the commanded twist misses it. Empty without twists.
+    """`TWIST_FIGURES` of a controller's T steps; empty without twists.
+
+    Share of states with a valid twist, share of these capped, and errors [m/s, rad/s].
     """
     if track is None:
         return {}
@@ -231,7 +227,7 @@ def twist_figures(
 
 
 def check_controller(request: ReplayRequest) -> None:
-    """Raise UsageError for a controller that no mode asks, that cannot be meant, or options without one."""
+    """Raise UsageError for a controller in an audit, an invalid one, or its options alone."""
     if request.controller is None and request.controller_command is None:
         if request.controller_twice or request.controller_step_limit != STEP_LIMIT:
             raise UsageError(
@@ -259,8 +255,9 @@ def commander_of(
     frame: str,
     home: Float64 | None,
 ) -> Iterator[Commander]:
-    """Who is asked: our own controller, or the user's, which has ended when this does. Raises InputError for one that
-    does not start.
+    """Start our controller or the user's, which ends with the block.
+
+    Raises InputError if it does not start.
     """
     if request.controller is None and request.controller_command is None:
         yield OURS
@@ -286,7 +283,6 @@ def commander_of(
 
 
 def _named_command(request: ReplayRequest) -> tuple[str, tuple[str, ...]]:
-    """What people call the controller, and its command line."""
     if request.controller is not None:
         if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", request.controller):
             raise UsageError(f"--controller: expected module:Class, got {request.controller!r}")

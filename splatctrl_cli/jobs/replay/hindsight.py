@@ -1,4 +1,4 @@
-"""What the map of a moment did not show yet: later depth has a thing in the arm's place of that moment."""
+"""Obstacles that only later depth shows where the arm was."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,11 +19,10 @@ ClearanceIn = Callable[[int, Stamps, Float64], Float64]
 
 @dataclass(frozen=True, kw_only=True)
 class LaterDepth:
-    """A state that keeps the margin in the map that was known at `stamp_ns`, and is `clearance` [m], less than the
-    margin, from a thing that the depth of `depth_ns` shows, which that map did not have yet.
+    """A state that kept the margin in the map known then, but not by later depth.
 
-    since_ns: where the state is of a stretch of time without depth from about the arm, the stamp that it begins at;
-    it ends with this depth.
+    stamp_ns: of the state. clearance [m]: by the depth of `depth_ns`. since_ns: start of a stretch without depth
+    about the arm that this depth ends, 0 without.
     """
 
     depth_ns: int
@@ -33,7 +32,7 @@ class LaterDepth:
 
 
 class NewerDepth:
-    """Holds states against the depth of their own time where maps are late, and the last against the next depth."""
+    """Comparison of states with their own depth if maps are late, the last with the next."""
 
     def __init__(self, scene: KnownScene, margin: float, clearance_in: ClearanceIn) -> None:
         self._scene, self._margin, self._clearance_in = scene, margin, clearance_in
@@ -42,7 +41,7 @@ class NewerDepth:
         self.found: list[LaterDepth] = []
 
     def add(self, stamps: Stamps, positions: Float64, clearance: Float64) -> None:
-        """The next states (T,), (T, J), and their clearances (T,) [m] in the map that was known then."""
+        """Add states (T,), (T, J) and their clearances (T,) [m] in the map known then."""
         is_clear = clearance >= self._margin
         states = [(int(stamps[k]), positions[k].copy()) for k in np.flatnonzero(is_clear)]
         self._last = states[-1] if is_clear[-1] else None
@@ -51,7 +50,7 @@ class NewerDepth:
             self._hold(int(stamps[-1]))
 
     def finish(self) -> None:
-        """After the motion: what its last states' own depth shows, and the next after that."""
+        """Compare the last states with their own depth and the next one."""
         if self._last is None or not self._scene.stamps_ns:
             return
         stamp_ns, q = self._last
@@ -60,11 +59,10 @@ class NewerDepth:
         before_ns, known_ns = self._scene.depth_ns(own_ns), self._scene.next_ns(own_ns)
         next_ns = None if known_ns is None else self._scene.depth_ns(known_ns)
         if known_ns is None or before_ns is None or next_ns is None or next_ns - before_ns > UNWATCHED_NS:
-            return  # or `Hindsight` looks back at all that time
+            return  # a longer gap is left to `Hindsight`
         self._compare(known_ns, [(stamp_ns, q)])
 
     def _hold(self, now_ns: int) -> None:
-        """Against the scenes that are known by now."""
         late = self._scene.latency_ns
         due = [state for state in self._waiting if state[0] + late <= now_ns]
         del self._waiting[: len(due)]
@@ -84,7 +82,7 @@ class NewerDepth:
 
 
 class Hindsight:
-    """Keeps the postures since the last depth from about the arm, and holds them against the map after the next."""
+    """Comparison of postures since the last depth about the arm with a later map."""
 
     def __init__(self, scene: KnownScene, near: NearSpace, margin: float, clearance_in: ClearanceIn) -> None:
         self._scene, self._near, self._margin, self._clearance_in = scene, near, margin, clearance_in
@@ -94,14 +92,14 @@ class Hindsight:
         self.found: list[LaterDepth] = []
 
     def add(self, stamps: Stamps, positions: Float64) -> None:
-        """The next states (T,), (T, J) of the motion."""
+        """Add states (T,), (T, J) of the motion."""
         for at, stamp in enumerate(stamps.tolist()):
             if not self._stamps or stamp >= self._stamps[-1] + UNWATCHED_APART_NS or at == len(stamps) - 1:
                 self._stamps.append(stamp)
                 self._postures.append(positions[at].copy())
 
     def looked(self, stamp_ns: int, age_s: float) -> None:
-        """At a stamp the depth from about the arm was so old; NaN where that is not known."""
+        """Register the age of depth about the arm; NaN if unknown."""
         if not np.isfinite(age_s):
             return
         seen_ns = stamp_ns - round(age_s * 1e9)
@@ -112,7 +110,7 @@ class Hindsight:
         del self._stamps[:num], self._postures[:num]
 
     def finish(self) -> None:
-        """After the motion: wait for the next depth, and look back once more."""
+        """Wait for the next depth after the motion, and compare once more."""
         if not self._stamps or self._seen_ns is None:
             return
         last_ns, last = self._stamps[-1], self._postures[-1]
@@ -124,14 +122,13 @@ class Hindsight:
                 return
 
     def _later(self, stamp_ns: int) -> Iterator[int]:
-        """Stamps at which a newer scene is known."""
         shown = self._scene.age_s(stamp_ns)
         for later_ns in range(stamp_ns + STEP_NS, stamp_ns + UNWATCHED_AFTER_NS, STEP_NS):
             if self._scene.age_s(later_ns) < shown + (later_ns - stamp_ns) * 1e-9 - 1e-6:
                 yield later_ns
 
     def _hold_against(self, since_ns: int, until_ns: int, num: int) -> None:
-        """The first `num` postures against the map at `until_ns`: those that were clear of what was known of then."""
+        """Compare the first `num` postures, if clear in their own map, with a later one."""
         stamps, q = np.array(self._stamps[:num]), np.asarray(self._postures[:num])
         after = self._clearance_in(until_ns, stamps, q)
         near = np.flatnonzero(after < self._margin)

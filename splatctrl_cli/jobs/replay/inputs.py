@@ -1,4 +1,4 @@
-"""What a replay reads: the robot's model and what its spheres leave uncovered, and the states of a log."""
+"""A replay's robot with its sphere coverage, and a log's states."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -41,7 +41,7 @@ from splatctrl_cli.robot.self_margins import (
 from splatctrl_cli.robot.self_model import ALWAYS
 
 MAX_NOTES = 10  # printed
-GRASPING = 1.0  # [s] before a thing is held, and after, in which the hand may touch it
+GRASPING = 1.0  # [s] before and after a grasp in which the hand may touch the object
 ANGLE = Scale(unit="rad")
 LOG_FIGURES = {  # they describe the log
     "num_poses": DESCRIBES,
@@ -58,9 +58,9 @@ FR3_LIMITS = (
 
 
 def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[RobotModel, FrameSource | StateSource]:
-    """The robot of the arguments or the log, and the log that moves it, fingers locked that it does not move.
+    """Open the log and its robot, with fingers locked that the log does not move.
 
-    Raises InputError for a log without joint states, UsageError where neither says which robot it is.
+    Raises InputError for a log without joint states, UsageError for an unknown robot.
     """
     urdf = urdf_of(request.urdf, (request.log,), progress)
     if urdf is None:
@@ -81,9 +81,7 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredRobot:
-    """A robot whose spheres were measured against the URDF's collision geometry, the surfaces of its links (None
-    where they cannot be read), and the pairs of links whose spheres keep less than `control.self_margin`.
-    """
+    """A robot with measured coverage, link surfaces (None if unreadable), and lowered pair margins."""
 
     model: RobotModel
     surfaces: SelfSurfaces | None
@@ -93,10 +91,9 @@ class MeasuredRobot:
 def measured_robot(
     request: ReplayRequest, model: RobotModel, config: ControlConfig, recorded: Float64 | None = None
 ) -> MeasuredRobot:
-    """The robot without the pairs that its SRDF names; for a controller, each pair with a margin that it can keep.
+    """Measure sphere coverage, drop the SRDF's pairs, and give a controller margins it can keep.
 
-    recorded: `recorded_postures`. Raises InputError where `config.coverage` is "margin" and no distance bounds what
-    is uncovered.
+    recorded: `recorded_postures`. Raises InputError if `config.coverage` is "margin" and coverage is unbounded.
     """
     disabled: tuple[DisabledPair, ...] = ()
     if request.srdf is not None:
@@ -119,7 +116,7 @@ def measured_robot(
 
 
 def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfig) -> list[str]:
-    """What a person should know of the robot before trusting this replay; a sentence each."""
+    """Sentences on the robot to read before trusting this replay."""
     model = robot.model
     if request.mode == "audit":
         return list(model.doubts)
@@ -137,7 +134,7 @@ def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfi
 
 
 def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[str] = ()) -> dict[str, str]:
-    """What the robot's spheres stand for, by subject, a sentence each. by_surface: as of `ReplayTrace`."""
+    """Sentences on what the robot's spheres cover, by subject. by_surface: of `ReplayTrace`."""
     words = {"coverage": coverage_words(robot.model, config)}
     kept = [pair for pair in robot.kept if pair.margin is not None]
     if kept:
@@ -156,7 +153,6 @@ def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[s
 
 
 def _self_margin_words(robot: MeasuredRobot, kept: Sequence[KeptMargin], config: ControlConfig) -> str:
-    """Which pairs of links keep less than the margin asked for."""
     each = ", ".join(f"{' and '.join(pair.links)} {1e3 * (pair.margin or 0.0):.1f} mm{_told(pair)}" for pair in kept)
     judged = "" if robot.surfaces is None else "; whether links touch is judged by their surfaces"
     return f"self-collision margin: {1e3 * config.self_margin:g} mm, or what spheres can keep: {each}{judged}"
@@ -171,7 +167,7 @@ def _told(pair: KeptMargin) -> str:
 
 
 def coverage_words(model: RobotModel, config: ControlConfig) -> str:
-    """What the spheres leave uncovered, or why that is not known, and the margin that then holds for the surface."""
+    """The uncovered surface, or why it is unknown, and the resulting surface margin."""
     report = model.coverage
     if report is None:
         return f"how much of the surface the spheres cover is not known: {model.coverage_unknown}"
@@ -194,7 +190,7 @@ def coverage_words(model: RobotModel, config: ControlConfig) -> str:
 
 
 def _check_bounded(model: RobotModel) -> None:
-    """Raise InputError where a link that moves has no sphere, or nothing was measured."""
+    """Raise InputError for a moving link without a sphere, or without a measurement."""
     wanted = "control.coverage = margin"
     if model.coverage is None:
         raise InputError(
@@ -209,7 +205,7 @@ def _check_bounded(model: RobotModel) -> None:
 
 
 def bare_moving_links(model: RobotModel) -> list[str]:
-    """Links with a body, moved by a joint, that have no sphere; none where the coverage was not measured."""
+    """Moving links with a body but no sphere; empty if coverage was not measured."""
     if model.coverage is None:
         return []
     bodies = model.urdf.rigid_bodies()
@@ -223,10 +219,9 @@ def _proven(link: LinkCoverage) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class LoggedStates:
-    """States in the model's joint order, where they are from, and what was found about them.
+    """States in the model's joint order, their source, and its checks.
 
-    poses: beside forward kinematics, None where the log has no end-effector poses; clock: of cameras against the
-    robot, None where the log has no frames.
+    poses: against forward kinematics, None without logged poses. clock: of cameras against the robot.
     """
 
     source: RecordSource
@@ -235,7 +230,6 @@ class LoggedStates:
     clock: ClockOffset | None = None
 
     def as_dict(self) -> Mapping[str, Any]:
-        """For states.json."""
         return {
             "num_states": len(self.states),
             "loss": asdict(self.source.loss),
@@ -246,7 +240,7 @@ class LoggedStates:
         }
 
     def metrics(self) -> dict[str, float | None]:
-        """`LOG_FIGURES`: None where the log has no poses, or the offset is not known."""
+        """Values of `LOG_FIGURES`."""
         poses, clock = self.poses, self.clock
         values = (
             0 if poses is None else poses.num_poses,
@@ -260,13 +254,12 @@ class LoggedStates:
         return dict(zip(LOG_FIGURES, values, strict=True))
 
     def counts(self) -> dict[str, int]:
-        """How many poses or intervals each of `metrics` rests on; the number of poses rests on the states."""
+        """Number of poses or intervals behind each metric."""
         num_poses = 0 if self.poses is None else self.poses.num_poses
         num_intervals = 0 if self.clock is None else self.clock.num_intervals
         return {name: num_intervals if name.startswith("clock_") else num_poses for name in [*LOG_FIGURES][1:]}
 
     def lines(self) -> list[str]:
-        """A line for each thing that a person should know."""
         notes = self.source.loss.notes
         more = [f"and {len(notes) - MAX_NOTES} more notes in states.json"] if len(notes) > MAX_NOTES else []
         found = [check.sentence for check in (self.poses, self.clock) if check is not None]
@@ -274,9 +267,9 @@ class LoggedStates:
 
 
 def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedStates:
-    """The states of the robot's joints in a log, whose frames are not read yet: `clock_of` is known after them.
+    """Read the robot's states; `clock_of` is known after the frames.
 
-    Raises InputError where they cannot be the robot's.
+    Raises InputError if they cannot be the robot's.
     """
     states = source.states.of_log(*model.joint_columns(source.joint_names))
     check_states(states, model.joint_names)
@@ -285,9 +278,9 @@ def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedS
 
 
 def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[ExpectedContact]:
-    """Where the links of a hand meet what it takes and leaves: at its place then, before and after.
+    """Contact of a hand's links with a grasped part where it is taken and left.
 
-    Until `GRASPING` after it is taken, too: the map still has it at its place.
+    It lasts until `GRASPING` after the part is taken, since the map still shows it there.
     """
     bodies = model.urdf.rigid_bodies(set(model.joint_names) - set(model.urdf.grippers))
     first_ns = int(states.stamp_ns[0])
@@ -306,12 +299,12 @@ def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[Expected
 
 
 def recorded_postures(states: StateColumns) -> Float64:
-    """Postures (R, J) of a log: SELF_POSTURES of them or somewhat more, evenly over it, or all."""
+    """About SELF_POSTURES postures (R, J), evenly over the log."""
     return states.position[np.arange(0, len(states), max(len(states) // SELF_POSTURES, 1))]
 
 
 def check_inside(model: RobotModel, q: Float64, box: Box) -> None:
-    """Raise NotEvaluableError for a posture (J,) of which no moving sphere is in the box of a baked field."""
+    """Raise NotEvaluableError if no moving sphere at q (J,) is in a baked field's box."""
     centers = model.sphere_centers(q)[np.flatnonzero(model.moving_spheres)]
     beyond = np.maximum(box.lower - centers, centers - box.upper).max(axis=1)
     if not len(centers) or beyond.min() <= 0:
@@ -325,7 +318,7 @@ def check_inside(model: RobotModel, q: Float64, box: Box) -> None:
 
 
 def clock_of(model: RobotModel, logged: LoggedStates, motion: ImageMotion) -> ClockOffset | None:
-    """The offset of the cameras' clock, by how the log's images change; None without images, times or states."""
+    """Estimate the cameras' clock offset from image changes; None without images, times or states."""
     states = logged.states
     if not motion.cameras or not logged.source.has_clock or not len(states):
         return None

@@ -1,4 +1,4 @@
-"""What a replay may know of the scene: a baked grid, or the splats as they were known at each time."""
+"""Scenes known to a replay: a baked grid, or splats over time."""
 
 import math
 from bisect import bisect_right
@@ -36,11 +36,11 @@ HELD = 2  # scenes whose fields are kept: a rate of change needs two
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KnownFields:
-    """The fields of one scene: `barrier` is what a controller uses, `distances` what an audit puts side by side.
+    """The fields of one scene: `barrier` for a controller, `distances` for an audit.
 
-    obstacles: points (Q, 3) [m], world -> what is nearest to each. human: its people alone, None without any.
-    splats_alone: the exact distance without voxels that no splat represents, None where there are no such voxels.
-    balls: those of the barrier, None for a grid and where people count nearer than they are.
+    obstacles: points (Q, 3) [m], world -> the nearest of each. human: people alone. splats_alone: exact distance
+    without voxels that no splat represents. balls: of the barrier; None for a grid, or with a larger margin for
+    people.
     """
 
     barrier: DistanceField
@@ -54,17 +54,14 @@ class KnownFields:
 
 @dataclass(frozen=True, kw_only=True)
 class KnownScene:
-    """`at(stamp_ns)` gives the same object for the same scene as long as it is in use; nothing is known before
-    `first_ns` (None: always).
+    """The scene a replay may use at each time; unknown before `first_ns` (None: always known).
 
-    observed: None where what cameras saw is not recorded. cameras: the cameras that made it, None where that is not
-    recorded. stamps_ns: of the scenes that are there one after the other (so far, where they are made on the way:
-    `advance` to a stamp makes those known then), empty for one scene for all times; each is known `latency_ns` after
-    its stamp. finish: to be called when the replay is done. box: of the centres of a grid's cells, None for splats.
-    moment_ns: the one time that a baked field is of, None where it has none. seen_at: what was known at a stamp
-    of when space was last seen, None where nothing is recorded; without has_seen_times only of whether it ever was.
-    figures: what the reconstruction reported of itself, once the replay is done. has_people_margin: whether people
-    are kept at another distance than things. made_from: of a baked field, `SceneFolder.made_from`.
+    `at(stamp_ns)` returns the same object while a scene is in use. observed, cameras: None if not recorded.
+    stamps_ns: of consecutive scenes, each known `latency_ns` after its stamp; empty for one scene for all times.
+    `advance` to a stamp makes the scenes up to it; call `finish` after the replay. box: of a grid's cell centres.
+    moment_ns: the time of a baked field. seen_at: when space was last seen, as known at a stamp; without
+    has_seen_times only if it ever was. figures: of the reconstruction, complete after the replay. has_people_margin:
+    people keep another margin than objects.
     """
 
     at: Callable[[int], KnownFields]
@@ -85,21 +82,19 @@ class KnownScene:
     made_from: Mapping[str, Any] = field(default_factory=dict)
 
     def age_s(self, stamp_ns: int) -> float:
-        """How old [s] the scene in use at a stamp is, of a field how far its moment is from it; NaN where there are
-        no times.
-        """
+        """Age [s] of the scene in use; for a field, time from its moment; NaN without times."""
         if self.moment_ns is not None:
             return abs(stamp_ns - self.moment_ns) * 1e-9
         index = self._index_at(stamp_ns)
         return math.nan if index < 0 else (stamp_ns - self.stamps_ns[index]) * 1e-9
 
     def depth_ns(self, stamp_ns: int) -> int | None:
-        """The stamp [ns] of the newest depth in the scene that is known at a stamp; None where there are no times."""
+        """Stamp [ns] of the newest depth in the scene in use; None without times."""
         index = self._index_at(stamp_ns)
         return None if index < 0 else self.stamps_ns[index]
 
     def step_at(self, stamp_ns: int) -> SceneStep | None:
-        """The two newest scenes at a stamp, None where there is only one."""
+        """The two newest scenes at a stamp, None if there is only one."""
         index = self._index_at(stamp_ns)
         if index < 1:
             return None
@@ -108,7 +103,7 @@ class KnownScene:
         return SceneStep(newer=newer, older=older, seconds=(newer_ns - older_ns) * 1e-9)
 
     def next_ns(self, stamp_ns: int) -> int | None:
-        """The stamp [ns] from which the scene after the one in use at a stamp is known; None without one soon."""
+        """Stamp [ns] from which the next scene is known; None if none follows within NEXT_SCENE_NS."""
         later = self._index_at(stamp_ns) + 1
         self.advance(stamp_ns + NEXT_SCENE_NS)
         known_ns = [stamp + self.latency_ns for stamp in self.stamps_ns[later : later + 1]]
@@ -122,8 +117,9 @@ class KnownScene:
 def fields_at(
     stamps_ns: Sequence[int], latency_ns: int, key_of: Callable[[int], Key], fields_of: Callable[[Key], KnownFields]
 ) -> Callable[[int], KnownFields]:
-    """The fields of the newest scene (by its index among `stamps_ns`) that is known at a stamp; those of the HELD
-    scenes used last are kept. It raises NotEvaluableError where none is known yet.
+    """Return a lookup of the newest scene known at a stamp; it keeps the last HELD.
+
+    The lookup raises NotEvaluableError before the first scene is known.
     """
     kept = lru_cache(maxsize=HELD)(fields_of)
 
@@ -139,7 +135,7 @@ def fields_at(
 
 
 def from_grid(path: Path) -> KnownScene:
-    """The scene of a baked grid: one field for all times. `path` is a field folder or a ``field.npz``."""
+    """Read a baked grid as one scene for all times; `path` is its folder or ``field.npz``."""
     file = path / "field.npz" if path.is_dir() else path
     grid = read_npz(Parts.beside(file).checked(file))
     barrier = GridField(grid)
@@ -173,9 +169,9 @@ def from_grid(path: Path) -> KnownScene:
 
 
 def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0) -> KnownScene:
-    """The scene of a reconstruction: at each stamp the fields of its newest snapshot that is as old as the latency.
+    """Read a reconstruction; each stamp uses the newest snapshot at least as old as the latency.
 
-    Known space is what a camera saw, and what the robot itself was in at some time of the log.
+    Known space is where a camera looked, or the robot ever was in the log.
     """
     scene = open_scene(path)
     stamps = sorted({snapshot.stamp_ns for snapshot in scene.snapshots} | {scene.stamp_ns})
@@ -218,16 +214,14 @@ def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0
 
 
 def seen_of(voxels: SeenVoxels) -> Seen:
-    """What the space about an arm is asked for."""
+    """Convert seen voxels for `NearSpace`."""
     edges = np.column_stack([voxels.edges.centers, voxels.edges.radii]).astype(np.float64)
     return Seen(look=voxels.look, edges=edges, origin=voxels.origin, voxel=voxels.voxel)
 
 
 def _seen_in_grid(observed: Observed, grid: DistanceGrid) -> Seen:
-    """What a baked grid says: whether a camera ever saw a place. It does not say when, or why not."""
-
     def look(points: Float64) -> tuple[NDArray[np.int64], UInt8]:
-        is_seen = np.isin(observed(points), BY_CAMERA)  # the robot's spheres stick out: swept by them is not seen
+        is_seen = np.isin(observed(points), BY_CAMERA)  # the robot's spheres stick out: swept space is not seen
         classes = np.where(is_seen, EvidenceClass.FREE, EvidenceClass.OUT_OF_VIEW).astype(np.uint8)
         return np.where(is_seen, np.int64(0), np.int64(-1)), classes
 
@@ -235,15 +229,13 @@ def _seen_in_grid(observed: Observed, grid: DistanceGrid) -> Seen:
 
 
 def known_space(occupancy: OccupancyGrid) -> Observed:
-    """What a camera saw or the robot was in, of an occupancy grid."""
+    """Look up whether a camera saw a place or the robot swept it."""
     known = (occupancy.num_updates > 0) | ((occupancy.entity & SWEPT) > 0)
     return partial(observed_at, known.astype("uint8"), occupancy.origin, occupancy.voxel)
 
 
 def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: Balls | None = None) -> KnownFields:
-    """Exact and barrier field of the splats and of the occupied voxels without one, the robot's own left out; in the
-    latter people count as much nearer as `control.human_margin` asks.
-    """
+    """Exact and barrier field of the obstacles; people count nearer in the barrier (`control.human_margin`)."""
     obstacles = obstacle_spheres(splats, unrepresented)
     chosen = obstacles.splats
     spheres = Spheres.of(chosen.centers, chosen.radii)
@@ -267,7 +259,6 @@ def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: 
 
 
 def _splats_alone(obstacles: ObstacleSpheres, threads: int) -> DistanceFunction | None:
-    """The exact distance without the balls of voxels that no splat represents, None where there are none."""
     if not obstacles.num_unrepresented:
         return None
     is_splat = obstacles.index != NO_SPLAT
@@ -279,7 +270,6 @@ def _splats_alone(obstacles: ObstacleSpheres, threads: int) -> DistanceFunction 
 
 
 def _nearest_spheres(obstacles: ObstacleSpheres, index: Index, points: Float64) -> tuple[Obstacle, ...]:
-    """The spheres that are nearest to points (Q, 3), by their index (Q,) in the field."""
     splats = obstacles.splats
     in_file = [None if k == NO_SPLAT else int(k) for k in obstacles.index[index]]
     offset = points - splats.centers[index].astype(np.float64)
@@ -298,7 +288,6 @@ def _nearest_spheres(obstacles: ObstacleSpheres, index: Index, points: Float64) 
 
 
 def _nearest_cells(grid: DistanceGrid, field: GridField, points: Float64) -> tuple[Obstacle, ...]:
-    """The cells that hold the nearest surface to points (Q, 3), as the gradient points to it."""
     distance, gradient = field.query(points)
     surface = points - gradient * (distance / np.maximum(np.linalg.norm(gradient, axis=1), 1e-12))[:, None]
     cells = np.nan_to_num(np.floor((surface - grid.origin) / grid.voxel + 0.5)).astype(np.int64)
@@ -327,16 +316,15 @@ def _median_radius(file: Path, header: Mapping[str, object]) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Certified:
-    """A scene to plan in: a lower bound of the exact distance to the splats."""
+    """Adapter of `certified_distance` for the planner."""
 
     distance: DistanceFunction
 
 
 def certified_distance(fields: KnownFields) -> DistanceFunction:
-    """A lower bound of a 1-Lipschitz distance: of a grid its certified one, of splats the exact one less rounding.
+    """Return a lower bound of the exact, 1-Lipschitz distance to the splats.
 
-    Both bound the exact distance to the splats, so what is proved of an edge is proved of that. Of the kernel fields
-    nothing can be proved from samples: their slope has no useful bound.
+    Kernel fields prove nothing from samples: their slope has no useful bound.
     """
     certified = fields.distances.get("certified")
     if certified is not None:

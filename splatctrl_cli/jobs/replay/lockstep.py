@@ -1,4 +1,4 @@
-"""A log's reconstruction in lockstep with its replay: frame sets are taken in as the replay's clock passes them."""
+"""A log's reconstruction in lockstep with its replay's clock."""
 
 import time
 from bisect import bisect_right
@@ -46,7 +46,7 @@ FOLDER = "scene"  # within the replay's
 
 
 def check_lockstep(request: ReplayRequest) -> None:
-    """Raise UsageError for options that mean nothing without it."""
+    """Raise UsageError for options without effect."""
     if request.latency and request.field is not None:
         raise UsageError("--latency: a baked field is one scene for all times", remedy="give --scene or --lockstep")
     if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != POSE_JUMP):
@@ -64,8 +64,9 @@ def opened_scene(
     source: RecordSource,
     observe: Callable[[RgbdFrame], None] | None = None,
 ) -> KnownScene:
-    """The scene that the options of a replay name; what --lockstep reconstructs, of the log `source`, goes into
-    `folder`, and `observe` is shown every frame of it.
+    """Open the request's scene; --lockstep reconstructs `source` into `folder`.
+
+    `observe` is called with every frame of that log.
     """
     if request.field is not None:
         if request.config.control.human_margin > request.config.control.margin:
@@ -83,7 +84,7 @@ def _latency_ns(request: ReplayRequest) -> int:
 
 
 def reads_whole_log(request: ReplayRequest, source: RecordSource) -> bool:
-    """Whether the scene is made of all frames of the log as it was opened: none is left out as evidence."""
+    """True if a lockstep reads every frame of the log, none left out as evidence."""
     return request.lockstep and request.evidence not in source.cameras
 
 
@@ -96,10 +97,10 @@ def from_log(
     source: RecordSource | None = None,
     observe: Callable[[RgbdFrame], None] | None = None,
 ) -> KnownScene:
-    """The scene that a log's own cameras give as it goes; what is reconstructed is left in `folder`/scene.
+    """Reconstruct a log as the replay goes, into `folder`/scene.
 
-    source: the log, where it is open already. observe: is shown every frame of it, those behind the replay's end when
-    that is done. Raises InputError for a log without frames or a clock.
+    source: the log, if open already. observe: called with every frame; those after the replay's end in `finish`.
+    Raises InputError for a log without frames or a clock.
     """
     config = request.config
     source = _training_source(request, model, source)
@@ -140,10 +141,10 @@ def from_log(
 
 
 class Lockstep:
-    """Frame sets that wait, and the stamps and files of the maps after those that were taken in.
+    """Frame sets still to come, and stamps and files of the maps so far.
 
-    ends_with_log: known space is that of the whole log, else that of the frame sets that the replay passed.
-    held_out_every: of so many frame sets one is not taken in, as it is evidence of the map's error.
+    ends_with_log: known space is of the whole log, else of the frame sets passed. held_out_every: one in so many is
+    evidence and left out.
     """
 
     def __init__(
@@ -159,7 +160,7 @@ class Lockstep:
         self._fitted, self._config, self._console = fitted, config, console
         self._latency_ns, self._ends_with_log = latency_ns, ends_with_log
         self._stopwatch = Stopwatch()
-        self._taking: list[tuple[int, float]] = []  # of each frame set, its stamp [ns] and the time [s] that it took
+        self._taking: list[tuple[int, float]] = []  # stamp [ns] and duration [s] of each frame set
         self._held_out_every = held_out_every
         self._steps = trained(fitted.time_steps(), held_out_every)
         self._next = next(self._steps, None)
@@ -168,7 +169,7 @@ class Lockstep:
         self._known: tuple[int, Observed] = (0, lambda points: np.zeros(len(points), np.uint8))  # after so many
 
     def scene(self) -> KnownScene:
-        """As a replay sees it; the first frame sets, up to the first map, are taken in at once."""
+        """Return the scene of a replay; takes frame sets up to the first map at once."""
         while self._next is not None and not self._stamps_ns:
             self._take()
         self._fitted.check_found()
@@ -206,7 +207,6 @@ class Lockstep:
         )
 
     def _advance(self, stamp_ns: int) -> None:
-        """Take in every frame set that is known at a stamp."""
         while self._next is not None and self._next.stamp_ns + self._latency_ns <= stamp_ns:
             self._take()
 
@@ -227,7 +227,6 @@ class Lockstep:
             self._files.append(snapshot.path)
 
     def _observed(self, points: Float64) -> UInt8:
-        """The known space of the log, or of as much of it as the replay has passed."""
         while self._ends_with_log and self._next is not None:
             self._take()
         num_taken, known = self._known
@@ -238,9 +237,7 @@ class Lockstep:
         return known(points)
 
     def _finish(self) -> None:
-        """Leave a scene folder as `reconstruct` writes it, of the frame sets that were taken in; the others are only
-        shown to who observes.
-        """
+        """Write a scene folder as `reconstruct` does; later frames go to `observe` alone."""
         fitted = self._fitted
         if fitted.observe is not None:
             with self._stopwatch.stage("read"):
@@ -261,7 +258,6 @@ class Lockstep:
         self._console.log(self._speed())
 
     def _speed(self) -> str:
-        """How long a frame set takes from its frames to its map, and how far apart they were recorded."""
         stamps_ns, seconds = zip(*self._taking, strict=True)
         middle, most = (f"{1e3 * float(t):.0f} ms" for t in np.percentile(seconds, [50, 99]))
         apart = f", recorded {1e-6 * float(np.median(np.diff(stamps_ns))):.0f} ms apart" if len(stamps_ns) > 1 else ""
@@ -272,7 +268,6 @@ class Lockstep:
 
 
 def _training_source(request: ReplayRequest, model: RobotModel, source: RecordSource | None) -> FrameSource:
-    """The log, whose frames are read in step with the replay; opened anew where one of its cameras is evidence."""
     source = open_states(request.log, request.options, model.joint_names) if source is None else source
     if not source.cameras:
         raise InputError(

@@ -1,6 +1,4 @@
-"""Every figure of a replay, by a name that is known before the work: its value, what it rests on, and when it first
-broke a bound.
-"""
+"""Metrics of a replay by predefined names: value, sample count, first failure."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -53,7 +51,6 @@ Declared = tuple[Metric[Replay], ...]
 
 
 def num_states(replay: Replay) -> int:
-    """Number of judged states."""
     return len(replay.audit.stamp_ns)
 
 
@@ -71,7 +68,6 @@ def _single(
     count: Callable[[Replay], int] = num_states,
     scale: Scale = DESCRIBES,
 ) -> Metric[Replay]:
-    """A figure that is not made of a column."""
     return Metric(name=name, value=value, count=count, scale=scale)
 
 
@@ -81,21 +77,16 @@ def _clearance(field: str) -> Metric[Replay]:
 
 
 def _of(columns: str, name: str, part: int | None = None) -> Callable[[Replay], Float64]:
-    """Reads a column of the replay's figures, or a part of one: `between`, `near`, `strain`, `divergence`, or those
-    of a controller.
-    """
     figures = attrgetter(columns)
     return lambda replay: figures(replay)[name] if part is None else figures(replay)[name][:, part]
 
 
 def _num_sudden(replay: Replay) -> int:
-    """States that have an acceleration, where that has a limit."""
     since = replay.audit.stamp_ns - replay.audit.stamp_ns[0]
     return int(np.sum(since >= 2 * MOTION_WINDOW * 1e9)) if np.any(replay.config.control.max_acceleration) else 0
 
 
 def _map_error(name: str, figure: str, scale: Scale) -> Metric[Replay]:
-    """By held-out depth; None without, or where that is too little."""
     return _single(
         name,
         lambda r: getattr(r.map_error.bound, figure) if r.map_error and r.map_error.bound else None,
@@ -241,7 +232,6 @@ OF_OPEN_LOOP: Declared = (
 
 
 def _trace(name: str, value: Callable[[ReplayTrace], float], scale: Scale = DESCRIBES) -> Metric[Replay]:
-    """A figure of the closed loop."""
     return _single(name, lambda replay: value(replay.closed_loop) if replay.closed_loop else None, scale=scale)
 
 
@@ -282,11 +272,10 @@ AGREEMENT = {
     **dict.fromkeys(("median", "p95", "largest", "largest_over"), ERROR),
     "share_within": GOOD_SHARE,
     "num_compared": DESCRIBES,
-}  # scales of what clearance_agreement gives, but of its tolerance
+}  # scales of clearance_agreement's figures, except its tolerance
 
 
 def _declared(mode: str, of_fields: Sequence[str]) -> Declared:
-    """The metrics of a --mode with fields by name ("exact" first)."""
     return (*OF_AUDIT, *map(_clearance, of_fields), *OF_STATES, *OF_MODE[mode])
 
 
@@ -297,14 +286,13 @@ def _declared_of(replay: Replay) -> Declared:
 def metric_names(
     mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
 ) -> tuple[str, ...]:
-    """The names that `metrics_of` and the log's own figures have for a --mode."""
+    """Names of `metrics_of` and of the log's own figures."""
     return tuple(metric_scales(mode, of_fields, has_truth=has_truth, has_twists=has_twists))
 
 
 def metric_scales(
     mode: str, of_fields: Sequence[str], *, has_truth: bool, has_twists: bool = False
 ) -> dict[str, Scale]:
-    """How two runs are compared by each of `metric_names`."""
     scales = {metric.name: metric.scale for metric in _declared(mode, of_fields)} | LOG_FIGURES
     scales |= TWIST_FIGURES if has_twists else {}
     if has_truth:
@@ -314,12 +302,12 @@ def metric_scales(
 
 
 def shown_metrics(mode: str, of_fields: Sequence[str]) -> dict[str, Shown]:
-    """Where ``steps.csv`` shows the metrics that it shows, by name."""
+    """Columns of ``steps.csv`` that show a metric, by metric name."""
     return {metric.name: metric.shown for metric in _declared(mode, of_fields) if metric.shown is not None}
 
 
 def metrics_of(replay: Replay) -> Metrics:
-    """Every figure that is printed, written and gated on, by name; None where there is no value."""
+    """Every printed, written and gated figure by name; None without a value."""
     metrics: Metrics = {metric.name: metric.value(replay) for metric in _declared_of(replay)}
     metrics |= replay.twist_figures
     for name, agreement in replay.agreement.items():
@@ -329,9 +317,7 @@ def metrics_of(replay: Replay) -> Metrics:
 
 
 def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> Counts:
-    """How many states, intervals, spheres or points each metric rests on; where nothing else is known of it, the
-    states that were judged.
-    """
+    """Number of states, intervals, spheres or points behind each metric, by default the judged states."""
     found = dict.fromkeys(metrics, num_states(replay))
     found |= {metric.name: metric.count(replay) for metric in _declared_of(replay)}
     for field, agreement in replay.agreement.items():
@@ -341,8 +327,9 @@ def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> Counts:
 
 
 def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> float | None:
-    """The first time [s] at which a metric, taken over the states until then, does not hold; None where it is no
-    figure of single states.
+    """First time [s] at which a metric over the states so far breaks.
+
+    None for metrics that are not of single states.
     """
     running = next((of.running for of in _declared_of(replay) if of.name == metric), None)
     start, values = (np.nan, ()) if running is None else running(replay)

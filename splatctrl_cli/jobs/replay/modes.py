@@ -1,4 +1,4 @@
-"""The replays themselves: audit, open loop and closed loop over what was read, and the truth beside them."""
+"""Replays by mode: audit, open loop and closed loop."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -28,7 +28,7 @@ from splatctrl_cli.robot.model import RobotModel
 
 
 def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
-    """The replay that --mode asks for, with its events."""
+    """Run the replay of --mode."""
     if inputs.scene.box is not None:
         check_inside(inputs.model, inputs.states.position[0], inputs.scene.box)
     mode = {"audit": _audited, "open-loop": _asked, "closed-loop": _driven}[request.mode]
@@ -36,7 +36,6 @@ def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, conso
 
 
 def _audited(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
-    """The audit of every logged state for which a scene was known."""
     first, record = _first_judged(request, inputs), _record(request, inputs, config)
     for stamps, positions, velocities in _blocks(record, inputs.states, first):
         record.explain(record.measured(stamps, positions, velocities))
@@ -44,7 +43,6 @@ def _audited(request: ReplayRequest, inputs: ReplayInputs, config: Config, conso
 
 
 def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
-    """The audit, and the controller's command at every state of it."""
     scene, model, states = inputs.scene, inputs.model, inputs.states
     first, record = _first_judged(request, inputs), _record(request, inputs, config)
     frame = request.frame or model.frame_names[-1]
@@ -82,7 +80,7 @@ def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
 
 
 def _with_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -> ReplayTrace:
-    """With what the first scene after the motion shows: something may have come between the last two."""
+    """Add the change to the first scene after the motion: an obstacle may have appeared."""
     last_ns = int(trace.stamp_ns[-1])
     next_ns = scene.next_ns(last_ns)
     if next_ns is None:
@@ -93,7 +91,6 @@ def _with_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -
 
 
 def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
-    """The closed loop, the audit of the states it went through, and how far they are from the log."""
     scene, model, record = inputs.scene, inputs.model, _record(request, inputs, config)
     motion = inputs.motion()
     twists = twist_track(request, model, _span(inputs), console)
@@ -151,14 +148,12 @@ def _record(request: ReplayRequest, inputs: ReplayInputs, config: Config) -> Rep
 
 
 def _blocks(record: ReplayRecord, states: StateColumns, start: int) -> Iterator[tuple[Stamps, Float64, Float64]]:
-    """Stamps (T,), positions and velocities (T, J) of the states from `start` on, a block at a time."""
     for first, last in record.blocks(states.stamp_ns[start:]):
         part = slice(start + first, start + last)
         yield states.stamp_ns[part], states.position[part], states.velocity[part]
 
 
 def _logged(request: ReplayRequest, inputs: ReplayInputs, config: Config, record: ReplayRecord, first: int) -> Replay:
-    """The replay of logged states from `first` on, whose static violations are those at the end."""
     states, model = inputs.states, inputs.model
     last = inputs.scene.at(int(states.stamp_ns[-1]))
     statics = static_violations(model, last.barrier, states.position[-1], scene_margin(model, config.control))
@@ -202,8 +197,9 @@ def _replay(
 
 
 def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
-    """The stamp from which on the request wants the log replayed. Raises InputError for one after its end,
-    NotEvaluableError where all of the log is before the scene.
+    """Stamp from which to replay the log.
+
+    Raises InputError after its end, NotEvaluableError if the log ends before the scene.
     """
     scene, stamps = inputs.scene, inputs.states.stamp_ns
     if scene.first_ns is not None and scene.first_ns > stamps[-1]:
@@ -228,7 +224,6 @@ def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
 
 
 def _first_judged(request: ReplayRequest, inputs: ReplayInputs) -> int:
-    """The first requested state for which a scene is known."""
     scene, stamps = inputs.scene, inputs.states.stamp_ns
     earliest = _requested_ns(request, inputs)
     return int(np.searchsorted(stamps, earliest if scene.first_ns is None else max(earliest, scene.first_ns)))
@@ -241,7 +236,6 @@ def _span(inputs: ReplayInputs) -> tuple[int, int]:
 def _task(
     request: ReplayRequest, inputs: ReplayInputs, motion: LoggedMotion, twists: TwistTrack | None, tolerance: float
 ) -> ReplayTask:
-    """The start (logged, and not before the scene is known) and the goal (given, or the logged end)."""
     stamps, positions = motion.stamp_ns, motion.position
     start = _first_judged(request, inputs)
     frame = request.frame or inputs.model.frame_names[-1]
@@ -266,7 +260,7 @@ def _task(
 
 
 def planned_ways_out(inputs: ReplayInputs, task: ReplayTask, config: Config) -> PlanDetour | None:
-    """The planner of detours out of a closed loop's local minima; None where detours are off."""
+    """Planner of detours from local minima; None if detours are off."""
     if config.control.max_detours == 0:
         return None
     return planned_detours(

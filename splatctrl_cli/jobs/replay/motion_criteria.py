@@ -1,4 +1,4 @@
-"""Criteria of a replay's verdict: the motion against the scene, itself, its limits and its goal."""
+"""Criteria of a replay's motion: scene, self-collision, limits and goal."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -39,7 +39,7 @@ def clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def certified_clearance(judged: Judged) -> Iterator[Reason]:
-    """With a grid alone: the bound that interpolation cannot break keeps the margin."""
+    """With a grid alone: the bound that holds between its cells keeps the margin."""
     clearance = judged.replay.audit.clearance
     if "certified" not in clearance:
         return
@@ -60,7 +60,7 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def clearance_of_people(judged: Judged) -> Iterator[Reason]:
-    """With `control.human_margin`: people are kept at that distance."""
+    """With `control.human_margin`: people keep that distance."""
     if judged.inputs.scene.has_people_margin:
         yield from _by_source(judged, "barrier")
 
@@ -98,7 +98,6 @@ def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
 
 
 def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
-    """Kept by the splats, which are `represented` [m] away; maybe not by the voxels that have none."""
     replay = judged.replay
     least = least_of(replay.audit.clearance["exact"].distance)
     assert least is not None
@@ -121,7 +120,6 @@ def _unrepresented(judged: Judged, represented: float) -> Iterator[Reason]:
 
 
 def _at_worst(event: Event, reason: Reason) -> Reason:
-    """The reason with when, who and where of an event's worst state."""
     there = event.obstacle
     return replace(
         reason,
@@ -133,10 +131,9 @@ def _at_worst(event: Event, reason: Reason) -> Reason:
 
 
 def self_clearance(judged: Judged) -> Iterator[Reason]:
-    """No two links of the arm overlap, none comes within the margin of one that stands still and carries none (a
-    table of the URDF), and none that were given a lower margin are driven nearer to each other than
-    `control.self_margin` (or half of the largest gap that they ever have) and than in the recording. By their
-    collision surfaces; by their spheres where these cannot be read.
+    """No two links overlap. No moving link comes within the margin of a fixed one that carries none, such as a table
+    of the URDF. Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest
+    gap) unless the recording was. Measured by collision surfaces, or by spheres if these cannot be read.
     """
     least = least_of(judged.replay.audit.figures["self_clearance"])
     events = events_of(judged.replay, EventKind.SELF_COLLISION)
@@ -162,7 +159,6 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def _beside_fixture(judged: Judged) -> Reason | None:
-    """A moving link that came nearer than the margin to a link that stands still, such as a table of the URDF."""
     found = [(gap, stamp, pair) for pair, (gap, stamp) in judged.replay.closest.items() if pair.is_fixture]
     gap, stamp, pair = min(found, key=lambda one: one[0] - one[2].apart, default=(np.inf, 0, None))
     if pair is None or gap >= pair.apart - SLIGHTLY_UNDER:
@@ -182,9 +178,7 @@ def _beside_fixture(judged: Judged) -> Reason | None:
 
 
 def _brought_together(judged: Judged) -> Reason | None:
-    """What our controller brought nearer than a lowered margin is to keep it, and than the recording had it: the rows
-    did not hold there what was asked for.
-    """
+    """The first pair our controller brought below its lowered margin and nearer than the recording."""
     inputs, replay = judged.inputs, judged.replay
     if replay.outside is not None:
         return None
@@ -211,9 +205,9 @@ def _brought_together(judged: Judged) -> Reason | None:
 
 
 def static_clearance(judged: Judged) -> Iterator[Reason]:
-    """Nothing comes within the margin of a link that no joint moves, by its own surface, in two scenes in a row and
-    1 cm or more (beside its mount 3 cm) from all that stood there when a camera first looked. What stands there from
-    the start is a note.
+    """No new obstacle comes within the margin of a fixed link's surface in two scenes in a row. New is what lies 1 cm
+    or more (at its mount 3 cm) from all that stood there when a camera first looked. What stands there from the start
+    is a note.
     """
     broken = {
         name: (first, least)
@@ -234,7 +228,7 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def position_limits(judged: Judged) -> Iterator[Reason]:
-    """Those of the URDF, with `control.limit_tolerance` for encoder noise."""
+    """Joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise."""
     least, tolerance = (
         least_of(judged.replay.audit.figures["limit_margin"]),
         judged.request.config.control.limit_tolerance,
@@ -260,7 +254,7 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
 
 
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
-    """At most one percent above those of the URDF, in the motion and in the commands of a controller of one's own."""
+    """At most one percent above the URDF's limits, in the motion and in the commands of a user's controller."""
     too_fast = commanded(judged)
     yield from _share_of_limit(judged, "velocity", EventKind.TOO_FAST) if too_fast is None else (too_fast,)
 
@@ -291,9 +285,7 @@ def _share_of_limit(judged: Judged, column: str, kind: EventKind) -> Iterator[Re
 
 
 def surface_clearance(judged: Judged) -> Iterator[Reason]:
-    """The spheres' clearance less what they leave uncovered keeps the margin, and every moving link has a
-    sphere.
-    """
+    """The spheres' clearance less what they leave uncovered keeps the margin; every moving link has a sphere."""
     model = judged.replay.model
     deficit = model.sphere_deficit[np.asarray(model.moving_spheres)]
     if np.isnan(deficit).any():
@@ -328,7 +320,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:
-    """A lower bound, by the spheres' lever arms, keeps the margin; intervals are halved where it is too low."""
+    """A lower bound by the spheres' lever arms keeps the margin; intervals where it is too low are halved."""
     model, columns = judged.replay.model, judged.replay.between
     _, surface, between = _of_body(judged)
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
@@ -348,9 +340,7 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
 
 
 def _of_body(judged: Judged) -> tuple[float, float | None, float | None]:
-    """The least clearance [m] of the spheres, of the surface, and between the states; the last two None where they
-    are not known, or the spheres' own already says that the margin is broken.
-    """
+    """Least clearance [m] of spheres, surface, and between states; the last two None if already broken."""
     clearance = judged.replay.audit.clearance
     spheres = least_of(clearance["certified" if "certified" in clearance else "exact"].distance)  # as `surface` is
     if spheres is None or spheres < judged.threshold:

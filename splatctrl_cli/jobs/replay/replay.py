@@ -1,4 +1,4 @@
-"""A replay from its request to its result: read, replay, measure, write."""
+"""A replay: read, replay, measure, write."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,12 +51,7 @@ from splatctrl_cli.simulate.truth import load_truth
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayResult:
-    """What a replay found, all of it written to `out`.
-
-    inputs: what it read, with the scene as it was known at each time (of ``lockstep``, while the replay ran).
-    verdict: what it comes to; notes: sentences on the robot, the pictures and the log. is_damaged: part of the log
-    was lost.
-    """
+    """A replay's result; is_damaged: part of the log was lost."""
 
     __repr__ = brief
 
@@ -69,14 +64,15 @@ class ReplayResult:
     is_damaged: bool
 
     def exit_code(self, *, report_only: bool = False) -> int:
-        """1 or 5 as the verdict says, 3 for a damaged log, else 0; with `report_only` only the request's own gates
-        turn it.
+        """1 or 5 by the verdict, 3 for a damaged log, else 0.
+
+        With `report_only` only the request's own gates set 1 or 5.
         """
         return self.verdict.exit_code_of(ASKED if report_only else None) or (3 if self.is_damaged else 0)
 
 
 def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
-    """Replay, and write the output folder. Raises SplatCtrlError for what cannot be replayed."""
+    """Replay, and write the output folder. Raises SplatCtrlError if that is impossible."""
     check_request(request)
     config, stopwatch = request.config, Stopwatch()
     with output_path(request.out, force=request.force, is_folder=True) as folder:
@@ -118,9 +114,7 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
 
 
 def check_request(request: ReplayRequest) -> None:
-    """Raise UsageError for what no replay can be made of: gates on figures that it does not have, options that
-    belong to another mode.
-    """
+    """Raise UsageError for gates on missing figures, and options of another mode."""
     fields = ("exact", "barrier", *(("certified",) if request.field is not None else ()))
     has_truth, has_twists = request.truth is not None, request.twist_topic is not None
     names = {mode: metric_names(mode, fields, has_truth=has_truth, has_twists=has_twists) for mode in MODES}
@@ -135,7 +129,7 @@ def check_request(request: ReplayRequest) -> None:
 def _seen_by_cameras(
     request: ReplayRequest, inputs: ReplayInputs, replay: Replay
 ) -> tuple[Replay, list[Sight | None]]:
-    """With the truth, and images of the worst moments: one pass over the frames for both."""
+    """Add the truth and images of the worst moments in one pass over the frames."""
     off = inputs.scene.figures().get("displaced_cameras") or {}
     recorded = frames_of(inputs.source) if inputs.source.cameras else iter(())
     replay, surfaces = with_truth(inputs, replay)
@@ -152,7 +146,7 @@ def _seen_by_cameras(
 def _read(
     request: ReplayRequest, folder: Path, progress: Progress, motion: ImageMotion
 ) -> tuple[ReplayInputs, LoggedStates, Evidence | None, MeasuredRobot]:
-    """What the replay needs; `motion` is shown all frames of the log now, or as a lockstep takes them in."""
+    """Read the inputs; `motion` sees every frame of the log now, or during a lockstep."""
     model, opened = open_log(request, progress)
     if request.urdf is None:  # for who looks at the run
         (folder / ROBOT).write_text(model.urdf.text, encoding="utf-8", newline="")
@@ -193,7 +187,6 @@ def _read(
 def _mismatches(
     request: ReplayRequest, known: KnownScene, logged: LoggedStates, model: RobotModel
 ) -> tuple[Mismatch, ...]:
-    """What does not belong together; a log that is its own scene always does."""
     if request.field is not None:
         return tuple(made_from_mismatches(request.field, known.made_from, logged.source, model))
     if request.scene is None:

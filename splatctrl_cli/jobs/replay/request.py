@@ -1,4 +1,4 @@
-"""The request of a replay, its inputs, and its result: audit, trace and their references."""
+"""A replay's request, inputs and result."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,15 +36,14 @@ JUDGE, OCCUPIED = "judge", "occupied"  # space that no camera saw free: judged b
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayRequest(RobotOptions, RunOptions):
-    """One replay: the options of ``splatctrl replay``, by their names.
+    """One replay: the options of ``splatctrl replay``, by name.
 
-    log: a log or capture with joint states, read as `options` say. urdf: the robot, None for the one that the log
-    describes itself. One of `scene` (a reconstruction), `field` (a baked grid) and `lockstep` (reconstruct the log on
-    the way, on `device`) says what is known of the scene. Times in seconds; start_time may be FIRST_MAP. evidence: a
-    camera, or every how many frame sets, that did not train the scene and bounds its error; with require_evidence no
-    verdict passes without, with require_proof none where space about the arm was assumed to be free; unseen: `JUDGE`
-    or `OCCUPIED`. controller: a user's own class, ``module:Class``, or controller_command: a program
-    (docs/controllers.md). report_only: the verdict alone does not set the exit code.
+    log: read by `options`. urdf: None for the robot of the log. The scene is `scene` (a reconstruction), `field` (a
+    baked grid) or `lockstep` (reconstruct on the way, on `device`). start_time [s] may be FIRST_MAP. evidence: a
+    held-out camera, or k for each k-th frame set, to bound the map's error. require_evidence, require_proof: no pass
+    without evidence, or with space about the arm assumed free. unseen: `JUDGE` or `OCCUPIED`. controller: a user's
+    class ``module:Class``; controller_command: a program (docs/controllers.md). report_only: the verdict sets no exit
+    code.
     """
 
     log: Path
@@ -89,8 +88,9 @@ class ReplayRequest(RobotOptions, RunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayInputs:
-    """Everything a replay reads; states in the model's joint order. mismatches: inputs that do not belong together.
-    surfaces: of the robot's links, None where they cannot be read; kept: what pairs of them keep of the margin.
+    """All inputs of a replay; states in the model's joint order.
+
+    surfaces: of links, None if unreadable. kept: margins of pairs.
     """
 
     source: RecordSource
@@ -105,18 +105,17 @@ class ReplayInputs:
     kept: tuple[KeptMargin, ...] = ()
 
     def motion(self) -> LoggedMotion:
-        """Every logged state, whether a scene was known or not."""
         states = self.states
         return LoggedMotion(stamp_ns=states.stamp_ns, position=states.position, velocity=states.velocity)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapError:
-    """What held-out frame sets say of the map: `bound` is None where they are too few.
+    """The map's error by held-out frame sets; `bound` is None if they are too few.
 
-    source: which frames, in words; num_sets: those within the judged time, num_seen of them with points near the
-    motion, num_points in all; time_s, place (3,) [m]: when (since the first judged state) and where the map misses as
-    much as the bound says. A bound below 0, of a map that is fatter than what it shows everywhere, is given as 0.
+    num_sets: within the judged time, num_seen of them with points near the motion. time_s (since the first judged
+    state), place (3,) [m]: where the miss equals the bound. A negative bound, of a map fatter than its surfaces,
+    becomes 0.
     """
 
     source: str
@@ -130,14 +129,12 @@ class MapError:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """One finished replay of T states: their audit, the trace of its mode, and the truth where it is known.
+    """A finished replay of T states: audit, trace of its mode, and truth if known.
 
-    num_before_scene: requested states earlier than the first scene, left out, over lead_in_s [s]; start_time_s: of
-    the first state in the log [s]; between, near, strain, statics and closest: as `ReplayRecord` has them; unwatched,
-    overtaken: what later depth showed; obstacles (T,): what is nearest to the nearest sphere, in words; map_age_s
-    (T,): of the scene in use; kept_steps: of a controller; divergence: of a closed loop from the log, by columns
-    joints [rad], position [m], rotation [rad]; map_error: where the request names evidence of it; outside: of a
-    user's own controller.
+    num_before_scene: requested states before the first scene, left out, over lead_in_s [s]. start_time_s: of the
+    first state in the log. between, near, strain, statics, closest: as in `ReplayRecord`. unwatched, overtaken: from
+    later depth. map_age_s (T,). divergence: of a closed loop from the log: joints [rad], position [m], rotation
+    [rad]. outside: a user's controller.
     """
 
     model: RobotModel
@@ -170,16 +167,15 @@ class Replay:
 
     @property
     def margin(self) -> float:
-        """The least clearance [m] that is allowed."""
+        """The least clearance allowed [m]."""
         return self.config.control.margin
 
     @property
     def mode(self) -> str:
-        """The mode, named as by --mode."""
         return "closed-loop" if self.closed_loop else "open-loop" if self.open_loop else "audit"
 
     @property
     def steps(self) -> Sequence[ControlStep | None]:
-        """What the controller decided at each state; empty in an audit."""
+        """The controller's steps; empty in an audit."""
         trace = self.closed_loop or self.open_loop
         return () if trace is None else trace.steps

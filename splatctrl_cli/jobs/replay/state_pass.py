@@ -1,4 +1,4 @@
-"""States of a replay as they come, block by block: measured, explained, and kept in files."""
+"""States of a replay, measured, explained and stored block by block."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -35,7 +35,7 @@ from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces, sphere_ga
 from splatctrl_cli.voxels import EvidenceClass
 
 KINDS = len(EvidenceClass)
-NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # of what was known about the arm, and their shapes at a state
+NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # columns of evidence about the arm, with their shapes at a state
     **dict.fromkeys(("age", "ahead", "unseen", "assumed", "unseen_to_surface", "blind_to_surface"), ()),
     **{
         "unseen_to_surface_place": (3,),
@@ -48,16 +48,15 @@ NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # of what was known about the a
 
 
 class ReplayRecord:
-    """The audit of states (T,) in the scenes as they were known, what is nearest to the nearest sphere of each, in
-    words, the age (T,) [s] of each state's scene, and what happened.
+    """Audit of T states in the scenes known at their times, with what happened.
 
-    between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), 1 where that is
-    the clearance of a posture on the way instead (`met`), the time [s] that nobody can bound (`unbounded`), the
-    clearance [m] of the body at the state (`surface`), and that of the spheres to the splats alone (`represented`).
-    near: what was known about the arm (`NEAR_COLUMNS`), NaN at states that were not looked at.
-    hindsight: what later depth says of times without any; newer_depth: of states that a late map judged. strain:
-    velocity and acceleration as shares of their limits. closest: of pairs of links that keep less than the
-    margin asked for, how near they came [m] and the stamp; nothing of those that stayed apart.
+    obstacles: nearest to the nearest sphere.
+    between: clearance bound since the state before (`lower` [m], NaN at the first). `met`: 1 if a posture on the way
+    has it. `unbounded` [s]: time without a bound. `surface` [m]: clearance of the body. `represented` [m]: of the
+    spheres to splats alone.
+    near: `NEAR_COLUMNS`, NaN where not evaluated. hindsight: later depth about unwatched times. newer_depth: states
+    judged by a late map. strain: shares of the velocity and acceleration limits. closest: of link pairs below their
+    margin, gap [m] and stamp.
     """
 
     def __init__(
@@ -73,9 +72,10 @@ class ReplayRecord:
         surfaces: SelfSurfaces | None = None,
         kept: Sequence[KeptMargin] = (),
     ) -> None:
-        """is_continuous: False where the arm is put elsewhere on the way, so that nothing holds between states.
-        declared: contact that is meant, at times that count from `first_state_ns`. surfaces: of the links, which tell
-        where the arm touches itself; None for its spheres alone. kept: margins of pairs of links.
+        """Start an empty record.
+
+        is_continuous: False if the arm is re-anchored, so that nothing is bounded between states. declared: intended
+        contact, its times from `first_state_ns`. surfaces: for self-collision; None uses the spheres.
         """
         self._declared, self._first_state_ns = declared or Declarations(), first_state_ns
         self.audit, self.obstacles, self.ages = StoredAudit(), StoredObjects[str](), Figures()
@@ -104,12 +104,10 @@ class ReplayRecord:
         self.newer_depth = NewerDepth(scene, config.control.margin - SLIGHTLY_UNDER, self._clearance_in)
         self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
         self._last_scene: KnownFields | None = None
-        self._seen_before: Seen | None = None  # when the fixed spheres were last looked at
+        self._seen_before: Seen | None = None  # at the last check of the fixed spheres
 
     def blocks(self, stamps: Stamps) -> Iterator[tuple[int, int]]:
-        """Ranges of at most BLOCK consecutive states of stamps (T,) that see the same scene with one surface of the
-        robot.
-        """
+        """Ranges of at most BLOCK of stamps (T,), with one scene and robot surface each."""
         first = 0
         while first < len(stamps):
             scene, last = self._scene.at(int(stamps[first])), first + 1
@@ -121,7 +119,7 @@ class ReplayRecord:
             first = last
 
     def measured(self, stamps: Stamps, positions: Float64, velocities: Float64) -> AuditTrace:
-        """The audit of the next block of states (T, J), which see one scene."""
+        """Audit and store the next block of states (T, J), which see one scene."""
         scene, self._model = self._scene, self._robot.at(int(stamps[0]))
         part = audit(self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed)
         part = self._look_at_self(self._without_expected(part))
@@ -139,7 +137,7 @@ class ReplayRecord:
         return part
 
     def explain(self, part: AuditTrace, steps: Sequence[ControlStep | None] = ()) -> None:
-        """Find what happened in the block that was measured last, with what a controller did there."""
+        """Find the events of the block measured last, with the controller's `steps` there."""
         signals = audit_signals(part, self._margin, self._spheres, self._model.joint_names, self._pairs)
         signals += limit_signals(self._strain, self._model.joint_names)
         signals += interval_signals(self._lower, self._unbounded, self._margin - SLIGHTLY_UNDER)
@@ -157,7 +155,6 @@ class ReplayRecord:
         self.events.add(part.stamp_ns, signals, near)
 
     def _without_expected(self, part: AuditTrace) -> AuditTrace:
-        """The audit without the spheres whose contact is declared, where they would break the margin."""
         if not self._declared.expected_contact:
             return part
         clearance, of_spheres, moving = dict(part.clearance), dict(part.of_spheres), self._reach.moving
@@ -169,7 +166,7 @@ class ReplayRecord:
         return replace(part, clearance=clearance, of_spheres=of_spheres)
 
     def _unexpected(self, known: KnownFields, stamps: Stamps, positions: Float64, each: Float64) -> Float64:
-        """Clearances `each` (T, M) [m] of the moving spheres, infinite where contact is declared."""
+        """Clearances `each` (T, M) [m] of moving spheres, infinite where contact is declared."""
         links, kept = self._model.sphere_set.links, each.copy()
         for state, column in zip(*np.nonzero(each < self._margin), strict=True):
             sphere = int(self._reach.moving[column])
@@ -180,7 +177,6 @@ class ReplayRecord:
         return kept
 
     def _clearance_in(self, scene_ns: int, stamps: Stamps, positions: Float64) -> Float64:
-        """Of states (T,), (T, J) in the scene that is known at another time than theirs (T,) [m]."""
         known, found = self._scene.at(scene_ns), []
         for its in np.split(np.arange(len(stamps)), np.searchsorted(stamps, self._robot.changes)):
             if len(its):
@@ -190,9 +186,9 @@ class ReplayRecord:
         return np.concatenate(found)
 
     def _look_at_self(self, part: AuditTrace) -> AuditTrace:
-        """The audit with how near the links' own surfaces come to each other, where they are known: spheres that
-        stick out may overlap where nothing touches, and those that leave something uncovered be apart where it does.
-        And how near the pairs came that keep less than the margin asked for.
+        """Use gaps of link surfaces where known, and record pairs below their margin.
+
+        Spheres that stick out may overlap without contact, and spheres that leave surface uncovered may miss one.
         """
         surfaces, gaps = self._surfaces, np.empty((len(part.position), 0))
         if surfaces is not None:
@@ -208,7 +204,7 @@ class ReplayRecord:
         return part
 
     def _bound(self, part: AuditTrace, velocities: Float64) -> None:
-        """Bounds between the states of a block, and since the last state of the one before, in this block's scene."""
+        """Bound the clearance since each state before, in this block's scene."""
         known = self._scene.at(int(part.stamp_ns[0])).distances
         name = "certified" if "certified" in known else "exact"
         is_surface = part_clearances(self._model, part.position[:1], known[name])[1]
@@ -218,7 +214,7 @@ class ReplayRecord:
         if self._before is not None:
             stamp, q, velocity = self._before
             earlier = clearances(self._model, self._reach, q[None], known[name])
-            earlier[:, np.isinf(at_states[0])] = np.inf  # what is meant now was meant on the way
+            earlier[:, np.isinf(at_states[0])] = np.inf  # contact declared now was declared on the way
             stamps, positions = np.concatenate([[stamp], stamps]), np.concatenate([q[None], positions])
             velocities = np.concatenate([velocity[None], velocities])
             at_states = np.concatenate([earlier, at_states])
@@ -247,7 +243,6 @@ class ReplayRecord:
         self.between.append(lower=lower, unbounded=unbounded, met=met, surface=surface)
 
     def _look_at_statics(self, part: AuditTrace) -> None:
-        """Look once at each scene for what comes near the fixed links."""
         stamp = int(part.stamp_ns[0])
         known = self._scene.at(stamp)
         if known is self._last_scene:
@@ -258,11 +253,9 @@ class ReplayRecord:
 
     @property
     def statics(self) -> dict[str, tuple[float, float]]:
-        """`FixedParts.found`."""
         return self._fixed.found
 
     def _look_around(self, part: AuditTrace) -> None:
-        """What was known of the space about the arm, at some of the states and on the way there."""
         num = len(part.stamp_ns)
         columns = {name: np.full((num, *shape), np.nan) for name, shape in NEAR_COLUMNS.items()}
         if self._scene.has_seen_times:
@@ -278,7 +271,7 @@ class ReplayRecord:
                 for name, value in _folded(accounts).items():
                     columns[name][at] = value
                 if not self._scene.has_seen_times:
-                    columns["assumed"][at] = np.nan  # space that was once free may not be now
+                    columns["assumed"][at] = np.nan  # space seen free once may be occupied now
                 elif is_timed:
                     columns["age"][at], columns["ahead"][at] = accounts[0].age, accounts[0].ahead
                     self.hindsight.looked(stamp, accounts[0].age)
@@ -286,7 +279,6 @@ class ReplayRecord:
         self.near.append(**columns)
 
     def _tell_represented(self, part: AuditTrace) -> None:
-        """The clearance (T,) [m] without the balls of voxels that have no splat, where these make a difference."""
         exact = part.clearance["exact"].distance
         alone, splats_alone = exact.copy(), self._scene.at(int(part.stamp_ns[0])).splats_alone
         low = np.flatnonzero(exact < self._margin - SLIGHTLY_UNDER)
@@ -295,7 +287,6 @@ class ReplayRecord:
         self.between.append(represented=alone)
 
     def _nearest(self, part: AuditTrace) -> list[Obstacle | None]:
-        """What is nearest to the nearest sphere, by the controller's field; None without a distance."""
         nearest = part.clearance["barrier"]
         found: list[Obstacle | None] = [None] * len(part.stamp_ns)
         states = np.flatnonzero(np.isfinite(nearest.distance))
@@ -309,7 +300,10 @@ class ReplayRecord:
 
 
 def _folded(accounts: Sequence[Account]) -> dict[str, float | Float64]:
-    """The shares at a state; of it and of the postures on the way, the largest unseen share and least distances."""
+    """Fold the accounts of a state and the postures before it.
+
+    Shares are of the state; distances are the least and unseen shares the largest of all.
+    """
     shares, nearest = (np.array([getattr(each, name) for each in accounts]) for name in ("shares", "nearest"))
     least, places = nearest.argmin(axis=0), np.array([each.places for each in accounts])
     unseen, blind = (min(accounts, key=attrgetter(f"{name}_to_surface")) for name in ("unseen", "blind"))

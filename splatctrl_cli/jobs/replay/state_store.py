@@ -1,4 +1,4 @@
-"""What a replay keeps of its states: columns and objects in files, read whole, one at a time, or by blocks."""
+"""States of a replay in files, read whole, singly, or by blocks."""
 
 import pickle
 import tempfile
@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 
 class StampColumn:
-    """Stamps [ns], in memory: eight bytes for each state."""
+    """Stamps [ns] in memory, eight bytes each."""
 
     def __init__(self) -> None:
         self._parts: list[Stamps] = []
@@ -46,12 +46,12 @@ class StampColumn:
 
 
 class StoredObjects(Sequence[T], Generic[T]):
-    """Objects in a file without a name, read a block at a time."""
+    """Objects in an unnamed file, read by blocks."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
         weakref.finalize(self, self._file.close)
-        self._starts: list[int] = []  # of each block: its first object, and where it is in the file
+        self._starts: list[int] = []  # first object of each block; `_places`: its file offset
         self._places: list[int] = []
         self._num = 0
         self._read: tuple[int, list[T]] = (-1, [])
@@ -92,13 +92,13 @@ class StoredObjects(Sequence[T], Generic[T]):
 
 
 class Figures:
-    """Columns of one number, or one row of them, per state, by name; NaN where a state has none."""
+    """Named columns of a number or row per state; NaN without a value."""
 
     def __init__(self) -> None:
         self._files: dict[str, RowFile] = {}
 
     def append(self, **columns: Float64) -> None:
-        """Add the next states' (T,)."""
+        """Add the next (T,) of each."""
         for name, values in columns.items():
             self._files.setdefault(name, RowFile(values.shape[1:])).append(values)
 
@@ -107,12 +107,12 @@ class Figures:
         return self._files[name].read(0, len(self._files[name]))
 
     def rows(self, name: str) -> Rows:
-        """A column (T,) that is read as it is asked for."""
+        """Lazily read column (T,)."""
         return Rows(self._files[name])
 
 
 class StoredClearance:
-    """As `Clearance`, a column read each time it is asked for."""
+    """A `Clearance` whose columns are read on each access."""
 
     def __init__(self, figures: Figures, name: str) -> None:
         self._figures, self._name = figures, name
@@ -124,7 +124,7 @@ class StoredClearance:
 
     @property
     def rows(self) -> Rows:
-        """The distance (T,) [m], read as it is asked for."""
+        """Lazily read distance (T,) [m]."""
         return self._figures.rows(f"distance {self._name}")
 
     @property
@@ -134,9 +134,7 @@ class StoredClearance:
 
 
 class StoredAudit:
-    """As `AuditTrace`, in files: position is read by rows, clearances each time they are asked for; figures (T,): the
-    other columns, as `AuditTrace` has them.
-    """
+    """An `AuditTrace` in files; clearances are read on each access, positions by row."""
 
     def __init__(self) -> None:
         self._stamps, self.figures = StampColumn(), Figures()
@@ -162,7 +160,6 @@ class StoredAudit:
 
     @property
     def clearance(self) -> Mapping[str, StoredClearance]:
-        """By field name."""
         return {name: StoredClearance(self.figures, name) for name in self._names}
 
     def block(self, first: int, last: int) -> AuditTrace:
@@ -185,9 +182,9 @@ class StoredAudit:
 
 
 class StoredSteps:
-    """Steps of a controller, None where it was not asked, with the figures (T,) that are asked for over all of them:
-    clearance, residual, scale, rung (its number), refused, shaped, and shaped by each kind of row; and the velocity
-    (T, J) [rad/s], NaN without a step.
+    """Steps of a controller, None where it had none, with `STEP_FIGURES` (T,) over all.
+
+    Also the velocity (T, J) [rad/s], NaN without a step.
     """
 
     def __init__(self) -> None:
@@ -205,7 +202,6 @@ class StoredSteps:
 
 
 def _figures_of(step: ControlStep) -> tuple[float, ...]:
-    """`STEP_FIGURES` of a step."""
     shaped: tuple[float, ...] = (is_shaped(step), *(is_shaped(step, kind) for kind in RowKind))
     if step.rung is Rung.OUTSIDE:
         shaped = (np.nan,) * len(shaped)
@@ -234,7 +230,6 @@ class StoredLoop:
 
     @property
     def steps(self) -> Sequence[ControlStep]:
-        """The steps; none is None."""
         self._flush()
         return self.kept.stored  # type: ignore[return-value]
 
@@ -254,8 +249,10 @@ class StoredLoop:
 
 
 class StoredOpenLoop:
-    """As `OpenLoopTrace`, in files; figures (T,): size and largest of the difference, and by how much the logged
-    velocity keeps the tightest barrier row and limit; (T, J) [rad/s]: logged, and difference: commanded less logged.
+    """An `OpenLoopTrace` in files.
+
+    figures (T,): size and largest of the difference; slack of the logged velocity to the tightest barrier row and
+    limit. Also logged and difference (commanded less logged) (T, J) [rad/s].
     """
 
     def __init__(self) -> None:
@@ -264,7 +261,7 @@ class StoredOpenLoop:
 
     @property
     def steps(self) -> Sequence[ControlStep | None]:
-        """None where the controller was not asked."""
+        """None where the controller did not run."""
         return self.kept.stored
 
     def add(self, part: OpenLoopTrace) -> None:

@@ -1,4 +1,4 @@
-"""The verdict of a replay: every criterion of *safe*, with what it found, when, where and what to do about it."""
+"""The verdict of a replay, by every criterion of *safe*."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,7 +13,7 @@ from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.robot.declared_contact import carried_words
 
-ASKED = ("--require",)  # criteria that the request itself asked for
+ASKED = ("--require",)  # criteria of the request itself
 LARGER_IS_LAXER = (
     *("max_unknown", "max_map_age", "max_pose_jump", "allow_disagreement", "config.control.limit_tolerance"),
     *("config.verdict.unjudged", "config.verdict.lead_in", "config.verdict.longest_interval"),
@@ -28,14 +28,14 @@ CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
 
 
 def replay_verdict(judged: Judged) -> Verdict:
-    """The verdict on a replay: every criterion, and each ``--require`` of its request."""
+    """Judge a replay by every criterion and each ``--require``."""
     replay, request = judged.replay, judged.request
     reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
     if displaced(judged) is not None:
         by_map = (*BY_MAP, *(() if replay.outside else BY_OUR_CONTROLLER))
         reasons = [_doubted(reason) if reason.criterion in by_map else reason for reason in reasons]
         reasons.sort(key=lambda reason: reason.criterion != "calibration")
-    reasons.sort(key=lambda reason: reason.label != CONTACT)  # by any measure, before what only broke a margin
+    reasons.sort(key=lambda reason: reason.label != CONTACT)  # contact by any measure precedes a broken margin
     counts = counts_of(replay, judged.logged, judged.metrics)
     reasons += gate_reasons(
         request.require, judged.metrics, counts, first_time=lambda name, holds: first_time(replay, name, holds)
@@ -60,13 +60,13 @@ def replay_verdict(judged: Judged) -> Verdict:
 
 
 def _doubted(reason: Reason) -> Reason:
-    """A reason that rests on a map in which the robot itself may stand as a thing: it fails nothing."""
+    """Make a failure not evaluable if the map may contain the robot as an obstacle."""
     is_failure = reason.outcome is Outcome.FAILED
     return replace(reason, outcome=Outcome.NOT_EVALUABLE, label="") if is_failure else reason
 
 
 def _how(judged: Judged) -> str:
-    """How a safe run passed: waived, proven or neither. Proven: cameras saw all space within the margin free."""
+    """ "waived", "proven" (cameras saw all space within the margin free), or neither."""
     if any(waivers(judged.request)):
         return "waived"
     assumed = nearby(judged, judged.replay.near["assumed"])
@@ -98,7 +98,7 @@ def _notes(judged: Judged) -> Iterator[str]:
 
 
 def waivers(request: ReplayRequest) -> Iterator[str]:
-    """Options and settings of the evidence and the margins that are laxer than their defaults."""
+    """Options and settings of evidence and margins laxer than their defaults."""
     usual = ReplayRequest(log=request.log, out=request.out)
     for name in (*LARGER_IS_LAXER, *SMALLER_IS_LAXER):
         given, default = (attrgetter(name)(each) for each in (request, usual))
@@ -108,7 +108,6 @@ def waivers(request: ReplayRequest) -> Iterator[str]:
 
 
 def _declared_notes(judged: Judged) -> Iterator[str]:
-    """Parts that were learned, declared contact, what the map was told that the robot carries, and unused entries."""
     declared, inputs = judged.inputs.declared, judged.inputs
     if inputs.model.self_model is not None:
         yield from (part.words(int(inputs.states.stamp_ns[0])) for part in inputs.model.self_model.parts)

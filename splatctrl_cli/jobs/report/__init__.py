@@ -1,1 +1,1 @@
-"""What a report is made of: the folders of runs and batches, and their scenes in three dimensions."""
+"""Reports on runs and batches, with 3-D scenes."""

@@ -1,6 +1,4 @@
-"""A report from its request to its page: one run, or every job of a batch, in one file that opens from disk; and a
-page that only shows a scene, a field, splats or a replay in 3-D.
-"""
+"""A report on a run or batch, or a 3-D view, in one HTML file."""
 
 import json
 import math
@@ -29,30 +27,30 @@ from splatctrl_cli.jobs.runs.run_folder import (
 from splatctrl_cli.report.page import Cell, Page, Picture, RunSection, Table, packed, picture, rendered
 
 MOST_SCENES = 6  # of a batch, without `all_scenes`
-PICTURES = {True: (3, 800), False: (1, 640)}  # of a batch's run with and without a scene: how many, how wide [px]
+PICTURES = {True: (3, 800), False: (1, 640)}  # number and width [px] for a batch's run with and without a scene
 LOG_LINES = 12  # of a job that ended in an error
 MOST_ROWS = 40  # of recordings that are shown at once
 WITHOUT_A_RUN = ("skipped", "to do")  # states of jobs
 WITH_SPACE = ("replay", "reconstruct", "sdf-bake")
 MAP = "reconstruct"
-WITH_PICTURES = {  # by command: what is in a picture's name, and what it shows
+WITH_PICTURES = {  # by command: part of a picture's name, and its caption
     "score": ("_best_worst", "photo, render and depth error of the best and the worst view"),
     "sdf-bake": ("slices", "slices of the distance"),
 }
-MOST_PICTURES, PICTURE_WIDTH = 24, 560  # of recordings as expected: how many, how wide [px]
+MOST_PICTURES, PICTURE_WIDTH = 24, 560  # number and width [px] for recordings as expected
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewRequest(FolderRequest):
-    """A page on `path`, a run, scene or field folder, a grid or a file of splats, into `out`, None for PATH.html."""
+    """A page on a run, scene or field folder, grid or splat file; out: None for PATH.html."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WriteReportRequest(ViewRequest):
-    """A report on `path`, the folder of a run or of a batch, into the HTML file `out`, None for PATH.html.
+    """A report on a run's or batch's folder into HTML; out: None for PATH.html.
 
-    against: an earlier run or batch, or a stored baseline, since which it says what changed. all_scenes: of a batch,
-    every scene in 3-D and not only the failed, changed and worst.
+    against: an earlier run, batch or baseline to compare with. all_scenes: every scene of a batch in 3-D, not only
+    failed, changed and worst ones.
     """
 
     against: Path | None = None
@@ -61,7 +59,7 @@ class WriteReportRequest(ViewRequest):
 
 @dataclass(frozen=True, kw_only=True)
 class WriteReportResult(WrittenFile):
-    """The page: how many runs it tells of, how many of them in 3-D, and why others are not."""
+    """The page; notes: why runs lack a 3-D scene."""
 
     num_runs: int
     num_scenes: int
@@ -69,8 +67,9 @@ class WriteReportResult(WrittenFile):
 
 
 def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> WriteReportResult:
-    """Write the page. Raises InputError for a folder that is no run and no batch, that is not whole, or that a newer
-    version wrote, and for `against` what cannot be compared with it.
+    """Write the page.
+
+    Raises InputError for no or an incomplete run or batch, one too new, or unlike `against`.
     """
     if is_batch(request.path):
         page = _of_batch(request, open_batch(request.path), progress)
@@ -94,7 +93,6 @@ def _write(request: FolderRequest, page: Page) -> Path:
 
 
 def beside(path: Path) -> Path:
-    """NAME.html for a folder or file."""
     place = path.absolute() if not path.name.strip(".") else path
     return place.with_name(f"{place.stem if place.is_file() else place.name}.html")
 
@@ -117,7 +115,6 @@ def _of_run(request: WriteReportRequest, run: RunFolder) -> Page:
 def _in_space(
     section: RunSection, run: RunFolder, roots: tuple[Path, ...], scenes: dict[str, str], name: str
 ) -> RunSection:
-    """The section with its scene, which is added by its name, or with why there is none."""
     try:
         scenes[name] = packed(space_of_run(run, roots))
         return replace(section, space=name)
@@ -127,8 +124,6 @@ def _in_space(
 
 @dataclass(frozen=True, kw_only=True)
 class _Job:
-    """A job of a batch with its folder, if that can be read, and else why not."""
-
     ran: Run
     run: RunFolder | None
     why: str
@@ -136,14 +131,13 @@ class _Job:
 
     @property
     def least(self) -> float:
-        """The least clearance [m], infinity where there is none."""
+        """Least clearance [m], infinity without one."""
         metrics = {} if self.run is None else self.run.metrics
         values = [metrics.get(name) for name in ("min_clearance", "min_clearance_true")]
         return min((float(value) for value in values if isinstance(value, int | float)), default=math.inf)
 
     @property
     def order(self) -> tuple[bool, bool, bool, float]:
-        """Not as expected first, then changed, then not passed, then by clearance."""
         ran = self.ran
         return (ran.state == DONE, not self.is_changed, ran.outcome in ("passed", ""), self.least)
 
@@ -182,7 +176,6 @@ def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progres
 
 
 def _gallery(jobs: Sequence[_Job], linked: set[str]) -> list[Picture]:
-    """A picture of each recording without one in a section: of its score, else of its field."""
     shown = {job.ran.recording for job in jobs if job.ran.node in linked and job.run is not None}
     found = list[Picture]()
     for command, (name, words) in WITH_PICTURES.items():
@@ -197,7 +190,6 @@ def _gallery(jobs: Sequence[_Job], linked: set[str]) -> list[Picture]:
 
 
 def _sentence(jobs: Sequence[_Job], unexpected: Sequence[_Job]) -> str:
-    """How many jobs are as expected, and the first that is not."""
     count = len(jobs) - len(unexpected)
     if not unexpected:
         damaged = dict.fromkeys(job.ran.recording for job in jobs if job.ran.damage)
@@ -220,9 +212,7 @@ def _job(batch: BatchFolder, ran: Run, is_changed: bool) -> _Job:
 
 
 def _is_told(job: _Job, *, is_seen: bool) -> bool:
-    """Replays, and whatever did not come out as expected or as before, have a section of their own; so has a map
-    that is to be seen.
-    """
+    """True for jobs with a section: replays, unexpected or changed results, and maps to show."""
     if is_seen and job.ran.command == MAP and job.run is not None:
         return True
     if job.ran.state in WITHOUT_A_RUN:
@@ -255,7 +245,6 @@ def _section(
 
 
 def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> list[Table]:
-    """A row for each recording, those with the worst jobs first, and a column for each job and variant."""
     nodes = {(job.ran.recording, job.ran.column): job.ran for job in jobs}
     recordings = dict.fromkeys(job.ran.recording for job in jobs)
     names = columns_of(((ran.job, ran.column) for ran in batch.runs), batch.jobs)
@@ -269,7 +258,6 @@ def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> list[
 
 
 def _cell(ran: Run | None, linked: set[str]) -> Cell:
-    """The verdict of a job; in the colour of its state where that is not as expected."""
     if ran is None:
         return Cell(text="-")
     state = ran.outcome if ran.state == DONE and ran.outcome else ran.state
@@ -301,7 +289,7 @@ def _log(batch: BatchFolder, ran: Run) -> Table:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewResult(WrittenFile):
-    """The page, and what is to be seen: splats, states of the arm, cubes of space never seen."""
+    """The page with its number of splats, states, and cubes of unobserved space."""
 
     num_splats: int
     num_states: int
@@ -309,7 +297,7 @@ class ViewResult(WrittenFile):
 
 
 def view(request: ViewRequest) -> ViewResult:
-    """Write the page. Raises InputError for what there is nothing to see of."""
+    """Write a 3-D page. Raises InputError if there is nothing to show."""
     space = space_of(request.path, request.roots)
     name = request.path.absolute().name
     section = RunSection(anchor="scene", title="", state="", sentence="", space="scene")

@@ -1,6 +1,4 @@
-"""What a page says of one run: its reasons, the timeline of a replay, pictures, settings and where it came from; and
-what changed since an earlier run or batch, or a stored baseline.
-"""
+"""Sections of a page on one run, and its changes."""
 
 import json
 import shlex
@@ -19,7 +17,7 @@ from splatctrl_cli.report.timeline import legend, timeline
 PASSED = "passed"
 MOST_METRICS = 400  # rows of a table
 WIDTH = 900  # pixels of a picture at most
-PICTURES = {  # by the beginning of a file's name: what it shows
+PICTURES = {  # captions by start of file name
     "worst_": "a moment of least clearance: photo, and the arm's spheres as the replay had them",
     "clearance": "clearance over time",
     "commands": "what the controller commanded",
@@ -36,7 +34,7 @@ PICTURES = {  # by the beginning of a file's name: what it shows
 def section_of(
     run: RunFolder, *, anchor: str, title: str, most_pictures: int | None = None, width: int = WIDTH
 ) -> RunSection:
-    """The section of a run, without its scene; width: of its pictures [px], of which there are at most so many."""
+    """Section of a run without its scene; width: of its pictures [px]."""
     verdict = run.verdict
     states = run.states
     replayed: dict[str, Any] = {}
@@ -68,7 +66,6 @@ def section_of(
 
 
 def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
-    """The criteria of a verdict that hold, or those that do not, first the one that decided it."""
     rows = list[Row]()
     for reason in verdict.get("reasons", []):
         when = "" if reason["time_s"] is None else f" at {reason['time_s']:.2f} s"
@@ -79,7 +76,7 @@ def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
 
 
 def _events(run: RunFolder) -> dict[str, list[tuple[float, float]]]:
-    """First and last time [s] of the events, by kind and measure: what went wrong, then what shaped a command."""
+    """Spans [s] of events by kind and measure: faults, then what shaped a command."""
     found: dict[str, list[tuple[float, float]]] = {}
     events = (run.json_of("events.json") or {}).get("events", [])
     shown = [event for event in events if event["source"] in SHOWN]
@@ -90,7 +87,6 @@ def _events(run: RunFolder) -> dict[str, list[tuple[float, float]]]:
 
 
 def _pictures(run: RunFolder, most: int | None, width: int, *, has_timeline: bool) -> list[Any]:
-    """The pictures of a folder; of a replay the moments first, and not the clearance, which is the timeline."""
     files = [path for path in run.pictures() if not (has_timeline and path.name == "clearance.png")]
     files.sort(key=lambda path: not path.name.startswith("worst_"))
     words = {path: next((w for start, w in PICTURES.items() if path.name.startswith(start)), "") for path in files}
@@ -98,7 +94,6 @@ def _pictures(run: RunFolder, most: int | None, width: int, *, has_timeline: boo
 
 
 def _settings(run: RunFolder) -> Table:
-    """The command line, and each key of the configuration that is not the default."""
     used, default = run.run.get("config", {}), Config().as_dict()
     rows = [
         ((f"{section}.{key}", json.dumps(value), json.dumps(default[section].get(key))), "")
@@ -112,7 +107,6 @@ def _settings(run: RunFolder) -> Table:
 
 
 def _provenance(run: RunFolder) -> Table:
-    """Versions, times, and the sha256 of what went in."""
     about = {
         "splatctrl": run.run.get("splatctrl"),
         "python": run.run.get("python"),
@@ -131,10 +125,9 @@ STATES = {Change.WORSE: "failed"}  # of a row
 
 
 def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple[list[Table], frozenset[str]]:
-    """Tables of what changed, the second folded, and the jobs that got worse or have another verdict.
+    """Tables of changes, the second folded, and the jobs with a regression or another verdict.
 
-    before: a folder, else a baseline; None for no tables. has_links: each job has a section. Raises InputError for
-    what cannot be compared.
+    before: a folder or baseline; None for no tables. has_links: each job has a section. Raises InputError.
     """
     if before is None:
         return [], frozenset()

@@ -1,4 +1,4 @@
-"""The three-dimensional scene of a run, a scene folder, a field or a file of splats."""
+"""3-D scenes of runs, scene folders, fields and splat files."""
 
 import re
 from collections.abc import Mapping
@@ -27,14 +27,14 @@ from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 MOST_STATES = 240  # of a motion
 MOST_SETS = 5  # of splats over time
 MOST_UNKNOWN = 6000  # cubes of space never seen
-MOST_CELLS = 80  # along a side of a grid of which the surface is drawn
+MOST_CELLS = 80  # along a side of a grid whose surface is drawn
 PLACE = re.compile(r"at \((-?[\d.]+), (-?[\d.]+), (-?[\d.]+)\)")
 
 
 def space_of(path: Path, roots: tuple[Path, ...] = ()) -> Space:
-    """What there is to see of a run, a scene or field folder, or a file of splats or of a field.
+    """Scene of a run, scene or field folder, splat file or field.
 
-    Raises InputError for anything else, and for a run whose scene or robot is not found.
+    Raises InputError for anything else, or if a run's scene or robot is missing.
     """
     if not path.is_file():
         return space_of_run(open_run(path), roots)
@@ -46,7 +46,7 @@ def space_of(path: Path, roots: tuple[Path, ...] = ()) -> Space:
 
 
 def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
-    """As `space_of`, of an open run."""
+    """`space_of` an open run."""
     path = run.path
     if run.command == REPLAY:
         return space_of_replay(run, roots)
@@ -60,14 +60,14 @@ def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
 
 
 def space_of_scene(scene: SceneFolder) -> Space:
-    """The splats at the end of a scene, and the space that was never seen."""
+    """Final splats of a scene, and unobserved space."""
     if scene.is_anisotropic:
         return Space(splats={0.0: nearest_splats(scene.gaussians())})
     return _with_unknown(Space(splats={0.0: scene.splats()}), scene.occupancy(), scene)
 
 
 def space_of_grid(path: Path) -> Space:
-    """Where a baked distance is 0, on a thinned grid, and the space that was never seen."""
+    """Zero surface of a baked field, on a thinned grid, and unobserved space."""
     grid = read_npz(path)
     if "sdf" not in grid.channels:
         raise InputError(f"{path}: expected the channel sdf, got {', '.join(grid.channels)}")
@@ -87,7 +87,7 @@ def space_of_grid(path: Path) -> Space:
 
 
 def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
-    """The scene of a replay as it was known at each time, its robot over the states, and what decided."""
+    """A replay's scene as known over time, its robot's motion, and what decided."""
     states = run.states
     if states is None:
         raise InputError(f"{run.path}: no steps.csv", remedy="replay again")
@@ -98,9 +98,7 @@ def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
 
 
 def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> RobotModel:
-    """The robot of a replay with these states, as its command line or its log named it. Raises InputError where its
-    files are not found.
-    """
+    """Robot of a replay, by its command line or log. Raises InputError for missing files."""
     files = {name: run.option(f"--{name}") for name in ("urdf", "spheres")}
     found = {name: _file(run, given, roots) for name, given in files.items() if given is not None}
     if files["urdf"] is None and run.parts.has(run.path / ROBOT):
@@ -125,14 +123,13 @@ def _robot(
     packages: tuple[Path, ...],
     _digests: tuple[str, ...],
 ) -> RobotModel:
-    """The runs of a batch have mostly the same robot; the digests tell a file that was changed."""
+    """Cached, since runs of a batch share robots; the digests detect changed files."""
     T = None if pose is None else transform_from(pose[:3], pose[3:])
     return RobotModel.from_urdf(urdf, spheres, T_world_base=T, locked=dict(locks), packages=packages)
 
 
 @lru_cache(maxsize=4)
 def robot_bodies(robot: RobotModel) -> dict[str, Surface]:
-    """The collision geometry of its links, by name."""
     return bodies_of(robot.surface)
 
 
@@ -148,7 +145,6 @@ def _file(run: RunFolder, given: str, roots: tuple[Path, ...]) -> Path:
 
 
 def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding: Deciding | None) -> Space:
-    """The splats by time and the unknown space when the verdict was decided; of a field its surface."""
     grid = run.option("--field")
     if grid is not None:
         place = _file(run, grid, roots)
@@ -164,7 +160,7 @@ def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding:
 
 
 def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
-    """The scene of a replay, as its command line named it. Raises InputError where it is not found."""
+    """Scene of a replay's command line. Raises InputError if missing."""
     given = run.option("--scene")
     folder = run.path / "scene" if given is None else run.place_of(given, roots)
     if folder is None or not folder.exists():
@@ -176,7 +172,7 @@ def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
 
 
 def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple[float, Snapshot]]:
-    """The snapshots that a replay came to, each with the time [s] of the motion from which it was known."""
+    """Snapshots a replay used, each with the motion time [s] it was known from."""
     latency_ns = round(1e9 * float(run.option("--latency") or 0.0))
     first, last = (int(stamp) - latency_ns for stamp in (states.stamps_ns[0], states.stamps_ns[-1]))
     known = [s for s in scene.snapshots if s.stamp_ns <= last] if scene.has_clock else list(scene.snapshots[-1:])
@@ -186,7 +182,7 @@ def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple
 
 
 def spread(times: list[float], when: float) -> list[int]:
-    """At most MOST_SETS of the sets known from `times` on: the first, the last, the one at `when`, others evenly."""
+    """At most MOST_SETS of `times`: first, last, the one at `when`, others evenly."""
     if not times:
         return []
     count = len(times)
@@ -209,7 +205,6 @@ def _with_unknown(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) 
 
 
 def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
-    """The arm over at most MOST_STATES of the states: evenly, with the one of least clearance."""
     count = len(states.seconds)
     chosen = set(np.linspace(0, count - 1, min(count, MOST_STATES)).round().astype(int).tolist())
     worst = states.worst()
@@ -240,7 +235,6 @@ def position_of(states: States, robot: RobotModel, state: int) -> Float64:
 
 
 def _deciding(run: RunFolder, states: States, robot: RobotModel) -> Deciding | None:
-    """The first reason of the verdict that has a time and a place; else the least clearance and what was near."""
     for reason in run.verdict.get("reasons", []):
         if reason["outcome"] != "passed" and reason["place"] is not None and reason["time_s"] is not None:
             words = f"{reason['sentence']} at {reason['time_s']:.2f} s, {reason['cause']}"
@@ -255,7 +249,6 @@ def _deciding(run: RunFolder, states: States, robot: RobotModel) -> Deciding | N
 
 
 def _decided(states: States, robot: RobotModel, words: str, time_s: float, place: list[float], who: str) -> Deciding:
-    """With the sphere that is named, else the nearest to the place among those that move."""
     state = int(np.argmin(np.abs(states.seconds - time_s)))
     centers, radii = robot.sphere_centers(position_of(states, robot, state)), robot.sphere_set.radii
     names = sphere_names(robot.sphere_set)

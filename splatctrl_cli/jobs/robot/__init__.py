@@ -1,1 +1,1 @@
-"""The spheres of a robot, and which robot a job works with."""
+"""Robots and their spheres."""

@@ -1,4 +1,4 @@
-"""Which robot a job works with: that of --urdf, else the one that the log describes itself."""
+"""The robot of a job: of --urdf, or the log's own."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,10 +25,10 @@ TAKE = "leave --urdf out to take the log's own, or correct the file"
 
 @dataclass(frozen=True, kw_only=True)
 class RobotOptions:
-    """How a robot's URDF is read.
+    """Options to read a robot's URDF.
 
-    spheres: that cover it, None for those of the URDF; packages: folders of its meshes; base: pose of its root in
-    world, x, y, z, qx, qy, qz, qw; locked: values [rad or m] of joints that no log moves.
+    spheres: None for the URDF's own. packages: folders of meshes. base: root pose in world, x, y, z, qx, qy, qz, qw.
+    locked: values [rad or m] of unlogged joints.
     """
 
     spheres: Path | None = None
@@ -38,9 +38,7 @@ class RobotOptions:
 
 
 def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
-    """The robot that logs describe, None where none does. Raises InputError where they describe several, or none that
-    is a URDF.
-    """
+    """Robot described by logs, None if none is. Raises InputError for several or an invalid one."""
     found = logged_descriptions(paths)
     if len(found) > 1:
         where = ", ".join(description.where for _, description in found)
@@ -49,9 +47,7 @@ def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
 
 
 def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILENT) -> UrdfFile | None:
-    """The robot of --urdf, with a warning where the logs describe another one; without it the one that they describe,
-    None where they describe none. Raises InputError.
-    """
+    """Robot of --urdf, with a warning if the logs describe another; by default theirs."""
     if given is None:
         return logged_urdf(paths)
     file = read_urdf(given)
@@ -61,10 +57,9 @@ def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILE
 
 
 def with_self_model(model: RobotModel, given: Path | None, scene: Path | None = None) -> RobotModel:
-    """The robot with the parts that a self-model (`robot learn`) adds to its surface: the file given, else that of a
-    scene folder where it has one of this robot; unchanged without a file, or `NO_SELF_MODEL`.
+    """Add a self-model (`robot learn`): the given file, else the scene's if of this robot.
 
-    Raises InputError for a file that cannot be read, or one given that belongs to another robot.
+    `NO_SELF_MODEL` adds nothing. Raises InputError for an unreadable file, or one given for another robot.
     """
     path = scene / SELF_MODEL if given is None and scene is not None else given
     if path is None or path == NO_SELF_MODEL or (given is None and not path.is_file()):
@@ -78,21 +73,21 @@ def with_self_model(model: RobotModel, given: Path | None, scene: Path | None = 
     try:
         found.check_robot(model.surface, model.urdf.links, path)
     except InputError:
-        if given is None:  # that the scene is of another robot is what a replay says
+        if given is None:  # a replay reports a scene of another robot
             return model
         raise
     return model.with_self_model(found)
 
 
 def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:
-    """In words, that the poses of a log or capture are in another frame than the robot's root; empty where not."""
+    """Sentence if a log's poses are not in the robot's root frame, else empty."""
     if not isinstance(source, LOGGED) or source.world_frame == file.root:
         return ""
     return f"the poses are in the frame '{source.world_frame}', not in that of its root '{file.root}'"
 
 
 def differs(file: UrdfFile, paths: Sequence[Path]) -> str:
-    """How a model differs from all that the logs describe, in words; empty where it does not, or there is none."""
+    """Describe how a model differs from all in the logs; empty if alike or none."""
     words = []
     for path, description in logged_descriptions(paths):
         try:

@@ -1,4 +1,4 @@
-"""What `robot` does, from requests to results: fit spheres, measure them, list self-collision pairs, show a robot."""
+"""Jobs of `robot`: fit and measure spheres, list self-collision pairs, describe."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -48,7 +48,7 @@ SCALES = {
     "num_spheres": DESCRIBES,
     **dict.fromkeys(("num_bare_links", "num_open_links", "num_stray_spheres"), FAULTS),
 }
-METRICS: dict[str, Callable[[CoverageReport], float | None]] = {  # lengths in metres, None where no figure bounds it
+METRICS: dict[str, Callable[[CoverageReport], float | None]] = {  # lengths [m], None if unbounded
     "max_deficit": lambda report: report.max_deficit,
     "uncovered_share": lambda report: report.uncovered_share,
     "max_protrusion": lambda report: report.max_protrusion,
@@ -61,12 +61,11 @@ METRICS: dict[str, Callable[[CoverageReport], float | None]] = {  # lengths in m
 
 @dataclass(frozen=True, kw_only=True)
 class RobotRequest:
-    """A robot, and what to do with it.
+    """A robot, and the options of its jobs.
 
-    spheres: a file of its collision spheres, None for those of the URDF; packages: folders of its meshes; locked:
-    values [rad or m] of joints that hold still. Of a fit or a check: `picture`, a PNG to draw, and `require`, gates
-    on METRICS. Of a fit: `out`, the file to write, and `fit`. Of pairs: `srdf`, or `postures`, how many
-    configurations are sampled, and `drop_never`, whether what never comes near in them is left out.
+    spheres: None for the URDF's own. packages: folders of meshes. locked: values [rad or m] of fixed joints. Fit and
+    check: `picture`, and gates `require` on METRICS. Pairs: `srdf`, or `postures` to sample, and `drop_never` for
+    pairs that never come near.
     """
 
     urdf: Path
@@ -86,7 +85,7 @@ class RobotRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageResult:
-    """How spheres cover a robot: the file they are in (None: one that was just fitted), links it names in vain."""
+    """Coverage of a robot by spheres; file: None if just fitted; links_left_out: unknown links."""
 
     report: CoverageReport
     verdict: Verdict
@@ -102,7 +101,7 @@ class CoverageResult:
 
 @dataclass(frozen=True, kw_only=True)
 class PairsResult:
-    """Which links may collide; num_foreign: pairs of the SRDF whose links the robot does not have."""
+    """Links that may collide; num_foreign: SRDF pairs with unknown links."""
 
     found: SelfCollisionPairs
     num_foreign: int
@@ -125,7 +124,7 @@ class PairsResult:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotResult:
-    """A robot, its joints that are locked, and what is wrong with each mesh that is not found."""
+    """A robot, its locked joints, and faults of missing meshes."""
 
     model: RobotModel
     locked: Mapping[str, float]
@@ -133,14 +132,13 @@ class RobotResult:
 
     @property
     def joints(self) -> list[tuple[str, float, float, float]]:
-        """Name, lower and upper limit [rad or m] and velocity limit of each joint."""
+        """Name, lower and upper limit [rad or m], and velocity limit of each joint."""
         model = self.model
         limits = zip(model.joint_names, model.lower, model.upper, model.velocity_limit, strict=True)
         return [(name, float(lower), float(upper), float(velocity)) for name, lower, upper, velocity in limits]
 
     @property
     def doubts(self) -> list[str]:
-        """What may be wrong with the spheres, where there are some."""
         return list(self.model.doubts) if len(self.model.sphere_set.radii) else []
 
     def as_dict(self) -> dict[str, Any]:
@@ -164,7 +162,7 @@ class RobotResult:
 
 
 def fit_robot(request: RobotRequest, progress: Progress = SILENT) -> CoverageResult:
-    """Fit spheres that cover each link's collision geometry, write them, and measure what was written."""
+    """Fit spheres to each link's collision geometry, write them, and measure them."""
     check_gate_names(request.require, METRICS)
     with output_path(request.out, force=request.force, is_folder=False) as partial:
         urdf = read_urdf(request.urdf)
@@ -182,7 +180,7 @@ def fit_robot(request: RobotRequest, progress: Progress = SILENT) -> CoverageRes
 
 
 def check_robot(request: RobotRequest) -> CoverageResult:
-    """Measure how much of the collision surface a set of spheres covers."""
+    """Measure how much of the collision surface spheres cover."""
     check_gate_names(request.require, METRICS)
     urdf, path = read_urdf(request.urdf), request.spheres or request.urdf
     file = read_sphere_file(path)
@@ -202,7 +200,7 @@ def check_robot(request: RobotRequest) -> CoverageResult:
 
 
 def robot_pairs(request: RobotRequest) -> PairsResult:
-    """Which links may collide with each other, and why others may not."""
+    """Find links that may collide, and why others may not."""
     model = RobotModel.from_urdf(request.urdf, request.spheres, locked=request.locked)
     disabled, foreign = ((), ()) if request.srdf is None else read_srdf(request.srdf, model.urdf)
     found = self_collision_pairs(
@@ -212,7 +210,7 @@ def robot_pairs(request: RobotRequest) -> PairsResult:
 
 
 def describe_robot(request: RobotRequest) -> RobotResult:
-    """The joints, links, shapes and spheres of a robot; without `spheres`, those of the URDF if it has only such."""
+    """Describe joints, links, shapes and spheres, by default the URDF's own spheres."""
     urdf = read_urdf(request.urdf)
     locked = urdf.with_followers(request.locked)
     spheres = own_spheres(urdf) if request.spheres is None else request.spheres
@@ -221,7 +219,7 @@ def describe_robot(request: RobotRequest) -> RobotResult:
 
 
 def coverage_summary(report: CoverageReport) -> str:
-    """What a set of spheres leaves outside, and how far it sticks out, in one sentence."""
+    """Sentence on uncovered surface and protrusion."""
     share = f"{100 * report.uncovered_share:.1f} % of the surface outside"
     out = f"sticking out by at most {1e3 * report.max_protrusion:.1f} mm"
     if report.worst is None or report.max_deficit is None:
@@ -235,7 +233,7 @@ def coverage_summary(report: CoverageReport) -> str:
 
 
 def bare_links(report: CoverageReport) -> str:
-    """What is not known of links without a sphere; empty where there is none."""
+    """Sentence on links without a sphere, else empty."""
     bare = ", ".join(report.bare_links)
     return f"no sphere stands for {bare}: nothing is said of these links" if bare else ""
 
@@ -248,10 +246,9 @@ def _verdict(
     require: Sequence[str],
     allowed: float,
 ) -> Verdict:
-    """The verdict on a set of spheres: what they leave uncovered, links without any, and each ``--require``.
+    """Judge spheres: uncovered surface, bare links, and each ``--require``.
 
-    A surface farther than `allowed` [m] outside fails, and a link that moves without a sphere; a gate on max_deficit
-    takes the place of that.
+    Fails for surface more than `allowed` [m] outside, or a bare moving link; a gate on max_deficit replaces that.
     """
     num, bare = len(report.links), bare_links(report)
     counts = dict.fromkeys(METRICS, num) | dict.fromkeys(("max_protrusion", "num_stray_spheres"), report.num_spheres)
@@ -285,7 +282,6 @@ def _verdict(
 
 
 def _uncovered(report: CoverageReport, urdf: UrdfFile, allowed: float) -> list[str]:
-    """The links whose surface is farther than `allowed` [m] outside, the worst first, and how far."""
     bodies, root = urdf.rigid_bodies(), urdf.root
     bare = [f"{link} moves and has no sphere" for link in report.bare_links if bodies[link][0] != root]
     far = [(link.deficit.proven, link.link) for link in report.links if link.deficit is not None]
@@ -293,7 +289,6 @@ def _uncovered(report: CoverageReport, urdf: UrdfFile, allowed: float) -> list[s
 
 
 def _lost_meshes(urdf: UrdfFile, packages: Sequence[Path]) -> tuple[str, ...]:
-    """What is wrong with each mesh of a URDF that is not there."""
     lost = []
     for mesh in urdf.meshes:
         try:
@@ -304,7 +299,6 @@ def _lost_meshes(urdf: UrdfFile, packages: Sequence[Path]) -> tuple[str, ...]:
 
 
 def _comments(urdf: Path, report: CoverageReport) -> list[str]:
-    """What a person should know of a written set, first lines of its file."""
     deficit, protrusion = report.max_deficit, 1e3 * report.max_protrusion
     covered = "cover all of it" if deficit == 0 else f"leave at most {1e3 * (deficit or 0.0):.2f} mm of it outside"
     return [

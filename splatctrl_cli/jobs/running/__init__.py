@@ -1,1 +1,1 @@
-"""Progress, device and resumption of a job."""
+"""Progress, device and resumption."""

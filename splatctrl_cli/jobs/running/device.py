@@ -1,4 +1,4 @@
-"""Where a fit or a bake computes: on the processor, or on a CUDA card that is there, usable and worth its start."""
+"""Device of a fit or bake: the processor, or a CUDA card worth its start."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -25,7 +25,7 @@ INSTALL = "pip install 'splatctrl-cli[cuda]'"
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """How a job runs. force: replace the output; threads: 0 for one per core; device: as of --device."""
+    """Options of a job; threads: 0 for one per core; device: as of --device."""
 
     config: Config = field(default_factory=Config)
     force: bool = False
@@ -35,20 +35,19 @@ class RunOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Device:
-    """cpu, or cuda:N with its card, and the memory of it."""
+    """cpu, or cuda:N with its card and memory."""
 
     name: str = CPU
     card: Card | None = None
     memory: Memory | None = field(default=None, repr=False)
 
     def as_dict(self) -> dict[str, Any]:
-        """For ``run.json``."""
         known = {} if self.card is None else {"card": self.card.name, "driver": self.card.driver}
         return {"device": self.name, **known}
 
 
 def opened(name: str, source: str = FIT) -> Device:
-    """That of ``cuda`` or ``cuda:N``, for the kernels of a source. Raises DeviceError, with a remedy, if it fails."""
+    """Open ``cuda`` or ``cuda:N`` for a source's kernels. Raises DeviceError with a remedy."""
     if missing := [module for module in EXTRA if not is_installed(module)]:
         raise DeviceError(f"the extra [cuda] is not installed ({missing[0]})", remedy=INSTALL)
     index = int(name.partition(":")[2] or 0)
@@ -63,7 +62,7 @@ def opened(name: str, source: str = FIT) -> Device:
 
 
 def demanded(name: str, source: str = FIT) -> Device | None:
-    """The device of a --device; None for auto. Raises UsageError where that one cannot be used."""
+    """Device of --device; None for auto. Raises UsageError if unusable."""
     if name in (AUTO, CPU):
         return None if name == AUTO else Device()
     try:
@@ -76,7 +75,7 @@ def demanded(name: str, source: str = FIT) -> Device | None:
 def automatic(
     progress: Progress, too_little: str = "", *, name: str = CUDA, source: str = FIT, needed: int = 0
 ) -> Device:
-    """Where auto computes, and why is said: a card that is usable and has `needed` bytes, if the work is enough."""
+    """Choose a usable card with `needed` bytes, if the work is enough; log why."""
     try:
         if too_little:
             raise DeviceError(too_little)
@@ -92,9 +91,9 @@ def automatic(
 
 
 def chosen(name: str, is_enough: bool, progress: Progress) -> Device:
-    """The device of a --device that fields are computed on; auto asks for a card where the work is enough.
+    """Device of --device for fields; auto uses a card if the work is enough.
 
-    Raises UsageError where it cannot be used.
+    Raises UsageError if unusable.
     """
     device = demanded(name, FIELD)
     if device is None:
@@ -103,10 +102,10 @@ def chosen(name: str, is_enough: bool, progress: Progress) -> Device:
 
 
 class FitDevice:
-    """The device that a fit computes on, of a --device, and those that it has computed on.
+    """The device of a fit, and its earlier ones.
 
-    history: of each, as ``run.json`` has it, with the number of the iteration from which on. With auto a fit begins
-    where its work is worth it, and goes on where it was. Raises UsageError for a device that cannot be used.
+    history: as in ``run.json``, with the first iteration of each. auto starts where the work is worth it, and resumes
+    where it was. Raises UsageError for an unusable device.
     """
 
     def __init__(self, name: str = CPU) -> None:
@@ -115,7 +114,7 @@ class FitDevice:
         self.history: list[dict[str, Any]] = []
 
     def give(self, fitter: SceneFitter, frames: Sequence[RgbdFrame], progress: Progress) -> None:
-        """Let a fitter compute there; `frames` are those of its first time step, keyframes come to them."""
+        """Move a fitter to the device; `frames` are its first time step, keyframes add to them."""
         num_splats, window = fitter.config.max_splats, fitter.config.window
         sizes = [(frame.intrinsics.height, frame.intrinsics.width) for frame in frames]
         sizes += [max(sizes)] * window
@@ -134,7 +133,6 @@ class FitDevice:
             self._fit = fitter.descent.device = DeviceFit(device.memory, num_splats, sizes)
 
     def _chosen(self, num_splats: int, sizes: Sequence[tuple[int, int]], progress: Progress) -> Device:
-        """Where auto computes; why is said."""
         last = self.history[-1]["device"] if self.history else ""
         if last == CPU:
             return Device()
@@ -144,14 +142,14 @@ class FitDevice:
         return automatic(progress, too_little, name=last or CUDA, needed=bytes_needed(num_splats, sizes))
 
     def close(self) -> None:
-        """Give the card's memory back."""
+        """Free the card's memory."""
         if self._fit is not None:
-            with suppress(DeviceError):  # a card that failed has been told of
+            with suppress(DeviceError):  # its failure was reported already
                 self._fit.close()
 
     @contextmanager
     def told_how_to_go_on(self, checkpoint: Path) -> Iterator[None]:
-        """Names what fails on the device, and how to go on from `checkpoint` where it is there."""
+        """Add device and remedy to its failures."""
         try:
             yield
         except DeviceError as error:
@@ -159,7 +157,7 @@ class FitDevice:
 
 
 def named(error: DeviceError, device: Device | None, checkpoint: Path | None = None) -> DeviceFault:
-    """What failed on a device, and how to go on, from `checkpoint` where it is there."""
+    """Describe a device's failure, with a remedy from `checkpoint` if it exists."""
     kind = DeviceFull if isinstance(error, OutOfMemory) else DeviceFault
     remedies = [error.remedy] if error.remedy else []
     if checkpoint is not None and checkpoint.is_file():
@@ -171,6 +169,5 @@ def named(error: DeviceError, device: Device | None, checkpoint: Path | None = N
 
 
 def shown(device: dict[str, Any]) -> str:
-    """A device of the history in words."""
     card = f" ({device['card']}, driver {device['driver']})" if "card" in device else ""
     return f"{device['device']}{card}"

@@ -1,4 +1,4 @@
-"""What a job says while it works."""
+"""Progress of a job."""
 
 import time
 from typing import Protocol, Self
@@ -7,7 +7,7 @@ TELL_S = 10.0  # between two lines of one wait
 
 
 class Progress(Protocol):
-    """Takes log lines; `is_quiet` where nobody reads them, so that no bar is drawn."""
+    """Receiver of log lines; no bar is drawn if `is_quiet`."""
 
     is_quiet: bool
 
@@ -17,7 +17,7 @@ class Progress(Protocol):
 
 
 class Silent:
-    """Says nothing."""
+    """Progress without output."""
 
     is_quiet = True
 
@@ -29,19 +29,15 @@ SILENT = Silent()
 
 
 class Wait:
-    """A wait of many steps, announced before it begins; then, while it lasts, how far it is and about how long still.
-
-    total: None where nobody knows how many steps there will be.
-    """
+    """A wait of many steps, announced, then reported with the time left."""
 
     def __init__(self, progress: Progress, what: str, unit: str, total: int | None = None) -> None:
         self._progress, self._what, self._unit, self._total = progress, what, unit, total
         self._told = time.monotonic()
-        self._first: tuple[float, int] | None = None  # the time of the first steps, which take longer, and how many
+        self._first: tuple[float, int] | None = None  # time and number of the first steps, which take longer
         self._done = 0
 
     def announce(self) -> Self:
-        """Say what begins, and how long it is."""
         self._progress.log(self._what + ("" if self._total is None else f": {self._total} {self._unit}"))
         return self
 
@@ -49,7 +45,7 @@ class Wait:
         self.at(self._done + 1)
 
     def at(self, done: int) -> None:
-        """`done` steps are; it is said where the last line is `TELL_S` ago."""
+        """Report `done` steps, at most every `TELL_S`."""
         self._done, now = done, time.monotonic()
         self._first = self._first or ((now, done) if done else None)
         if self._total is not None and done > self._total:
@@ -65,7 +61,7 @@ class Wait:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as a person says them: 40 s, 6 min, 1 h 20 min."""
+    """Seconds in words: 40 s, 6 min, 1 h 20 min."""
     minutes = round(seconds / 60)
     if seconds < 90:
         return f"{max(round(seconds), 1)} s"

@@ -1,4 +1,4 @@
-"""Going on with an interrupted run: what has to be the same, and what differs."""
+"""Resumption of an interrupted run, and what must be equal."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -14,7 +14,7 @@ from splatctrl_cli.files.output import sha256
 from splatctrl_cli.formats.scene.scene_writer import Checkpoint, read_checkpoint
 from splatctrl_cli.kernels import arithmetic
 
-DECIDING_OPTIONS: Mapping[str, object] = {  # what decides the bytes of a scene beside its configuration, if not given
+DECIDING_OPTIONS: Mapping[str, object] = {  # defaults that decide a scene's bytes, besides its configuration
     **{"cameras": None, "camera": [], "camera_pose": [], "world_frame": None, "depth_scale": None},
     **{
         "pairing_tolerance": 0.02,
@@ -32,10 +32,9 @@ DECIDING_PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin")  # their
 def identity(
     options: Mapping[str, object], files: Mapping[str, Path | None], config: Config, inputs: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Everything that decides the bytes of a run, as plain values; not the number of threads, which does not.
+    """Plain values that decide the bytes of a run; the number of threads does not.
 
-    options: values by the names of their options; files: likewise, whose contents count; inputs: sha256 of the
-    recording's files, by name.
+    options, files: by option name, files by content. inputs: sha256 of the recording's files.
     """
     values = {
         **deciding_versions(),
@@ -49,7 +48,7 @@ def identity(
 
 
 def deciding_versions() -> dict[str, str]:
-    """What of this program, its kernels and its packages may change a bit."""
+    """Versions of program, kernels and packages that may change a bit."""
     return {
         "splatctrl": __version__,
         "kernels": arithmetic(),
@@ -59,7 +58,7 @@ def deciding_versions() -> dict[str, str]:
 
 @contextmanager
 def told_how_to_go_on(checkpoint: Path, kept: Path | None = None) -> Iterator[None]:
-    """Says after Ctrl-C what was kept (by default the folder above that of the checkpoint)."""
+    """Add to Ctrl-C what was kept, by default the folder two above the checkpoint."""
     try:
         yield
     except KeyboardInterrupt:
@@ -72,14 +71,14 @@ def told_how_to_go_on(checkpoint: Path, kept: Path | None = None) -> Iterator[No
 
 
 def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> Checkpoint:
-    """The checkpoint in a partial folder. Raises UsageError naming what differs `now` from when it was written."""
+    """Read a partial folder's checkpoint. Raises UsageError naming differences."""
     checkpoint = read_checkpoint(folder)
     check_same_run(folder, checkpoint.progress["run"], now)
     return checkpoint
 
 
 def check_same_run(folder: Path, run: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise UsageError naming what differs `now` from what decided the bytes of an interrupted run."""
+    """Raise UsageError naming deciding values that differ from the interrupted run."""
     before, after = dict(_flat(run)), dict(_flat(now))
     differing = [name for name in {**before, **after} if before.get(name) != after.get(name)]
     if differing:

@@ -1,1 +1,1 @@
-"""The folder that a run leaves, read again."""
+"""Output folders of runs, read again."""

@@ -1,4 +1,4 @@
-"""What a finished run left in its folder (``run.json``, a replay's states, pictures), and a batch in its own."""
+"""Output folder of a finished run or batch."""
 
 import csv
 import json
@@ -21,10 +21,10 @@ REPLAY = "replay"
 
 @dataclass(frozen=True, kw_only=True)
 class States:
-    """The columns of a replay's ``steps.csv`` (T rows) that a report shows; NaN where a cell is empty.
+    """Columns of a replay's ``steps.csv`` (T rows); NaN for empty cells.
 
-    stamps_ns, seconds [s] since the first; joints by name (T,); clearance [m] by measure (T,), `truth` among them;
-    rungs (T,), empty without a controller; obstacles (T,) in words.
+    seconds since the first. joints by name (T,). clearance [m] by measure (T,), `truth` included. rungs, obstacles
+    (T,).
     """
 
     stamps_ns: Stamps
@@ -35,7 +35,7 @@ class States:
     obstacles: tuple[str, ...]
 
     def worst(self) -> int | None:
-        """The state of least clearance by any measure, None where there is no value."""
+        """State of least clearance by any measure, None without values."""
         if not self.clearance or not len(self.seconds):
             return None
         least = np.fmin.reduce(list(self.clearance.values()))
@@ -44,7 +44,7 @@ class States:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A folder that a command wrote; words: its command line, where ``run.json`` has that of a program around it."""
+    """A command's folder; words: its command line, if ``run.json`` has an outer program's."""
 
     path: Path
     run: Mapping[str, Any]
@@ -52,7 +52,7 @@ class RunFolder:
 
     @cached_property
     def parts(self) -> Parts:
-        """By which each file is checked when it is opened."""
+        """Digests to check files on opening."""
         return Parts.of_run(self.path, self.run)
 
     @property
@@ -61,7 +61,7 @@ class RunFolder:
 
     @property
     def verdict(self) -> Mapping[str, Any]:
-        """As ``run.json`` has it, empty for a command that does not judge."""
+        """Verdict in ``run.json``, empty without one."""
         return self._object("verdict")
 
     @property
@@ -80,17 +80,17 @@ class RunFolder:
         return [str(word) for word in given] if isinstance(given, list) else []
 
     def options(self, name: str) -> list[str]:
-        """The values of a repeatable option of the command line."""
+        """Values of a repeatable option."""
         words = self.arguments
         found = [words[i + 1] for i, word in enumerate(words[:-1]) if word == name]
         return found + [word.partition("=")[2] for word in words if word.startswith(f"{name}=")]
 
     def option(self, name: str) -> str | None:
-        """The last value of an option, None where it was not given."""
+        """Last value of an option."""
         return next(iter(self.options(name)[::-1]), None)
 
     def json_of(self, name: str) -> Any:
-        """What a JSON file of the folder holds, None where it is not there. Raises InputError for one that is not."""
+        """Content of a JSON file, None if missing. Raises InputError for invalid JSON."""
         file = self.path / name
         if not self.parts.has(file):
             return None
@@ -100,13 +100,13 @@ class RunFolder:
             raise InputError(f"{file}: is not JSON: {error}") from None
 
     def pictures(self) -> list[Path]:
-        """The PNG files of the folder and of its folders of pictures, by name."""
+        """PNG files of the run, by name."""
         found = [*sorted(self.path.glob("*.png")), *sorted(self.path.glob("report/*.png"))]
         return [self.parts.checked(path) for path in found if self.parts.has(path)]
 
     @cached_property
     def states(self) -> States | None:
-        """The states of a replay; None of other commands. Raises InputError for a table with other columns."""
+        """States of a replay, else None. Raises InputError for other columns."""
         file = self.path / "steps.csv"
         if self.command != REPLAY or not self.parts.has(file):
             return None
@@ -116,9 +116,9 @@ class RunFolder:
             raise InputError(f"{file}: expected the columns of a replay: {error}") from None
 
     def place_of(self, given: str, roots: tuple[Path, ...], digest: str | None = None) -> Path | None:
-        """Where a path of the command line lies now: as typed, below a folder above the run, or below `roots`.
+        """Find a path of the command line: as typed, above the run, or below `roots`.
 
-        digest: of the file, which it is to have. None where there is no such file.
+        None if missing, or of another `digest`.
         """
         above = [Path(), *self.path.absolute().parents, *roots]
         found = [root / given for root in above if (root / given).exists()]
@@ -127,10 +127,7 @@ class RunFolder:
 
 @dataclass(frozen=True, kw_only=True)
 class FolderRequest:
-    """A file `out` made of `path`, None for a name like its own.
-
-    roots: folders in which the scene and robot of a replay's command line are looked for.
-    """
+    """A file `out` made from `path`; roots: folders with a replay's scene and robot."""
 
     path: Path
     out: Path | None = None
@@ -140,7 +137,7 @@ class FolderRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenFile:
-    """A file that was written, and its size."""
+    """A written file and its size."""
 
     file: Path
     bytes: int
@@ -150,7 +147,7 @@ class WrittenFile:
 
 
 def open_run(path: Path) -> RunFolder:
-    """The run in a folder. Raises InputError where it is none, is not whole, or a newer version wrote it."""
+    """Open a run's folder. Raises InputError if it is no run, incomplete, or too new."""
     partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
     if partial.exists() and (partial == path or not path.exists()):
         raise InputError(
@@ -174,7 +171,7 @@ def open_run(path: Path) -> RunFolder:
 
 
 def read_object(file: Path) -> dict[str, Any]:
-    """The object in a JSON file. Raises InputError where there is none."""
+    """Read a JSON object. Raises InputError for anything else."""
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -188,7 +185,7 @@ def read_object(file: Path) -> dict[str, Any]:
 
 
 def read_columns(file: Path) -> dict[str, tuple[str, ...]]:
-    """The cells of a CSV table with rows, by column."""
+    """Cells of a CSV table by column."""
     with file.open(encoding="utf-8", newline="") as stream:
         rows = csv.reader(stream)
         header = next(rows)
@@ -216,7 +213,7 @@ def _states(columns: Mapping[str, tuple[str, ...]]) -> States:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchFolder:
-    """A batch and the last run of each of its nodes; jobs: the names of the suite's, in its order."""
+    """A batch and the last run of each node; jobs in the suite's order."""
 
     path: Path
     suite: str
@@ -224,7 +221,7 @@ class BatchFolder:
     runs: tuple[Run, ...]
 
     def inside(self, name: str) -> Path:
-        """A path that the batch names. Raises InputError where it leads out of its folder."""
+        """Path the batch names. Raises InputError if it leaves the folder."""
         if not name or Path(name).is_absolute() or ".." in Path(name).parts:
             raise InputError(f"{self.path / FILE}: {name!r}: expected a path in the batch", remedy="run it again")
         return self.path / name
@@ -235,7 +232,7 @@ def is_batch(path: Path) -> bool:
 
 
 def open_batch(path: Path) -> BatchFolder:
-    """The batch in a folder. Raises InputError for a file that is not one, or that a newer version wrote."""
+    """Open a batch. Raises InputError for another or a too new file."""
     file = path / FILE
     batch = read_object(file)
     try:

@@ -1,1 +1,1 @@
-"""Scores of splats on recorded views."""
+"""Scores on recorded views."""

@@ -1,4 +1,4 @@
-"""What `score` compares with: the recording, which of its views are scored by which protocol, and their masks."""
+"""Reference of `score`: recording, scored views by protocol, and masks."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,10 +27,10 @@ Mask = Callable[[RgbdFrame], Bool | None]
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """source: the recording `where` with all its cameras. scan: its name in a data set of several. protocol and split
-    where one was named; training_stamps_ns: of the views that it trains on. mask_rule says in words what `mask`
-    selects. Without depth, nothing says what a training camera saw. stamps_ns: of each camera's frames, where several
-    logs are one session. doubts: what speaks against the scores, in words.
+    """Recording `where` with all its cameras, to score against.
+
+    scan: name in a data set. mask_rule: describes `mask`. Without depth, what training cameras saw is unknown.
+    stamps_ns: by camera, for a session of logs.
     """
 
     where: Path
@@ -49,12 +49,12 @@ class Reference:
 
     @property
     def scores_training(self) -> bool:
-        """Whether the protocol scores the views that trained."""
+        """True if the protocol scores training views."""
         return self.protocol is not None and self.protocol.scores_training
 
 
 def open_reference(recording: RecordingRequest, progress: Progress) -> Reference:
-    """The recording with all its cameras: those chosen are scored, the others say what was seen."""
+    """Open the recording with all cameras: chosen ones are scored, others tell what was seen."""
     if recording.is_dtu:
         return _dtu_reference(recording, progress)
     refuse_scan_options(recording)
@@ -78,7 +78,7 @@ def open_reference(recording: RecordingRequest, progress: Progress) -> Reference
 
 
 def _session_reference(paths: Sequence[Path], options: SourceOptions) -> Reference:
-    """Several logs as one: in one tree of frames, or InputError is raised."""
+    """Join logs with one tf tree; raises InputError otherwise."""
     source = open_session(paths, options)
     stamps_ns: dict[str, list[int]] = {}
     for stamp, camera, _ in source.poses():
@@ -112,7 +112,7 @@ def _dtu_reference(recording: RecordingRequest, progress: Progress) -> Reference
 
 
 def missing_views(source: DtuSource, protocol: ScoreProtocol | None) -> Iterator[str]:
-    """In words, which views of the scan are not there, where that changes which are scored, or that lack depth."""
+    """Sentences on a scan's missing views that change the scored ones, or lack depth."""
     numbers = sorted({*source.split.training, *source.split.scored, *source.split.left_out})
     missing = sorted(set(range(numbers[-1] + 1)) - set(numbers))
     if missing and protocol is not None and protocol.every:
@@ -137,7 +137,7 @@ def _mask_of(source: DtuSource, wanted: str) -> tuple[Mask | None, str]:
 def cameras_to_score(
     wanted: Sequence[str] | None, reference: Reference, training: Sequence[str], *, allow_training: bool
 ) -> tuple[str, ...]:
-    """The cameras that are scored: by default those that did not train. Raises UsageError where there is none."""
+    """Scored cameras, by default those that did not train. Raises UsageError without any."""
     recorded = reference.source.cameras
     if reference.scores_training:
         return recorded
@@ -163,7 +163,7 @@ def cameras_to_score(
 
 
 def check_times(reference: Reference, scoring: Sequence[str], training: Sequence[str]) -> None:
-    """Raise InputError for a camera of a session whose frames all lie before or after those of training cameras."""
+    """Raise InputError for a session's camera entirely before or after the training cameras."""
     trained = [stamp for camera in training for stamp in reference.stamps_ns.get(camera, ())]
     for camera in scoring if trained else ():
         stamps = reference.stamps_ns[camera]
@@ -176,7 +176,7 @@ def check_times(reference: Reference, scoring: Sequence[str], training: Sequence
 
 
 def check_training(path: Path, scene: SceneFolder, reference: Reference) -> None:
-    """Raise UsageError where the scene at `path` was not trained on the views that the protocol trains on."""
+    """Raise UsageError if the scene did not train on the protocol's training views."""
     if reference.protocol is None or reference.split is None or not scene.names_its_views:
         return
     trained, expected = scene.training_stamps_ns, reference.training_stamps_ns
@@ -193,11 +193,9 @@ def check_training(path: Path, scene: SceneFolder, reference: Reference) -> None
 def recording_check(
     path: Path, scene: SceneFolder, reference: Reference, digests: Mapping[str, str], *, allow_other: bool
 ) -> dict[str, Any]:
-    """What the recording has in common with the one that made the scene at `path`. Raises InputError where they
-    differ, unless that is allowed.
+    """Compare the recording with the scene's own; raises InputError for another, unless allowed.
 
-    By the first frame of each camera that trained (not kept by an older version), and the digests of files of the
-    same names.
+    Compares first frames of training cameras (unless an older version), and digests of equal file names.
     """
     recorded = scene.run.get("metrics", {}).get("first_frames")
     then = scene.run.get("inputs", {})

@@ -1,4 +1,4 @@
-"""A scene against recorded views that did not train it, from the request to the result: one scan, or several."""
+"""A score of scenes against held-out views of one or several scans."""
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
@@ -41,12 +41,11 @@ from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, vie
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreRequest:
-    """One scene, or a folder of scenes named like the scans of the recording's data set, and how views are scored.
+    """One scene, or a folder of scenes named like scans, to score on views.
 
-    recording: what is compared with; its options' cameras are those scored. baseline: score.json of an earlier score,
-    whose figures are compared. out: folder for scores and pictures. newest: render a view from the newest snapshot
-    not later than it, else from the final splats. images: pictures of ``all`` views, of each camera's ``best-worst``,
-    or ``none``. require: gates on the metrics. Raises UsageError for pictures of all views without a folder.
+    recording: its options' cameras are scored. baseline: score.json of an earlier score. newest: render a view from
+    the newest snapshot not later than it, else from the final splats. images: pictures of ``all`` views, each
+    camera's ``best-worst``, or ``none``. Raises UsageError for all without a folder.
     """
 
     scene: Path
@@ -69,7 +68,7 @@ class ScoreRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreResult:
-    """report: everything that ``score.json`` holds; the folder `out` where one was asked for."""
+    """A score; report: the content of ``score.json``."""
 
     __repr__ = brief
 
@@ -79,27 +78,24 @@ class ScoreResult:
 
     @property
     def metrics(self) -> Mapping[str, float | None]:
-        """The mean figures by flat name, None where a figure has no value."""
+        """Mean figures, None without a value."""
         return dict(self.report["metrics"])
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """How many views each figure rests on."""
+        """Views behind each figure."""
         return self.verdict.counts
 
     @property
     def notes(self) -> Sequence[str]:
-        """What speaks against the figures, in words."""
+        """Doubts about the figures."""
         return tuple(self.report["warnings"])
 
 
 def score(request: ScoreRequest, progress: Progress = SILENT) -> ScoreResult:
-    """Score a scene, or the scenes of several scans and their mean.
-
-    Raises SplatCtrlError for a scene or a recording that cannot be compared.
-    """
+    """Score a scene, or scenes of several scans and their mean. Raises SplatCtrlError."""
     if request.baseline is not None:
-        read_baseline(request.baseline)  # better refused now than after the views
+        read_baseline(request.baseline)  # refuses it before the views are scored
     names = NAMES if request.baseline is None else NAMES_WITH_CHANGES
     check_gate_names(request.require, names, {"--baseline": NAMES_WITH_CHANGES})
     scenes = _scenes_of_scans(request)
@@ -110,13 +106,12 @@ def score(request: ScoreRequest, progress: Progress = SILENT) -> ScoreResult:
 
 
 def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) -> ScoreResult:
-    """Score one scene, and write what is asked for into `folder`, where there is one."""
     stopwatch, recording = Stopwatch(), request.recording
     if folder:
         folder.mkdir(exist_ok=True)
     scene = open_splats(request.scene)
     if scene.is_anisotropic:
-        scene.gaussians()  # either raises where there is none to compare
+        scene.gaussians()  # both raise if there is no splat to compare
     else:
         field_splats(scene.splats())
     reference = open_reference(recording, progress)
@@ -194,7 +189,7 @@ def _report(
 
 
 def _protocol(reference: Reference, scene: SceneFolder, scores: Scores) -> dict[str, Any]:
-    """What a figure has to be printed with to be compared with another."""
+    """Facts a figure must be published with to be comparable."""
     named, split = reference.protocol, reference.split
     sizes = sorted({view.size for view in scores.views})
     return {
@@ -215,7 +210,7 @@ def _protocol(reference: Reference, scene: SceneFolder, scores: Scores) -> dict[
 
 
 def _free_mass(path: Path, scene: SceneFolder) -> float:
-    """nan where the scene has no occupancy grid."""
+    """Free mass of the scene, NaN without an occupancy grid."""
     if not (path / "occupancy.npz").is_file():
         return nan
     keys = ("config", "occupancy", "free_below")
@@ -225,7 +220,6 @@ def _free_mass(path: Path, scene: SceneFolder) -> float:
 
 
 def _concluded(request: ScoreRequest, report: dict[str, Any], *, is_damaged: bool) -> ScoreResult:
-    """The result of a report, to whose metrics the changes since a baseline are added."""
     if request.baseline is not None:
         report["metrics"] |= changes(report, request.baseline)
     verdict = score_verdict(report, request.require, is_damaged=is_damaged)
@@ -233,7 +227,6 @@ def _concluded(request: ScoreRequest, report: dict[str, Any], *, is_damaged: boo
 
 
 def _view_drawer(folder: Path) -> Callable[[ComparisonRow], None]:
-    """Writes the pictures of each view into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     return lambda row: view_picture(folder / f"{row.title}.png", row)
 
@@ -253,7 +246,6 @@ def _write_result(
     inputs: Mapping[str, str] | None = None,
     stopwatch: Stopwatch | None = None,
 ) -> None:
-    """``score.json`` and ``run.json``."""
     write_json(folder / "score.json", result.report)
     write_run(
         folder,
@@ -267,10 +259,7 @@ def _write_result(
 
 
 def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
-    """The scenes by scan where the request's is a folder of them; empty where it is one, or of no data set.
-
-    Raises InputError for a scan that has none.
-    """
+    """Scenes by scan in a folder of them; empty for a single scene. Raises InputError."""
     folder, recording = request.scene, request.recording
     if not recording.is_dtu or not folder.is_dir() or (folder / "splats.ply").is_file():
         return {}
@@ -287,12 +276,11 @@ def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
 def _score_scans(
     request: ScoreRequest, scenes: Mapping[str, Path], folder: Path | None, progress: Progress
 ) -> ScoreResult:
-    """Score every scene against its scan, and the means. `folder` gets a folder for each scan."""
     results: dict[str, ScoreResult] = {}
     for scan, scene in scenes.items():
         progress.log(f"{scan}: scores {scene}")
         recording = of_scan(request.recording, scan)
-        # the means alone are held to gates and a baseline
+        # gates and baseline apply to the means alone
         alone = replace(request, scene=scene, recording=recording, require=(), baseline=None)
         results[scan] = _score_scene(alone, folder and folder / scan, progress)
     report = {"scenes": str(request.scene), "reference": str(request.recording.path)}
@@ -307,9 +295,9 @@ def _score_scans(
 
 
 def of_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
-    """One scan of the recording's data set, with its masks: those in a folder DIR/SCAN.
+    """Recording of one scan with its masks in DIR/SCAN.
 
-    Raises InputError where there is none: the masks of one scan fit no other.
+    Raises InputError without them: masks of one scan fit no other.
     """
     masks = None if recording.masks is None else recording.masks / scan
     if masks is not None and not masks.is_dir():

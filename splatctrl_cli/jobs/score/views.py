@@ -1,6 +1,4 @@
-"""Renders the views that are scored, from the splats of their time, and scores them one by one; and a scene's surface
-against reference points or a mesh.
-"""
+"""Scores of rendered views and of surfaces."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
@@ -38,10 +36,9 @@ Ranked = tuple[float, ComparisonRow]
 
 @dataclass(kw_only=True)
 class Scores:
-    """What scoring gathers: the views, the names of those before the first snapshot, the pictures of each camera's
-    best and worst.
+    """Scored views; skipped: names before the first snapshot; extremes: best and worst by camera.
 
-    training: the frames that count as known at the last view; doubts: what speaks against the scores, in words.
+    training: frames known at the last view.
     """
 
     has_clock: bool
@@ -54,9 +51,9 @@ class Scores:
 
 @dataclass(frozen=True, kw_only=True)
 class Scorer:
-    """Scores views of `reference`; every view's row of pictures goes to `draw`, where there is one.
+    """Scorer of views of `reference`; `draw` gets every view's row of pictures.
 
-    newest: a view is rendered from the newest snapshot not later than it, else from the final splats.
+    newest: render from the newest snapshot not later than the view, else from the final splats.
     """
 
     scene: SceneFolder
@@ -68,7 +65,7 @@ class Scorer:
     threads: int = 0
 
     def run(self, progress: Progress, stopwatch: Stopwatch) -> Scores:
-        """Score every view. Raises NotEvaluableError where there is none, or not one pixel of any was seen."""
+        """Score every view. Raises NotEvaluableError without views, or if no pixel was seen."""
         scene, source = self.scene, self.reference.source
         has_clock = scene.has_clock and source.has_clock
         off = scene.run.get("metrics", {}).get("displaced_cameras") or {}
@@ -150,7 +147,6 @@ class Scorer:
     def _compared(
         self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet, shell: SplatSet | None
     ) -> tuple[ViewScore, ComparisonRow]:
-        """What a view comes to where `frame` stands for it."""
         protocol = self.reference.protocol
         camera = frame.intrinsics, frame.T_world_camera
         rendering = rendered(splats, *camera, self.threads)
@@ -189,22 +185,23 @@ def _figures(score: ViewScore) -> str:
 def rendered(
     splats: SplatSet | GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, threads: int
 ) -> Rendering:
-    """What a camera sees of splats of either kind."""
+    """Render splats of either kind."""
     if isinstance(splats, GaussianSet):
         return render_gaussians(splats, intrinsics, T_world_camera, threads=threads)
     return render(splats, intrinsics, T_world_camera, threads=threads)
 
 
 def final_splats(scene: SceneFolder) -> SplatSet | GaussianSet:
-    """The splats of either kind that a scene ended with."""
+    """Final splats, of either kind."""
     return scene.gaussians() if scene.is_anisotropic else scene.splats()
 
 
 @dataclass(frozen=True, kw_only=True)
 class CloudSettings:
-    """path: reference points or a mesh, or a folder of them by scan; unit: metres per unit of the file. Points
-    farther than `max_distance` [m] count in a share, not in a mean; both sides are thinned to `spacing` [m]. masks:
-    DTU's folder of what it observed, of one scan read into `space`.
+    """Reference points or mesh at `path`, or a folder of them by scan.
+
+    unit: metres per unit of the file. Points beyond `max_distance` [m] count in a share, not in a mean. Both sides
+    are thinned to `spacing` [m]. masks: DTU's folder of observed space, read for one scan into `space`.
     """
 
     path: Path
@@ -215,15 +212,11 @@ class CloudSettings:
     space: ObservedSpace | None = None
 
     def of_scan(self, scan: str | None) -> "CloudSettings":
-        """The same with the files of one scan, where folders of several were given.
-
-        Raises InputError naming the files looked for.
-        """
+        """Settings with one scan's files. Raises InputError naming missing files."""
         path = cloud_of_scan(self.path, scan or "") if self.path.is_dir() else self.path
         return replace(self, path=path, space=None if self.masks is None else read_observed(self.masks, scan or ""))
 
     def words(self) -> str:
-        """How the figures come about."""
         within = "" if self.masks is None else f"; within the masks and above the planes of {self.masks}"
         return (
             f"{self.path}, 1 unit = {self.unit:g} m; points {1e3 * self.spacing:g} mm apart; means below"
@@ -234,7 +227,7 @@ class CloudSettings:
 def cloud_figures(
     settings: CloudSettings, scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int
 ) -> dict[str, float]:
-    """The figures by flat name. `frames`: the training views that the surface is looked at from."""
+    """Surface figures by flat name, seen from training views `frames`."""
     reference, space, counts = spaced(_reference(settings), settings.spacing), settings.space, None
     points = _surface(scene, frames, threads, settings.spacing)
     if space is not None:
@@ -259,8 +252,7 @@ def _reference(settings: CloudSettings) -> Float64:
 
 
 def _surface(scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int, spacing: float) -> Float64:
-    """World points (P, 3) [m] of the final splats' rendered depth at the poses of `frames`, the robot left out,
-    `spacing` [m] apart."""
+    """World points (P, 3) [m] of the final splats' rendered depth, without the robot, thinned."""
     splats = final_splats(scene)
     splats = splats.select(splats.labels != Label.ROBOT)
     shown = (rendered(splats, frame.intrinsics, frame.T_world_camera, threads) for frame in frames)

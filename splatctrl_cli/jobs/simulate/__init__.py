@@ -1,1 +1,1 @@
-"""Recordings of which the truth is known."""
+"""Simulated recordings."""

@@ -1,6 +1,6 @@
-"""A simulation from its request to its result: a recorded log of an arm at a table, with its truth.
+"""A simulation: a log of an arm at a table, with its truth.
 
-Another arm takes its files, its spheres, and a motion that brings its tip where ours goes.
+Another arm gets its files, its spheres, and a motion that moves its tip like ours.
 """
 
 import shutil
@@ -41,12 +41,11 @@ from splatctrl_cli.simulate.truth import Truth, distance_along, truth_document
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateRequest:
-    """Write log.mcap, truth.json and the robot's files into the folder `out`; dtu: and a scan, in both layouts.
+    """One simulation into the folder `out`: log.mcap, truth.json and robot files; dtu: a scan, too.
 
-    urdf: of another arm than the simulated one, its base on the table at the world's origin; spheres: that cover it
-    (None: fitted); packages: where its meshes are looked for. is_slim: the arm is seen by shapes inside of its
-    collision shapes; unmodelled: names of `UNMODELLED` parts that move with it, in images and truth alone.
-    scene: what stands there and how the robot moves in it, instead of the table of the options.
+    urdf: of another arm, its base on the table at the world's origin. spheres: None to fit them. is_slim: images show
+    shapes inside the collision shapes. unmodelled: `UNMODELLED` parts that move along, in images and truth alone.
+    scene: objects and motion in place of the options' table.
     """
 
     out: Path
@@ -68,14 +67,14 @@ class SimulateRequest:
 
     @property
     def config(self) -> dict[str, Any]:
-        """Metrics for run.json."""
+        """Options for run.json."""
         own = {"is_slim": self.is_slim, "unmodelled": self.unmodelled}
         return {**vars(self.options), **{name: value for name, value in own.items() if value}}
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateResult:
-    """The folder, what is true in the log, frames by camera, and bytes of each file or folder in it."""
+    """The folder, the log's truth, frames by camera, and bytes by file or folder."""
 
     out: Path
     truth: Truth
@@ -88,7 +87,7 @@ class SimulateResult:
 
 
 def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateResult:
-    """Record the scene; the same options give the same bytes."""
+    """Record the scene; equal options give equal bytes."""
     stopwatch = Stopwatch()
     with output_path(request.out, force=request.force, is_folder=True) as folder:
         with stopwatch.stage("log"):
@@ -110,7 +109,6 @@ def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateR
 
 
 def _record(folder: Path, request: SimulateRequest, progress: Progress) -> tuple[Truth, dict[str, int]]:
-    """Write robot files and log; the truth and the number of frames by camera."""
     recording = _recording(folder, request, progress)
     contrast: dict[str, float] = {}
     num_frames = {camera.name: 0 for camera in recording.cameras}
@@ -130,7 +128,6 @@ def _record(folder: Path, request: SimulateRequest, progress: Progress) -> tuple
 
 
 def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Recording:
-    """The scene and the arm in it, whose files are written."""
     options = request.options
     surfaces = None
     if request.urdf is None:
@@ -182,7 +179,6 @@ def _write_scan(folder: Path) -> None:
 
 
 def _sizes(folder: Path) -> dict[str, int]:
-    """Bytes of each file, and of each folder's files in all."""
     sizes = {}
     for path in sorted(folder.iterdir()):
         parts = [path] if path.is_file() else [part for part in path.rglob("*") if part.is_file()]
@@ -208,10 +204,9 @@ REMEDY = "give the URDF of an arm whose base stands on the table's top"
 def copied_arm(
     urdf: Path, given: Path | None, packages: Sequence[Path], folder: Path, progress: Progress
 ) -> tuple[RobotModel, SelfSurfaces]:
-    """Write ``robot.urdf``, the meshes that it names into ``meshes/``, and ``robot_spheres.yaml`` (a copy of the file
-    `given`, or fitted) into a folder, and read them back as the robot and the surfaces of its links.
+    """Copy ``robot.urdf``, its ``meshes/`` and ``robot_spheres.yaml`` into a folder and read them.
 
-    Raises InputError for a URDF without collision geometry, or whose collision meshes are missing.
+    The spheres come from the file `given`, or are fitted. Raises InputError without collision geometry or meshes.
     """
     original = read_urdf(urdf)
     solids = read_solids(original, packages)
@@ -231,13 +226,12 @@ def copied_arm(
 
 
 def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Motion:
-    """The scene's motion for another arm: at each waypoint its tip (the last link of its URDF, z pointing away from
-    the arm) is where the hand of the simulated arm is, as far as it reaches, and any way round.
+    """Adapt the scene's motion to another arm, whose tip follows the simulated arm's hand.
 
-    Among the postures found, those of the shortest way that keeps clear of everything there and of the arm itself;
-    where none is within its velocity limits, the way that has to be slowed down least. An arm whose tip is there in
-    the same postures moves as the simulated arm does. Raises InputError where none leads to a waypoint, or every way
-    runs into something.
+    The tip is the URDF's last link, its z pointing away from the arm. It goes as far as it reaches, turned any way
+    about z. The shortest clear way through the postures found is taken, or the least slowed one if none keeps the
+    velocity limits. An arm that fits the original postures keeps the original motion. Raises InputError for an
+    unreachable waypoint, or if every way collides.
     """
     times, ours = scene.motion.times, scene.motion.waypoints
     if ours.shape[1] == model.num_joints and all(
@@ -261,8 +255,9 @@ def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> M
 
 
 def _with_own_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
-    """The URDF's text with its collision meshes, and as STL its visual ones, copied beside it: the folder needs no
-    package. A link whose visual mesh cannot be read is seen by its collision geometry, if it has any.
+    """Copy a URDF's meshes into the folder, visual ones as STL, and return its text.
+
+    A link whose visual mesh is unreadable shows its collision geometry, if any.
     """
     root, copies = ElementTree.fromstring(urdf.text), dict[tuple[str, str], str]()
     parts = [(link, part) for link in root.iter("link") for tag in ("collision", "visual") for part in link.iter(tag)]
@@ -287,7 +282,6 @@ def _with_own_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, pro
 
 
 def _copy(source: Path, folder: Path, copies: Mapping[tuple[str, str], str], is_visual: bool) -> str:
-    """Copy a mesh into the folder, under a name that no other copy has; that name."""
     kind = "meshes/visual" if is_visual else "meshes"
     stem = f"{source.stem}.stl" if is_visual else source.name
     name = f"{kind}/{stem}" if f"{kind}/{stem}" not in copies.values() else f"{kind}/{len(copies)}_{stem}"
@@ -301,9 +295,10 @@ def _copy(source: Path, folder: Path, copies: Mapping[tuple[str, str], str], is_
 
 
 def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
-    """Postures (K, J) with the tip at a pose (4, 4), or nearer to the base where it does not reach it.
+    """Find postures (K, J) with the tip at a pose (4, 4).
 
-    q: of the simulated arm there, from which the search for an arm of as many joints begins.
+    If out of reach, the pose moves nearer to the base. q: the simulated arm's, a first guess for an arm of as many
+    joints.
     """
     tip = model.frame_names[-1]
     guesses = [model.middle, *random_postures(model, fixed.SIMULATED_GUESSES, seed=0)]
@@ -327,7 +322,7 @@ def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
 
 
 def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
-    """The pose turned about its own z, its place that share as far from the base's axis."""
+    """Yield poses turned about z, `nearer` times as far from the base axis."""
     for angle in 2 * np.pi * np.arange(fixed.SIMULATED_TURNS) / fixed.SIMULATED_TURNS:
         T = T_base_hand.copy()
         c, s = np.cos(angle), np.sin(angle)
@@ -337,11 +332,9 @@ def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
 
 
 def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
-    """The cost of a leg between two postures: its length [rad], and more where it comes near anything, most where it
-    has to be slowed down; infinite where it runs into something or itself.
+    """Cost of a leg: length [rad], more if close to anything, most if slowed; infinite in collision.
 
-    A leg that is slowed down is elsewhere when things come and leave: it keeps clear of all of them, and is refused
-    where something moves.
+    A slowed leg meets objects at other times: it must avoid all, and is refused if one moves.
     """
     slowed = leg.within(model.velocity_limit)
     is_late = slowed.times[-1] > leg.times[-1]

@@ -1,1 +1,1 @@
-"""How far a recorded run is from the other verdict: what is varied, the search, the runs that answer it."""
+"""Sweeps: the distance of a run from another verdict."""

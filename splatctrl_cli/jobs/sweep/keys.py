@@ -1,4 +1,4 @@
-"""What a sweep may vary, and the jobs of a recorded run with a value of it."""
+"""Keys of a sweep, and the jobs with their values."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,17 +17,17 @@ from splatctrl_cli.recording.source_options import CALIBRATION, PERTURB
 from splatctrl_cli.simulate.tabletop import VISITOR
 
 SIMULATE, FIT, BAKE = "simulate", "reconstruct", "sdf-bake"
-MADE_BEFORE = {REPLAY: ("scene", "field"), BAKE: ("scene",)}  # options of a command that name what another wrote
-FITTED = ("scene", "occupancy", "human")  # sections of the configuration that the map is made with
+MADE_BEFORE = {REPLAY: ("scene", "field"), BAKE: ("scene",)}  # options naming another command's output
+FITTED = ("scene", "occupancy", "human")  # configuration sections of the map
 PLACES = ("obstacle-x", "obstacle-y", "obstacle-radius")  # in the order of simulate --visitor
 
 
 @dataclass(frozen=True, kw_only=True)
 class Key:
-    """What is varied: its unit, and which option of which command takes the value (as a batch's matrix names it).
+    """A varied value: its unit, and the option of each command that takes it.
 
-    lockstep: instead, of a run that makes its map itself. is_monotone: more of it can turn the verdict only once, for
-    which few values between the ends are tried.
+    lockstep: options for a run that makes its own map. is_monotone: the verdict can turn only once, so few values are
+    tried.
     """
 
     name: str
@@ -66,10 +66,7 @@ KEYS = {
 
 
 def key_of(name: str) -> Key:
-    """A key by its name, which may also be that of a setting that is a number, ``SECTION.KEY``.
-
-    Raises UsageError for another name.
-    """
+    """A key by name, or a numeric setting ``SECTION.KEY``. Raises UsageError for others."""
     if name in KEYS:
         return KEYS[name]
     section, _, setting = name.partition(".")
@@ -88,7 +85,7 @@ def key_of(name: str) -> Key:
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """A command that a run rests on, or the run itself: its options by name, and the cameras that trained, if any."""
+    """A command of a run: options by name, and training cameras."""
 
     command: str
     options: Mapping[str, Any]
@@ -97,13 +94,13 @@ class Stage:
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """The commands of a run from the first that a key varies on, the replay last."""
+    """Commands of a run from the first that a key varies on, the replay last."""
 
     stages: tuple[Stage, ...]
     keys: Mapping[str, Key]
 
     def jobs(self, values: Mapping[str, float]) -> tuple[Job, ...]:
-        """The jobs of a batch that make the run with values of all keys."""
+        """Batch jobs of the run with values of all keys."""
         return tuple(self._job(stage, values) for stage in self.stages)
 
     def _job(self, stage: Stage, values: Mapping[str, float]) -> Job:
@@ -126,15 +123,14 @@ class Chain:
 
 
 def options_for(key: Key, *, is_lockstep: bool) -> Mapping[str, str]:
-    """Which option of which command takes the value in such a run."""
+    """Option of each command that takes the value."""
     return key.lockstep if is_lockstep and key.lockstep else key.options
 
 
 def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine) -> Chain:
-    """The commands behind a replay, as far back as the keys reach.
+    """Commands behind a replay, as far back as the keys reach.
 
-    Raises InputError for what the run read that is not where it was, or not as it was; UsageError for a key that
-    means nothing for it.
+    Raises InputError for moved or changed inputs, UsageError for a key without effect.
     """
     stages = [_stage(run, command_line)]
     is_lockstep = "lockstep" in stages[0].options
@@ -167,7 +163,7 @@ def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine)
         if "cameras" in options.values() and not all(stage.cameras for stage in stages if stage.command in options):
             raise UsageError(f"--over {name}: the run does not say which cameras trained", remedy="reconstruct again")
     searched = {name: replace(key, is_monotone=key.is_monotone and not is_driven) for name, key in keys.items()}
-    return Chain(stages=tuple(stages), keys=searched)  # an arm that is driven moves otherwise with another value
+    return Chain(stages=tuple(stages), keys=searched)  # a driven arm moves differently with another value
 
 
 def _made_before(stage: Stage) -> str | None:
@@ -175,7 +171,7 @@ def _made_before(stage: Stage) -> str | None:
 
 
 def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
-    """A command with its options, their paths as they lie now. Raises InputError where something moved or changed."""
+    """Read a command's options with current paths. Raises InputError for moved or changed files."""
     options = command_line.options_of(run.arguments)
     found: list[Path] = []
 
@@ -202,7 +198,7 @@ def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
 
 
 def _check_inputs(run: RunFolder, places: Sequence[Path]) -> None:
-    """Raise InputError where a file that the run read is not to be found, or has other contents."""
+    """Raise InputError for a missing or changed input."""
     for name, digest in run.run.get("inputs", {}).items():
         if name.startswith(PERTURB):
             continue
@@ -213,13 +209,12 @@ def _check_inputs(run: RunFolder, places: Sequence[Path]) -> None:
 
 
 def _named(place: Path, name: str) -> Iterator[Path]:
-    """Where a file of that name, as a recording's digests have it, may lie: the place itself, in it, beside it."""
     yield from (place,) if place.name == name else ()
     yield from (place / name, place.parent / name)
 
 
 def _simulation_of(replayed: Stage) -> RunFolder:
-    """The simulation whose truth a replay was given. Raises UsageError where there is none."""
+    """Simulation of a replay's truth. Raises UsageError without one."""
     folder = Path(replayed.options.get("truth", "")).parent
     simulation = open_run(folder) if (folder / "run.json").is_file() else None
     if simulation is None or simulation.command != SIMULATE:
@@ -231,7 +226,7 @@ def _simulation_of(replayed: Stage) -> RunFolder:
 
 
 def _simulated(simulation: RunFolder, stages: Sequence[Stage], command_line: CommandLine) -> list[Stage]:
-    """With the simulation before them. Raises UsageError where they do not read its recording."""
+    """Prepend the simulation. Raises UsageError if the stages read another recording."""
     folder = simulation.path
     log, made = folder / "log.mcap", _stage(simulation, command_line)
     for stage in stages:
@@ -248,6 +243,5 @@ def _simulated(simulation: RunFolder, stages: Sequence[Stage], command_line: Com
 
 
 def _digests_behind(recording: Path) -> Iterable[str]:
-    """sha256 of a log, or of the logs that a capture was made of."""
     header = recording / "capture.json"
     return json.loads(header.read_text())["sources"].values() if header.is_file() else (sha256(recording),)

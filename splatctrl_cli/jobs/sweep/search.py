@@ -1,4 +1,4 @@
-"""Where an outcome changes: along one value by samples and bisection, over several by directions and bisection."""
+"""Search for a change of outcome over one or several values."""
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,17 +10,16 @@ from scipy.stats import qmc
 
 from splatctrl_cli.config.fixed import SWEEP_DIRECTIONS, SWEEP_SAMPLES, SWEEP_SEARCHED
 
-Judge = Callable[[Sequence[float]], Sequence[str]]  # outcomes of values, which may run side by side
+Judge = Callable[[Sequence[float]], Sequence[str]]  # outcomes of values, judged in parallel
 JudgeAt = Callable[[Sequence[Sequence[float]]], Sequence[str]]  # likewise of points in several values
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flip:
-    """The change nearest to the start: the last value with its outcome, and the first with another; None where all
-    values that were tried have one outcome.
+    """The flip nearest to the start: last value before it, first after; None without one.
 
-    outcomes: of every value tried, from the start on. is_monotone: they change once at most. spacing: the farthest
-    that two values tried before the flip, or any without one, lie apart: a narrower flip may have been missed.
+    outcomes: by distance from the start. is_monotone: at most one change. spacing: largest gap tried before the flip
+    (or anywhere without one); a narrower flip may be missed.
     """
 
     last: float | None
@@ -33,10 +32,10 @@ class Flip:
 def find_flip(
     judge: Judge, start: float, end: float, *, tolerance: float, is_whole: bool = False, is_monotone: bool = False
 ) -> Flip:
-    """The flip nearest to `start` on the way to `end`, to within `tolerance` (of whole values: 1).
+    """Find the flip nearest to `start` within `tolerance` (1 for whole values).
 
-    First the ends and SWEEP_SAMPLES values evenly between them are tried; SWEEP_SEARCHED where the outcome is not
-    declared monotone, or turns back among these. Then the nearest pair with different outcomes is halved.
+    It tries the ends and SWEEP_SAMPLES values evenly between; SWEEP_SEARCHED if the outcome is not declared monotone,
+    or turns back. Then it bisects the nearest pair with different outcomes.
     """
     known: dict[float, str] = {}
 
@@ -77,15 +76,15 @@ def _ordered(known: Mapping[float, str], start: float) -> dict[float, str]:
 
 
 def _num_changes(ordered: Mapping[float, str]) -> int:
-    """How often the outcome turns from that of the start to another, or back to it."""
     is_first = [outcome == next(iter(ordered.values())) for outcome in ordered.values()]
     return sum(a != b for a, b in itertools.pairwise(is_first))
 
 
 @dataclass(frozen=True, kw_only=True)
 class LeastChange:
-    """Points in shares of each range, the last with the start's outcome and the first with another along one
-    direction, and the length of the latter.
+    """Points before and after a flip along one direction, in range shares.
+
+    length: of `first`.
     """
 
     last: tuple[float, ...]
@@ -94,12 +93,11 @@ class LeastChange:
 
 
 def find_least(judge: JudgeAt, alone: Sequence[float | None], *, tolerance: float) -> LeastChange | None:
-    """The shortest change of several values within the unit cube that flips the outcome of (0, ..., 0), None where
-    no direction tried has one.
+    """Find the shortest joint change that flips the outcome of (0, ..., 0).
 
-    alone: the share at which each value flips it alone. Tried are the diagonal and SWEEP_DIRECTIONS of Halton's
-    sequence, then the best one turned towards and away from each value, by a quarter and by an eighth: each at the
-    length of the best so far, and halved to `tolerance` where that flips.
+    Points lie in the unit cube. alone: the share at which each value flips it alone. It tries the diagonal and
+    SWEEP_DIRECTIONS of Halton's sequence, then turns the best by a quarter and an eighth towards and away from each
+    value. Each is tried at the best length so far, and bisected to `tolerance` if it flips.
     """
     num = len(alone)
     start = judge([(0.0,) * num])[0]
@@ -132,7 +130,7 @@ def find_least(judge: JudgeAt, alone: Sequence[float | None], *, tolerance: floa
 
 
 def _directions(num: int) -> Iterator[np.ndarray]:
-    """Unit vectors (num,) without a negative part: the diagonal, then, evenly over all, those of Halton's points."""
+    """Non-negative unit vectors (num,): the diagonal, then evenly by Halton's points."""
     points = qmc.Halton(num, scramble=False).random(SWEEP_DIRECTIONS + 1)[1:]
     for way in (np.ones(num), *ndtri((1.0 + points) / 2.0)):
         yield way / np.linalg.norm(way)

@@ -1,4 +1,4 @@
-"""A sweep from its request to its result: a replay made again with other values until its verdict is another."""
+"""A sweep: replay with other values until the verdict flips."""
 
 import math
 import time
@@ -23,15 +23,15 @@ from splatctrl_cli.jobs.sweep.search import Flip, find_flip, find_least
 FORMAT, VERSION = "splatctrl-sweep", 1
 TOLERANCE = 1 / 64  # of a range
 FILE = "sweep.json"
-REFUSED, BY_ITS_VALUES = "refused", (2, 4)  # an outcome, and the exit codes of a command that it stands for
+REFUSED, BY_ITS_VALUES = "refused", (2, 4)  # an outcome, and the exit codes it stands for
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepRequest:
-    """Make the replay of a folder again, over ranges from A to B by the names of what is varied.
+    """Repeat a replay over ranges KEY=A:B.
 
-    tolerance: how near the two sides of a flip are to lie, as a share of the range. out: folder in which the sweep
-    goes on; workers: runs at once; dask: the address of a Dask scheduler that makes them instead.
+    tolerance: distance of a flip's two sides, as a share of the range. out: folder to continue in. workers: parallel
+    runs. dask: address of a scheduler to use instead.
     """
 
     replay: Path
@@ -44,9 +44,9 @@ class SweepRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Tried:
-    """A run of the sweep: the values by key, what it came to, and its folder within the sweep's.
+    """A run of the sweep: values by key, its result, and folder.
 
-    outcome: of its verdict, or REFUSED where a command did not take the values or what they make of the recording.
+    outcome: of its verdict, or REFUSED if a command rejected the values or the changed recording.
     """
 
     values: Mapping[str, float]
@@ -58,7 +58,7 @@ class Tried:
 
 @dataclass(frozen=True, kw_only=True)
 class KeyFlip:
-    """What one key alone does, the others at their start: the runs at both ends and at both sides of the flip."""
+    """Effect of one key alone: runs at both ends, and at both sides of the flip."""
 
     key: Key
     start: Tried
@@ -71,7 +71,6 @@ class KeyFlip:
 
     @property
     def sentence(self) -> str:
-        """What flips into what, and where."""
         unit = f" {self.key.unit}" if self.key.unit else ""
         name, num = self.key.name, len(self.tried)
         a, b = self.start.values[name], self.end.values[name]
@@ -88,7 +87,7 @@ class KeyFlip:
 
 @dataclass(frozen=True, kw_only=True)
 class LeastFlip:
-    """The least change of all keys together found; length: in shares of the ranges, root of summed squares."""
+    """Least joint change found; length: root of summed squares of range shares."""
 
     length: float
     last: Tried
@@ -97,7 +96,7 @@ class LeastFlip:
 
 @dataclass(frozen=True, kw_only=True)
 class SweepResult:
-    """What was found, all of it in ``sweep.json``. before: the verdict that the run itself came to."""
+    """Content of ``sweep.json``; before: the run's own verdict."""
 
     out: Path
     before: Mapping[str, Any]
@@ -107,7 +106,7 @@ class SweepResult:
     num_new: int = 0
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, the same of every sweep with these settings."""
+        """Plain values, equal for equal settings."""
         return {
             "before": {name: self.before[name] for name in ("outcome", "label", "sentence")},
             "keys": {
@@ -124,10 +123,10 @@ class SweepResult:
 
 
 def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress = SILENT) -> SweepResult:
-    """Find the flips, going on with what is done already.
+    """Find the flips, continuing an earlier sweep.
 
-    Raises UsageError for ranges that are none and an output of another sweep, InputError for a run that is none or
-    whose inputs are not as they were, NotEvaluableError where there is no verdict to flip.
+    Raises UsageError for invalid ranges or another sweep's output, InputError for an invalid run or changed inputs,
+    NotEvaluableError without a verdict to flip.
     """
     run, ranges = _judged(request.replay), ranges_of(request.over)
     keys = {name: key_of(name) for name in ranges}
@@ -163,7 +162,7 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
 
 
 def ranges_of(over: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """The two ends by name of each ``KEY=A:B``. Raises UsageError for what is none."""
+    """Ends by name of each ``KEY=A:B``. Raises UsageError for an invalid one."""
     ranges: dict[str, tuple[float, float]] = {}
     for text in over:
         name, _, span = text.partition("=")
@@ -184,7 +183,6 @@ def ranges_of(over: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 
 def _judged(path: Path) -> RunFolder:
-    """A replay that came to a verdict which can flip."""
     run = open_run(path)
     if run.command != REPLAY:
         raise UsageError(f"{path}: a run of {run.command}, expected one of replay", remedy="sweep the replay of it")
@@ -201,7 +199,7 @@ def _not_evaluable(what: str, sentence: str) -> NotEvaluableError:
 
 @dataclass(kw_only=True)
 class Runs:
-    """The runs of a sweep as nodes of a batch, each made once."""
+    """Runs of a sweep as batch nodes, each made once."""
 
     run: RunFolder
     chain: Chain
@@ -213,7 +211,6 @@ class Runs:
     tried: dict[tuple[float, ...], Tried] = field(default_factory=dict)
 
     def suite(self, values: Mapping[str, float]) -> Suite:
-        """The run with these values, as a batch has it."""
         name = f"{self.run.path.absolute().name}-swept"
         return Suite(
             name=name,
@@ -224,11 +221,11 @@ class Runs:
         )
 
     def nodes_at(self, values: Mapping[str, float]) -> list[Node]:
-        """Its nodes, the replay last. Raises UsageError for a value that an option does not take."""
+        """Nodes at values, the replay last. Raises UsageError for a rejected value."""
         return nodes_of(self.suite(values), self.out, self.command_line)
 
     def at(self, points: Sequence[Mapping[str, float]]) -> list[Tried]:
-        """What the run comes to at points, made side by side. Raises InputError where one could not be made."""
+        """Make the run at points, in parallel. Raises InputError if one fails."""
         new = {tuple(point.values()): point for point in points if tuple(point.values()) not in self.tried}
         made = {values: self.nodes_at(point) for values, point in new.items()}
         nodes: dict[str, Node] = {}
@@ -245,7 +242,7 @@ class Runs:
         return [self.tried[tuple(point.values())] for point in points]
 
     def _tried(self, values: Mapping[str, float], runs: Sequence[Run]) -> Tried:
-        """What a run came to. Raises InputError where it ended for another reason than its values."""
+        """Result of a run. Raises InputError if it failed for another cause than its values."""
         last = runs[-1]
         outcome = next(
             (o for o, code in EXIT_CODES.items() if not last.outcome and code and code == last.exit_code), ""
@@ -291,7 +288,7 @@ def _found(
 
 
 def _check_settings(run: RunFolder, again: RunFolder, chain: Chain) -> None:
-    """Raise InputError where the run made again has settings that are neither those of then nor varied."""
+    """Raise InputError if settings other than the varied ones changed."""
     options = (
         option for key in chain.keys.values() for each in (key.options, key.lockstep) for option in each.values()
     )
@@ -314,7 +311,6 @@ def _told(values: Mapping[str, float]) -> str:
 
 
 def _alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, tolerance: float) -> KeyFlip:
-    """The flip of one key, the others at their start."""
     key = runs.chain.keys[name]
 
     def at(value: float) -> Tried:
@@ -343,8 +339,6 @@ def _alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, toler
 def _together(
     flips: Sequence[KeyFlip], ranges: Mapping[str, tuple[float, float]], runs: Runs, tolerance: float
 ) -> LeastFlip | None:
-    """The least change of all keys together."""
-
     def values_at(shares: Sequence[float]) -> dict[str, float]:
         values = {n: a + (b - a) * s for (n, (a, b)), s in zip(ranges.items(), shares, strict=True)}
         return {n: float(round(v)) if runs.chain.keys[n].is_whole else float(f"{v:.6g}") for n, v in values.items()}
@@ -365,7 +359,6 @@ def _together(
 
 
 def _write(out: Path, asked: Mapping[str, Any], result: SweepResult | None) -> None:
-    """sweep.json; without a result while the sweep runs."""
     found = {} if result is None else result.as_dict()
     document = {"format": FORMAT, "version": VERSION, "is_done": result is not None, "asked": asked, **found}
     write_durably(out / FILE, lambda path: write_json(path, document))
