@@ -298,7 +298,7 @@ class SceneFitter:
 
     def _relabel(self, robot: RobotPosture | None, seen: Seen) -> Bool:
         """Label all splats anew; returns trails (M,). One that turns from robot to object gets the least radius."""
-        return relabel(self.buffer, self.occupancy, robot, seen, self.config.contact_radius)
+        return relabel(self.buffer, self.occupancy, robot, seen, 0.5 * self.config.contact_radius)
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
         """Remove what the optimiser moved off the robot, into the air or out, or made faint; counts in `removed`."""
