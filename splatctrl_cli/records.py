@@ -128,10 +128,10 @@ def by_stamp(*streams: Iterable[_Item]) -> Iterator[_Item]:
 class LossReport:
     """Losses of an input: `damaged` sets exit code 3, the rest is only counted.
 
-    duplicate_images: with an earlier stamp of their topic; dropped_images: gaps in a topic of steady rate;
-    invalid_depth: pixels with NaN, infinite, negative or 65535 counts, read as no return; differentiated_velocities:
-    joint states with velocity from positions; unsorted_states: earlier stamps; duplicate_states: equal stamps,
-    conflicting_states: of these, with other positions than the kept one; state_gaps: times without joint states.
+    duplicate_images: repeated stamps in a topic; dropped_images: gaps in a topic of steady rate; invalid_depth:
+    pixels with NaN, infinite, negative or 65535 counts, read as no return; differentiated_velocities: joint states
+    with velocity from positions; unsorted_states: earlier stamps; duplicate_states: equal stamps, conflicting_states:
+    of these, with other positions than the kept one; state_gaps: times without joint states.
     """
 
     unpaired_color: int = 0

@@ -1,8 +1,8 @@
-"""How near an arm comes to the scene between two logged states: a bound from both ends, refined where it is too low.
+"""Clearance bounds between two logged states, from both ends, refined where too low.
 
-Over an interval in which sphere s travels at most L_s, its distance to the scene is nowhere below
-``(d_0s + d_1s - L_s) / 2``, d_0s and d_1s being those at the two ends, because the exact distance is 1-Lipschitz. L_s
-follows from the joints' motion and the spheres' lever arms (`robot.levers`).
+If sphere s travels at most L_s over an interval, its distance to the scene is never below ``(d_0s + d_1s - L_s) /
+2``, d_0s and d_1s at the ends, because the exact distance is 1-Lipschitz. L_s follows from joint motion and lever
+arms (`RobotModel.lever_arms`).
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,9 @@ from splatctrl_cli.records import Bool, Float64
 
 @dataclass(frozen=True, kw_only=True)
 class Reach:
-    """What moves of an arm, and how far: moving (M,) sphere indices, radii (M,) [m] with what the spheres leave of
-    the surface uncovered, levers (M, J) [m per rad or m], velocity_limit (J,) [1/s].
+    """Moving spheres (M,) of an arm and their travel.
+
+    radii (M,) [m], with the uncovered surface; levers (M, J) [m per rad or m]; velocity_limit (J,) [1/s].
     """
 
     moving: "np.ndarray[tuple[int], np.dtype[np.intp]]"
@@ -28,7 +29,7 @@ class Reach:
 
     @classmethod
     def of(cls, model: ArmModel) -> "Reach":
-        """The reach of a model's moving spheres."""
+        """Return the reach of a model's moving spheres."""
         moving = np.flatnonzero(model.moving_spheres)
         deficit = np.maximum(np.nan_to_num(np.asarray(model.sphere_deficit, np.float64)[moving]), 0.0)
         return cls(
@@ -41,10 +42,10 @@ class Reach:
 
 @dataclass(frozen=True, kw_only=True)
 class Between:
-    """Of T - 1 intervals: lower (T - 1,) [m], a bound that the clearance within, ends included, is not below. Where
-    is_met (T - 1,) it is a witness instead: the clearance of a posture in between that is below the margin, so that
-    the least clearance is at most that. is_bounded (T - 1,): False where the states say too little of what the
-    arm did in between.
+    """Clearance bounds lower (T - 1,) [m] of intervals, ends included.
+
+    Where is_met (T - 1,), a witness instead: the clearance of a posture in between, below the margin, so the least
+    clearance is at most that. is_bounded (T - 1,): False if the states say too little.
     """
 
     lower: Float64
@@ -64,14 +65,12 @@ def between_states(
     margin: float,
     longest: float,
 ) -> Between:
-    """Bounds for the intervals between states (T, J) at stamps (T,) [ns] in one scene.
+    """Return bounds between states (T, J) at stamps (T,) [ns] in one scene.
 
-    at_states (T, M) [m]: the clearance of every moving sphere's surface at the states, by `clearances`; infinite
-    where a sphere is left out, as its contact is meant.
-
-    Up to `longest` [s] the arm is taken to have moved in a straight line of joint space, plus what its velocities
-    (T, J) say beyond that. Over a longer interval it may have gone anywhere that its velocity limits allow: it is
-    bounded only where that does not reach the margin [m].
+    at_states (T, M) [m]: clearances of the moving spheres' surfaces, by `clearances`; infinite for declared contact.
+    Up to `longest` [s] the arm moved straight in joint space, plus what its velocities (T, J) say beyond. Over a
+    longer interval it may have gone anywhere within its velocity limits: bounded only where that stays above the
+    margin [m].
     """
     seconds = np.diff(stamps) * 1e-9
     motion = np.abs(np.diff(positions, axis=0))
@@ -110,8 +109,9 @@ def _refined(
     distance_to: DistanceFunction,
     margin: float,
 ) -> tuple[Float64, Bool]:
-    """Least clearance bound (K,) of K straight motions: halved until every piece is above the margin, or short; and
-    (K,) whether a posture on the way is below the margin: then the least clearance of such postures.
+    """Clearance bounds (K,) of straight motions, and is_met (K,), as in `Between`.
+
+    Pieces are halved until above the margin, or short.
     """
     least, is_met = np.full(len(q_first), np.inf), np.zeros(len(q_first), dtype=np.bool_)
     owner = np.arange(len(q_first))
@@ -143,6 +143,6 @@ def _refined(
 
 
 def clearances(model: ArmModel, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:
-    """(T, M) [m] of every moving sphere's part of the body at postures (T, J), with what it leaves uncovered."""
+    """Return each moving sphere's clearance (T, M) [m] at postures (T, J), less uncovered surface."""
     each, is_surface = part_clearances(model, positions, distance_to)
     return np.asarray(each - np.where(is_surface, 0.0, reach.radii - model.sphere_set.radii[reach.moving]))
