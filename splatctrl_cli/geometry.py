@@ -20,9 +20,9 @@ def transform_points(T: Float64, points: NDArray[np.floating]) -> Float64:
 
 
 def rotation_from_quat(quat_xyzw: ArrayLike) -> Float64:
-    """Return the rotation (3, 3) of a finite quaternion (x, y, z, w) of nonzero length.
+    """Return the rotation (3, 3) of a finite, nonzero quaternion (x, y, z, w).
 
-    A power of two scales it first, which rounds nothing: squares of a tiny one would underflow.
+    Scaling by a power of two first rounds nothing: squares of a tiny one would underflow.
     """
     quat = np.asarray(quat_xyzw, dtype=np.float64)
     quat = np.ldexp(quat, -np.frexp(np.abs(quat).max())[1])

@@ -67,10 +67,10 @@ class Intrinsics:
 class RgbdFrame:
     """One colour image with registered depth and pose.
 
-    color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = none; T_world_camera (4, 4)
-    float64, from optical camera coordinates (z forward); human (H, W) uint8, nonzero on people, None if not
-    segmented; valid (H, W), False outside the lens's view, None if all valid. Invalid pixels have no colour; their
-    depth, of another lens, is not drawn or scored.
+    color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = no return; T_world_camera (4, 4)
+    float64, of the optical frame (z forward); human (H, W) uint8, nonzero on people, None if not segmented; valid (H,
+    W), False outside the lens's view, None if all valid. Invalid pixels have no colour; their depth, of another lens,
+    is not drawn or scored.
     """
 
     stamp_ns: int
@@ -128,10 +128,9 @@ def by_stamp(*streams: Iterable[_Item]) -> Iterator[_Item]:
 class LossReport:
     """Losses of an input: `damaged` sets exit code 3, the rest is only counted.
 
-    duplicate_images: repeated stamps in a topic; dropped_images: gaps in a topic of steady rate; invalid_depth:
-    pixels with NaN, infinite, negative or 65535 counts, read as no return; differentiated_velocities: joint states
-    with velocity from positions; unsorted_states: earlier stamps; duplicate_states: equal stamps, conflicting_states:
-    of these, with other positions than the kept one; state_gaps: times without joint states.
+    dropped_images: gaps in a topic of steady rate; invalid_depth: pixels with NaN, infinite, negative or 65535
+    counts, read as no return; differentiated_velocities: from positions; unsorted_states: stamps that went back;
+    conflicting_states: duplicates with other positions than the kept one; state_gaps: times without states.
     """
 
     unpaired_color: int = 0
@@ -228,7 +227,7 @@ class GaussianSet(Columns):
 
     centers (N, 3) float32 [m], world; scales (N, 3) float32 [m], sigmas along own axes; quats_wxyz (N, 4) float32,
     unit, own axes to world; opacities (N,) float32 in (0, 1); harmonics (N, K, 3) float32, real spherical harmonics
-    of RGB to degree 0 to 3 (K = 1, 4, 9, 16; colour is 0.5 + their sum); labels (N,) uint8 (`Label`).
+    of RGB, degree 0 to 3 (K = 1, 4, 9, 16; colour is 0.5 + their sum); labels (N,) uint8 (`Label`).
     """
 
     centers: Float32
@@ -288,7 +287,7 @@ class DistanceField(Protocol):
     """Signed distance to the scene, positive outside."""
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """Return distance (Q,) [m] at points (Q, 3) [m], world, and its exact gradient (Q, 3), not normalised."""
+        """Return distance (Q,) [m] at points (Q, 3), and its own gradient (Q, 3), not normalised."""
         ...
 
 

@@ -28,7 +28,7 @@ class VoxelState(IntEnum):
 class Unseen(IntEnum):
     """Reason why no camera got depth through or on a voxel (two-byte `last_seen`).
 
-    Of several cameras' reasons the largest counts; the last two stay until a ray passes.
+    The largest of several cameras' reasons counts; the last two stay until a ray passes.
     """
 
     SWEPT = 0xFFF0  # the robot's body was in it
@@ -154,7 +154,7 @@ NO_EDGES = LostEdges.joined([])
 
 @dataclass(frozen=True, kw_only=True)
 class SeenVoxels:
-    """Time of each voxel's last view; voxel centres: `origin` [m] + index times edge `voxel` [m].
+    """Last view of each voxel, centred at `origin` + index times `voxel` [m].
 
     last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last step in which a
     camera returned depth through or on the voxel; 0: never, without a reason; the type's largest numbers: the reason
@@ -168,9 +168,9 @@ class SeenVoxels:
     edges: LostEdges = NO_EDGES
 
     def look(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], UInt8]:
-        """Return last stamps (Q,) [ns], -1 for never, and `EvidenceClass` (Q,) at points (Q, 3).
+        """Return last stamps (Q,) [ns], -1 never, and `EvidenceClass` (Q,), `FREE` if ever seen.
 
-        Points in [m], world. `FREE` if ever seen.
+        points (Q, 3) [m], world.
         """
         cell = np.floor((points - self.origin) / self.voxel + 0.5)
         is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)

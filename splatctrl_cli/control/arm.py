@@ -1,4 +1,4 @@
-"""The controller's view of a robot: the one seam between control and kinematics."""
+"""The one seam between control and kinematics."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Protocol
@@ -11,13 +11,9 @@ from splatctrl_cli.records import Bool, Float64, SphereSet
 
 
 class ArmModel(Protocol):
-    """A kinematic chain with collision spheres, such as `splatctrl_cli.robot.model.RobotModel`.
+    """A kinematic chain with collision spheres; `splatctrl_cli.robot.model.RobotModel` documents its members.
 
-    J joints, S spheres; positions [m] and poses in world. sphere_deficit (S,) [m]: largest distance of the sphere's
-    body's surface outside the spheres, NaN if not measured. lever_arms (S, J): bound on a sphere's travel [m] per
-    radian (or metre). self_allowance (P,) [m]: margin shortfall of each of `self_pairs`. surface_gaps: clearance (T,)
-    [m] of meshed links at postures (T, J). link_distances: of meshed links, signed distance (Q,) [m] of points (Q,
-    3), link frame, some (Q,) known to be outside. chain: for the kernels, None if only methods know.
+    J joints, S spheres; positions [m] and poses in world. chain: None if only the methods know the kinematics.
     """
 
     @property
@@ -82,7 +78,7 @@ class ArmModel(Protocol):
 
 
 def sphere_names(spheres: SphereSet) -> tuple[str, ...]:
-    """Return each sphere's link and number within it: ``panda_hand[2]``."""
+    """Return each sphere's link and number on it: ``panda_hand[2]``."""
     seen: dict[str, int] = {}
     names = []
     for link in spheres.links:

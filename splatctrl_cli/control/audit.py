@@ -18,14 +18,13 @@ DistanceFunction = Callable[[Float64], Float64]
 
 @dataclass(frozen=True, kw_only=True)
 class BallDistance:
-    """A `DistanceFunction` of N balls, centers (N, 3), radii (N,) [m], for surface measurement."""
+    """A `DistanceFunction` of balls, centers (N, 3), radii (N,) [m], for surface measurement."""
 
     of_points: DistanceFunction
     centers: NDArray[np.floating]
     radii: NDArray[np.floating]
 
     def __call__(self, points: Float64) -> Float64:
-        """Return distances (Q,) [m] of points (Q, 3)."""
         return self.of_points(points)
 
 
@@ -53,10 +52,10 @@ class Clearance:
 class AuditTrace:
     """T audited states.
 
-    stamp_ns (T,); position (T, J) [rad]; clearance by field; limit_margin (T,) [rad] to the nearest position limit,
+    stamp_ns (T,); position (T, J) [rad]; clearance by field; limit_margin (T,) [rad]: to the nearest position limit,
     negative outside, at limit_joint (T,); self_clearance (T,) [m] (inf without pairs) at self_pair (T,);
-    unknown_share (T,) of sphere centres in never-seen space (NaN if not evaluated); of_spheres: clearance (T, M) [m]
-    of each moving sphere by field, if kept.
+    unknown_share (T,) of sphere centres in never-seen space (NaN if not measured); of_spheres: clearances (T, M) [m]
+    by field, if kept.
     """
 
     stamp_ns: Stamps
@@ -73,11 +72,10 @@ class AuditTrace:
 def part_clearances(
     model: ArmModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Float64, Bool]:
-    """Return clearances (T, M) [m] of moving spheres' parts; True (M,) where from link surfaces.
+    """Return the moving parts' clearances (T, M) [m], and which (M,) are of link surfaces.
 
-    If a link has triangles and the scene is of balls, its surface decides: its nearest sphere has the surface's
-    clearance, the others at least that, or their own less `sphere_deficit`. positions (T, J); centers (T, S, 3) [m],
-    if known.
+    Where a link has triangles and the scene is of balls, its surface decides: the nearest of its spheres has the
+    surface's clearance, the others at least that, or their own less `sphere_deficit`. centers (T, S, 3): if known.
     """
     moving = np.flatnonzero(model.moving_spheres)
     there = model.sphere_centers_batch(positions) if centers is None else centers
@@ -101,7 +99,7 @@ def part_clearances(
 def moving_clearance(
     model: ArmModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Clearance, Float64]:
-    """Return the least `part_clearances` of each posture (T, J), and all (T, M) [m]."""
+    """Return the least of `part_clearances` (T,), and all (T, M) [m]."""
     distance, _ = part_clearances(model, positions, distance_to, centers)
     moving = np.flatnonzero(model.moving_spheres)
     nearest = np.argmin(distance, axis=1)
@@ -117,10 +115,10 @@ def audit(
     *,
     observed: Observed | None = None,
 ) -> AuditTrace:
-    """Return states' clearances, each by the distances known at its stamp.
+    """Return clearances of states, by the distances known at their stamps.
 
-    stamps (T,) [ns] do not go back; positions (T, J) finite; T >= 1. Auditing part of the states of one scene gives
-    that part of the whole, to the bit.
+    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. In one scene, the audit of some states is that
+    part of the audit of all, to the bit.
     """
     parts: dict[str, list[Clearance]] = {}
     spheres: dict[str, list[Float64]] = {}
@@ -157,7 +155,7 @@ def observed_at(seen: Channel, origin: Float64, voxel: float, points: Float64) -
 
 
 def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]]:
-    """Ranges of up to CHUNK states in one scene; keeps at most two scenes."""
+    """Yield ranges of states in one scene; keep at most two scenes."""
     first, before = 0, distances_at(int(stamps[0]))
     for index, stamp in enumerate(stamps[1:], start=1):
         known = distances_at(int(stamp))

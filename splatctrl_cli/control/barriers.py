@@ -50,9 +50,9 @@ class SceneRows(BarrierTerm):
         return other
 
     def by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
-        """Return distances (M,) [m], of `chosen` (M,) spheres at least their link's surface gap.
+        """Return distances (M,) [m]; `chosen` (M,) spheres have at least their link's surface gap.
 
-        Rows G (M, J) become rows of that gap where it is larger, in place. Such a row keeps `config.margin` from the
+        Where that gap is larger, rows G (M, J) become its rows, in place. Such a row keeps `config.margin` from the
         surface, wherever the sphere moves.
         """
         if self._balls is None or not chosen.any():
@@ -78,10 +78,10 @@ class SceneRows(BarrierTerm):
         return self._barrier(self._moving, G, h, distance)
 
     def cut(self, state: State, velocity: Float64, chosen: NDArray[np.integer], distance: Float64) -> Barrier:
-        """Return further rows: `chosen` spheres against their nearest surfaces after a period of `velocity`.
+        """Return rows of `chosen` spheres against their nearest surfaces after a period of `velocity`.
 
-        distance (M,): now. The later distance is linearised where it was met. If the surface is convex seen from
-        there, as a ball is, its true distance is larger; now it is no nearer than the present nearest surface.
+        distance (M,): now. The later distance is linearised where it was met. For a surface convex from there, as a
+        ball is, the true distance is larger; now it is no nearer than the present nearest surface.
         """
         period = self._config.period
         q = state.q + period * velocity
@@ -103,7 +103,6 @@ class SceneRows(BarrierTerm):
         return Barrier(index=index, G=G, h=h, distance=distance, slack_cost=cost, slack_weight=weight)
 
     def _queried(self, centers: Float64) -> tuple[Float64, Float64]:
-        """Distance (M,) of the spheres' surfaces, field gradient (M, 3) at their centres."""
         points = np.ascontiguousarray(centers[self._moving])
         distance, gradient = self._field.query(points)
         bad = ~(np.isfinite(distance) & np.all(np.isfinite(gradient), axis=1))
@@ -175,8 +174,8 @@ class SelfRows(BarrierTerm):
 def scene_margin(model: ArmModel, config: ControlConfig) -> Float64:
     """Return spheres' scene margins (S,) [m]: epsilon, plus deficits if `config.coverage` is "margin".
 
-    A surface point is within that deficit of a sphere. By the triangle inequality the surface then keeps epsilon, for
-    any 1-Lipschitz distance.
+    The surface is within that deficit of a sphere, so by the triangle inequality it keeps epsilon for any 1-Lipschitz
+    distance.
     """
     deficit = np.asarray(model.sphere_deficit) if config.coverage == MARGIN else np.zeros(len(model.moving_spheres))
     return config.margin + deficit
@@ -192,8 +191,8 @@ def distance_bound(
 ) -> Float64:
     """Return h (M,), with the braking distance where joints cannot stop at once.
 
-    Only then G (M, J) counts. rate: dd/dt of a changing field. A row's approach G v can brake by at most ``|G| a``;
-    BRAKING_SHARE of it counts, because it changes on the way and other rows share it.
+    Only then G (M, J) counts. A row's approach G v can brake by at most ``|G| a``; BRAKING_SHARE of it counts,
+    because it changes on the way and other rows share it.
     """
     if acceleration is None or G is None:
         return barrier_bound(distance, margin=margin, gain=config.barrier_gain, rate=rate)

@@ -1,7 +1,4 @@
-"""Events: intervals of notable states, with worst value and names, from signals.
-
-Signals come from an audit and from a controller.
-"""
+"""Events of an audit and a controller: intervals with worst value and names."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -58,9 +55,9 @@ SHOWN = {"": "", "exact": "", "true": " (truth)"}  # measures whose events peopl
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:
-    """Nearest obstacle: distance [m] of its surface to a point, and place (3,) [m], world.
+    """Nearest obstacle: distance [m] of its surface to a point, place (3,) [m], world.
 
-    splat: index in its scene's file; label: the splat's, or UNREPRESENTED; cell: of a grid; name: of anything else.
+    splat: index in its scene's file; label: the splat's, or UNREPRESENTED; cell: of a grid; name: of others.
     """
 
     distance: float
@@ -85,8 +82,8 @@ class Obstacle:
 class Event:
     """An interval of consecutive states with its worst value.
 
-    Stamps [ns], times [s]; names: in order of appearance, at most MAX_NAMES of num_names; source: its field, or
-    empty; state: index of the worst, worst_name its name, obstacle there.
+    names: in order of appearance, at most MAX_NAMES of num_names; source: field, or empty; state: index of the worst;
+    worst_name, obstacle: there.
     """
 
     kind: EventKind
@@ -186,7 +183,7 @@ class EventFold:
         self._closed: list[_Run] = []
 
     def add(self, stamp_ns: Stamps, signals: Iterable[Signal], near: Near | None = None) -> None:
-        """Add a block: stamps (T,) and signals (T,), same kinds and order each time.
+        """Add a block of stamps (T,) and signals (T,), in the same order each time.
 
         near: gives the obstacle of each worst value here.
         """

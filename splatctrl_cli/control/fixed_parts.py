@@ -16,10 +16,9 @@ WasSeen = Callable[[Float64], Bool]
 class FixedParts:
     """`found`: each fixed sphere's clearance [m] in the first scene, and least to later arrivals.
 
-    A ball has arrived if none stood within STATIC_CHANGE of its place in the first scene; near a sphere at its mount,
-    whose map grows, within MOUNTED_CHANGE. It must be nearer than the first clearance by as much, a camera must have
-    seen its place before, and the last scene must have it too: noise is in one scene alone. If the link has
-    triangles, distance is to its surface.
+    A ball has arrived if none of the first scene stood within STATIC_CHANGE of it; near a sphere at its mount, whose
+    map grows, within MOUNTED_CHANGE. It is nearer than the first clearance by as much, a camera had seen its place
+    before, and the last scene had it too: noise is in one scene alone. A link's triangles replace its spheres.
     """
 
     def __init__(self, model: ArmModel, near: float) -> None:

@@ -55,7 +55,7 @@ def _capped(vector: Float64, limit: float) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class LoggedMotion:
-    """T logged states: stamp_ns (T,) that never go back, position and velocity (T, J) [rad, rad/s]."""
+    """T logged states: stamp_ns (T,), never going back, position, velocity (T, J) [rad, rad/s]."""
 
     stamp_ns: Stamps
     position: FloatRows
@@ -84,13 +84,13 @@ class LoggedMotion:
         return position, velocity
 
     def goal_at(self, model: ArmModel, frame: str, stamp_ns: int) -> tuple[Float64, Guide]:
-        """Return the logged pose (4, 4) of a frame at a stamp, and its motion."""
+        """Return a frame's logged pose (4, 4) and motion at a stamp."""
         position, velocity = self.at(stamp_ns)
         return guided_goal(model, frame, position, velocity)
 
 
 def guided_goal(model: ArmModel, frame: str, position: Float64, velocity: Float64) -> tuple[Float64, Guide]:
-    """Return the pose (4, 4) of a frame and its motion at a posture and velocity (J,)."""
+    """Return a frame's pose (4, 4) and motion at a posture and velocity (J,)."""
     twist = model.frame_jacobian(position, frame) @ velocity
     return model.frame_pose(position, frame), Guide(twist=twist, posture=position, velocity=velocity)
 
@@ -122,7 +122,7 @@ class Detour:
         return self.clock >= self.path.duration
 
     def goal(self, model: ArmModel, frame: str) -> tuple[Float64, Guide]:
-        """Return the pose (4, 4) of a frame at the clock, and its motion."""
+        """Return a frame's pose (4, 4) and motion at the clock."""
         position, velocity = self.path.at(self.clock)
         return guided_goal(model, frame, position[0], velocity[0])
 
@@ -138,9 +138,9 @@ PlanDetour = Callable[[int, Float64, Float64], Detour | None]
 
 @dataclass(frozen=True, kw_only=True)
 class TwistTrack:
-    """N twists (N, 6) [m/s, rad/s] of the controlled frame at rising stamp_ns (N,), linear first.
+    """N twists (N, 6) [m/s, rad/s] of the controlled frame, linear first.
 
-    axes: frame of their axes, turning with the arm; None: world.
+    stamp_ns (N,) rise; axes: frame of the axes, turning with the arm; None: world.
     """
 
     stamp_ns: Stamps
@@ -148,7 +148,7 @@ class TwistTrack:
     axes: str | None = None
 
     def at(self, stamp_ns: int, timeout: float) -> Float64:
-        """Return the newest twist (6,) at a stamp [ns]; zero if older than `timeout` [s] or none."""
+        """Return the newest twist (6,); zero if none or older than `timeout` [s]."""
         index = int(np.searchsorted(self.stamp_ns, stamp_ns, side="right")) - 1
         if index < 0 or (stamp_ns - self.stamp_ns[index]) * 1e-9 > timeout:
             return np.zeros(6)
@@ -180,6 +180,6 @@ class TwistTrack:
     def goal_at(
         self, model: ArmModel, config: ControlConfig, frame: str, q: Float64, stamp_ns: int
     ) -> tuple[Float64, Guide]:
-        """Return the frame's own pose (4, 4) with the twist as its motion; no posture attracts."""
+        """Return the frame's own pose (4, 4), moving with the twist, without a posture."""
         twist = self.reference(model, config, q, stamp_ns)
         return model.frame_pose(q, frame), Guide(twist=twist, posture=q, velocity=np.zeros(len(q)))

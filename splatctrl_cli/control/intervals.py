@@ -1,8 +1,7 @@
 """Clearance bounds between two logged states, from both ends, refined where too low.
 
-If sphere s travels at most L_s over an interval, its distance to the scene is never below ``(d_0s + d_1s - L_s) /
-2``, d_0s and d_1s at the ends, because the exact distance is 1-Lipschitz. L_s follows from joint motion and lever
-arms (`RobotModel.lever_arms`).
+If sphere s travels at most L_s in between, its distance is never below ``(d_0s + d_1s - L_s) / 2``, d_0s and d_1s at
+the ends, because exact distance is 1-Lipschitz. L_s follows from joint motion and `RobotModel.lever_arms`.
 """
 
 from dataclasses import dataclass
@@ -44,8 +43,8 @@ class Reach:
 class Between:
     """Clearance bounds lower (T - 1,) [m] of intervals, ends included.
 
-    Where is_met (T - 1,), a witness instead: the clearance of a posture in between, below the margin, so the least
-    clearance is at most that. is_bounded (T - 1,): False if the states say too little.
+    Where is_met (T - 1,), lower is a witness: the clearance of a posture in between, below the margin. is_bounded (T
+    - 1,): False if the states say too little.
     """
 
     lower: Float64
@@ -67,10 +66,9 @@ def between_states(
 ) -> Between:
     """Return bounds between states (T, J) at stamps (T,) [ns] in one scene.
 
-    at_states (T, M) [m]: clearances of the moving spheres' surfaces, by `clearances`; infinite for declared contact.
-    Up to `longest` [s] the arm moved straight in joint space, plus what its velocities (T, J) say beyond. Over a
-    longer interval it may have gone anywhere within its velocity limits: bounded only where that stays above the
-    margin [m].
+    at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. Up to `longest` [s] the arm
+    moved straight in joint space, plus any excess of its velocities (T, J). Longer, it may have gone anywhere within
+    its velocity limits: bounded only where that stays above the margin [m].
     """
     seconds = np.diff(stamps) * 1e-9
     motion = np.abs(np.diff(positions, axis=0))
@@ -109,10 +107,7 @@ def _refined(
     distance_to: DistanceFunction,
     margin: float,
 ) -> tuple[Float64, Bool]:
-    """Clearance bounds (K,) of straight motions, and is_met (K,), as in `Between`.
-
-    Pieces are halved until above the margin, or short.
-    """
+    """Halve straight motions until each bound reaches the margin, or the piece is short."""
     least, is_met = np.full(len(q_first), np.inf), np.zeros(len(q_first), dtype=np.bool_)
     owner = np.arange(len(q_first))
     for level in range(MAX_HALVINGS + 1):
@@ -143,6 +138,6 @@ def _refined(
 
 
 def clearances(model: ArmModel, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:
-    """Return each moving sphere's clearance (T, M) [m] at postures (T, J), less uncovered surface."""
+    """Return moving spheres' clearances (T, M) [m], less their uncovered surface."""
     each, is_surface = part_clearances(model, positions, distance_to)
     return np.asarray(each - np.where(is_surface, 0.0, reach.radii - model.sphere_set.radii[reach.moving]))

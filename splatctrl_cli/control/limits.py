@@ -130,9 +130,9 @@ class JointLimits:
     def box(self, q: Float64, last_velocity: Float64 | None = None) -> tuple[Float64, Float64]:
         """Return lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
-        Without last_velocity no acceleration counts. Where acceleration conflicts with velocity and position, it
-        yields to the nearest velocity within those two, so the box is never empty. From a state that this box led to
-        it never yields, unless by_position asks for more.
+        Without last_velocity no acceleration counts. An acceleration in conflict with velocity and position yields to
+        the nearest velocity within those, so the box is never empty. From a state that this box led to it never
+        yields, unless by_position asks for more.
         """
         lowest, highest = velocity_box(
             q, self.lower, self.upper, self.velocity, self.gain, acceleration=self.acceleration, period=self.period
@@ -165,8 +165,8 @@ def velocity_box(
     """Return lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
     III-E: ``v <= alpha (q_max - q)``, ``v >= -alpha (q - q_min)``, ``|v| <= v_max``, alpha the gain [1/s]; with an
-    acceleration (J,) [rad/s^2], `braking_speed` of that room. Position rows are clipped into the velocity range, so
-    the box is not empty for q outside its limits: there it demands the way back, at the velocity limit when far.
+    acceleration (J,) [rad/s^2], `braking_speed` of that room. Clipping into the velocity range keeps the box
+    non-empty for q outside its limits: there it demands the way back, at the velocity limit when far.
     """
     above, below = upper - q, q - lower
     if acceleration is None:
@@ -211,7 +211,7 @@ class Strain:
 
 
 class MotionLimits:
-    """Velocities and accelerations of a motion as shares of limits, less encoder error.
+    """A motion's velocities and accelerations as shares of limits, less encoder error.
 
     Velocities count from the last state and from `MOTION_WINDOW` earlier; accelerations from three places
     `MOTION_WINDOW` apart. A sample covers the time before it.

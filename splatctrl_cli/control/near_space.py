@@ -1,7 +1,7 @@
 """Camera evidence near a moving arm: each point within the margin has one class.
 
-The arm's inside is never seen. Points form a lattice outside the robot, within the margin of its moving links: of
-their triangles, else of their spheres.
+The arm's inside is never seen. The points form a lattice outside the robot, near its moving links' triangles, else
+spheres.
 """
 
 from collections.abc import Callable
@@ -29,8 +29,8 @@ class Seen:
     """Camera evidence at one moment.
 
     look: points (Q, 3) [m], world -> stamps (Q,) [ns] of the last depth through or on them, -1 never, and
-    `EvidenceClass` (Q,), `FREE` if ever seen. edges (K, 4) [m], world: centre and radius of balls in which a surface
-    may extend past its lost edge. origin (3,), voxel [m]: of the voxels.
+    `EvidenceClass` (Q,), `FREE` if ever seen. edges (K, 4) [m], world: balls in which a surface may extend past its
+    lost edge. origin (3,), voxel [m].
     """
 
     look: Callable[[Float64], tuple[NDArray[np.int64], UInt8]]
@@ -46,9 +46,9 @@ class Account:
     shares (C,): of points within the margin, by `EvidenceClass`. assumed: share not free, of points whose voxels
     reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places (C, 3).
     unseen_to_surface [m]: least distance of a never-seen point to the map's surfaces, at unseen_place.
-    blind_to_surface [m]: likewise about spheres with almost only such points (`NEAR_BLIND`). Infinite and NaN without
-    any. age [s]: within which `NEAR_FRESH_SHARE` of seen points were last seen; ahead [s]: how long after the state
-    the last was. NaN if nothing was seen.
+    blind_to_surface [m]: likewise, about spheres with almost only such points (`NEAR_BLIND`). Infinite and NaN
+    without any. age [s]: of `NEAR_FRESH_SHARE` of the seen points, at most; ahead [s]: of the last view after the
+    state. NaN without views.
     """
 
     shares: Float64
@@ -81,8 +81,8 @@ class NearSpace:
     def due(self, stamps: NDArray[np.int64], centers: Float64) -> dict[int, bool]:
         """Return indices of states to evaluate; True if their ages count.
 
-        stamps (T,) [ns] do not go back; sphere centres (T, S, 3). Due: after `NEAR_MOVED` of a sphere, and (True)
-        `NEAR_EVERY_NS` after the last timed one.
+        stamps (T,) [ns] never go back. Due: after `NEAR_MOVED` of a sphere (T, S, 3), and (True) `NEAR_EVERY_NS`
+        after the last timed one.
         """
         chosen, moving = dict[int, bool](), centers[:, self._moving]
         for index, stamp_ns in enumerate(stamps.tolist()):
@@ -144,7 +144,6 @@ class NearSpace:
         )
 
     def _lattice(self, origin: Float64, step: float, centers: Float64) -> Float64:
-        """Lattice points (Q, 3) in the moving spheres, grown by the margin."""
         at = (centers[self._moving] - origin) / step
         reaches = (self._radii[self._moving] + self._margin) / step + 0.5
         first = np.floor((at - reaches[:, None]).min(axis=0)).astype(int)
@@ -157,10 +156,7 @@ class NearSpace:
         return np.asarray(origin + step * (first + np.argwhere(is_near)))
 
     def _gaps(self, q: Float64, centers: Float64, points: Float64, reach: float) -> tuple[Float64, Index]:
-        """Distance (Q,) [m] of points to the moving links, and nearest moving sphere (Q,).
-
-        Infinite beyond `reach` [m], negative within any link.
-        """
+        """Distance (Q,) to the moving links, infinite beyond `reach`, negative inside; nearest sphere (Q,)."""
         to_spheres = cdist(points, centers) - self._radii
         gaps = np.full(len(points), np.inf)
         is_inside = np.zeros(len(points), bool)
@@ -178,10 +174,7 @@ class NearSpace:
         return np.where(is_inside, -np.abs(gaps), gaps), nearest
 
     def _gap_to(self, name: str, points: Float64) -> Float64:
-        """Signed distance (Q,) [m] of points, link frame, to its surface.
-
-        Nearby accurate to about a millimetre: interpolated from nodes half of `NEAR_LATTICE` apart.
-        """
+        """Interpolated distance (Q,) [m] to a link's surface, good to about a millimetre nearby."""
         if name not in self._grids:
             self._grids[name] = self._grid_of(name)
         lower, values = self._grids[name]
@@ -189,7 +182,6 @@ class NearSpace:
         return np.asarray(map_coordinates(values, at.T, order=1, mode="nearest"))
 
     def _grid_of(self, name: str) -> tuple[Float64, Float64]:
-        """Lower corner (3,) and surface distances of nodes about a link, in its frame."""
         step, own, reach = fixed.NEAR_LATTICE, self._links == name, self._margin + 2 * fixed.NEAR_LATTICE
         centers, radii = self._model.sphere_set.centers[own], self._radii[own, None] + reach
         lower = (centers - radii).min(axis=0)
@@ -203,7 +195,6 @@ class NearSpace:
         return lower, values.reshape(2 * num - 1)
 
     def _nearest_edge(self, q: Float64, centers: Float64, edges: Float64) -> tuple[float, Float64]:
-        """Least distance [m] of the arm to balls, at least 0, and that ball's centre."""
         reach = self._margin + np.max(edges[:, 3], initial=0.0)
         around = self._radii.max() + reach
         moving = centers[self._moving]
@@ -220,13 +211,11 @@ def _step_of(voxel: float) -> float:
 
 
 def _nearest_of(points: Float64, away: Float64) -> tuple[float, Float64]:
-    """Least distance and its point; infinite and NaN without points."""
     least = int(away.argmin()) if len(away) else None
     return (np.inf, np.full(3, np.nan)) if least is None else (float(away[least]), points[least])
 
 
 def _nearest_by(classes: UInt8, gaps: Float64, points: Float64) -> tuple[Float64, Float64]:
-    """Least gap of each `EvidenceClass` (C,), at least 0, and its point (C, 3)."""
     nearest, places = np.full(len(EvidenceClass), np.inf), np.full((len(EvidenceClass), 3), np.nan)
     for each in np.unique(classes):
         mine = np.flatnonzero(classes == each)

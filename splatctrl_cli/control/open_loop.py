@@ -19,9 +19,9 @@ FieldAt = Callable[[int], DistanceField]
 
 @dataclass(frozen=True, kw_only=True)
 class OpenLoopTask:
-    """Goal at each state: logged motion, a pose (4, 4) of the frame, or logged twists.
+    """Goal at each state: logged motion, a frame's pose (4, 4), or logged twists.
 
-    home (J,) [rad]: posture to lean to with a goal pose (None: amid the limits).
+    home (J,) [rad]: attracts free motion with a pose (None: `middle`).
     """
 
     frame: str
@@ -34,8 +34,8 @@ class OpenLoopTask:
 class OpenLoopTrace:
     """T states: the controller's step, and the room that the logged velocity left.
 
-    Both are None where the field has no distance, the step also after the commander's end. logged, commanded (T, J)
-    [rad/s], commanded NaN there.
+    Both are None where the field has no distance, the step also after the commander's end. commanded (T, J) [rad/s]
+    is NaN there.
     """
 
     logged: Float64
@@ -62,9 +62,8 @@ def open_loop(
 ) -> OpenLoopTrace:
     """Ask the commander at every logged state, in the field known then; nothing is integrated.
 
-    For the logged motion itself, the command is the logged velocity unless a row shapes it: the difference is the
-    intervention. has_distance (T,): False skips the state; so does the commander's end. scene_step_at as in
-    `closed_loop`.
+    For the logged motion, the command differs from the logged velocity only where a row shapes it: the intervention.
+    has_distance (T,): False skips a state. scene_step_at as in `closed_loop`.
     """
     field = field_at(int(motion.stamp_ns[0]))
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
@@ -101,7 +100,7 @@ def open_loop(
 def is_shaped(step: ControlStep | None, kind: RowKind | None = None) -> bool:
     """True if a row (of a kind) shapes the command.
 
-    Without a kind: if the step was not plainly taken. False for external controllers, whose reasons are unknown.
+    Without a kind also any fallback or scaling counts. False for external controllers, whose reasons are unknown.
     """
     if step is None or step.rung is Rung.OUTSIDE:
         return False

@@ -225,7 +225,7 @@ def _question(model: ArmModel, frame: str, moment: Moment, view: View) -> Docume
 
 
 def _rows(controller: QpIkController, view: View) -> list[Document]:
-    """Scene rows, and pairs that the program needs; see `ClearanceRow`."""
+    """Scene rows, and pairs in the program; see `ClearanceRow`."""
     rows, kinds = view.rows, controller.row_kinds
     G = np.concatenate([barrier.G for barrier in rows.barriers])
     h, distance = rows.h, rows.distance

@@ -74,7 +74,7 @@ def check_free(
 ) -> None:
     """Raise NotEvaluableError for a start q (J,) in collision, naming the deepest sphere.
 
-    distance_to: exact distance, by which known link surfaces decide (`part_clearances`).
+    distance_to: exact distance, by which link surfaces decide (`part_clearances`).
     """
     moving, distance = sphere_clearance(model, field, q, np.asarray(model.moving_spheres))
     if distance_to is not None and (distance < 0).any():

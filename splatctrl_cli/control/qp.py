@@ -209,8 +209,8 @@ def descend(
 ) -> Choice:
     """Return the solved or relaxed program, else least violation, else standstill.
 
-    First without slacks, which is far smaller: its solution is the answer if no multiplier exceeds its row's slack
-    cost. Programs with slacks are feasible by construction, so lower rungs are for failing solvers.
+    The first, far smaller program has no slacks: its solution stands if no multiplier exceeds its row's slack cost.
+    Programs with slacks are feasible by construction, so lower rungs are for failing solvers.
     """
     J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
     firm = solver.solve(assemble_hard(costs, *box, barriers))
@@ -259,10 +259,10 @@ def held(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: i
 def assemble_hard(
     costs: Sequence[Cost], lowest: Float64, highest: Float64, barriers: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """Return the program over v alone; rows: upper, lower box (2 J), barriers (M). It may be infeasible.
+    """Return the program over v alone; rows: upper, lower box (2 J), barriers (M).
 
-    If no barrier's multiplier exceeds its slack cost, its solution is that of `assemble`, with zero slacks: an L1
-    penalty above the multipliers is exact, and the slacks' signs take the rest.
+    It may be infeasible. If no barrier's multiplier exceeds its slack cost, its solution is that of `assemble`: an L1
+    penalty above the multipliers is exact.
     """
     H, c = summed(costs)
     G, h = box_rows(lowest, highest)
@@ -275,9 +275,9 @@ def assemble_hard(
 def assemble(
     costs: Sequence[Cost], lowest: Float64, highest: Float64, barriers: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """Return the program over ``z = (v, s)``; rows: upper, lower box (2 J), barriers (M), slack signs (M).
+    """Return the program over ``z = (v, s)``; rows: box (2 J), barriers (M), slack signs (M).
 
-    Always feasible: the box is not empty and every barrier row has its own slack.
+    The upper box comes first. Always feasible: the box is not empty and every barrier row has its own slack.
     """
     J, M = len(lowest), sum(len(barrier) for barrier in barriers)
     H, c = np.zeros((J + M, J + M)), np.zeros(J + M)

@@ -1,8 +1,8 @@
 """Rows of all terms at a configuration, those the program needs, and III-E as printed.
 
 ``min over (v, x, e) (u - x)' Q (u - x) + (x - J v)' R (x - J v) + e' S e`` with x the end-effector velocity, e one
-slack per external row, of either sign, and ``x - J v`` the paper's delta_x, defined by its first constraint. The
-controller otherwise solves a reduced program.
+slack per external row, of either sign, and ``x - J v`` the paper's delta_x. The controller otherwise solves a reduced
+program.
 """
 
 from collections.abc import Sequence
@@ -26,9 +26,9 @@ from splatctrl_cli.records import Bool, DistanceField, Float64
 class Rows:
     """Rows at one configuration (M, one barrier per term), and those the QP needs.
 
-    The first barrier is of the moving spheres, the second of the pairs. margin (M,) [m]; is_fixed: no joint velocity
-    changes it; in_qp: not fixed, and some velocity of the box violates it; cuts: further QP rows (`RowBuilder.cut`),
-    with the index of their own row.
+    First come the moving spheres, then the pairs. margin (M,) [m]; is_fixed: no joint velocity changes it; in_qp: not
+    fixed, and some velocity of the box violates it; cuts: further QP rows (`RowBuilder.cut`), indexed by their own
+    row.
     """
 
     barriers: tuple[Barrier, ...]
@@ -135,11 +135,11 @@ PRINTED = "printed"
 def assemble_printed(
     state: State, weights: tuple[Float64, Float64], posture: Cost, external: Barrier, firm: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """Return the program over ``z = (v, x, e)``; rows: upper, lower box (2 J), external (M), firm.
+    """Return the program over ``z = (v, x, e)``; rows: box (2 J), external (M), firm.
 
-    As printed: an external row is ``grad d v >= -(d - epsilon) + e``; rows of self-collision and further terms have
-    no slack. weights: diagonals (6,) of Q and R; posture: the "home pose bias" of III-E, without which seven joints
-    on six dimensions are undetermined.
+    The upper box comes first. As printed: an external row is ``grad d v >= -(d - epsilon) + e``; rows of
+    self-collision and further terms have no slack. weights: diagonals (6,) of Q and R; posture: "home pose bias" of
+    III-E, without which seven joints on six dimensions are undetermined.
     """
     J, M = len(state.q), len(external)
     v, x, e = slice(0, J), slice(J, J + 6), slice(J + 6, J + 6 + M)
@@ -166,7 +166,7 @@ def solve_printed(
 ) -> Choice:
     """Return the printed program's answer if solved and checked, else standstill.
 
-    The paper has no second rung. slack is the relaxation ``-e``; a row may also demand more than it needs, at a cost.
+    The paper has no second rung. slack is ``-e``; a row may also demand more than it needs, at a cost.
     """
     external, *firm = barriers
     J, M, num_firm = len(state.q), len(external), sum(len(rows) for rows in firm)

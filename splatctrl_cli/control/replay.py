@@ -50,8 +50,8 @@ class Waypoint:
 class ReplayTask:
     """Start (J,) [rad] at a stamp [ns] and goal pose (4, 4) of a frame.
 
-    home (J,) [rad]: attracts free motion (None: amid the limits). via: earlier goals, in order. follow: the goal is
-    each time's logged pose, until the log ends. twists: velocity to reach instead, until end_ns. anchors: every
+    home (J,) [rad]: attracts free motion (None: `middle`). via: earlier goals, in order. follow: the goal is each
+    time's logged pose, until the log ends. twists: velocity to reach instead, until end_ns. anchors: every
     anchor_period [s] the arm returns to the logged posture.
     """
 
@@ -97,7 +97,7 @@ class ReplayTrace:
     """T steps with stamp_ns (T,) and position (T, J) [rad] before each.
 
     anchored: steps before which the arm returned to the log; num_reached: goals; detours: steps after which a planned
-    detour began; by_surface: spheres that counted by their link's surface in the end.
+    detour began; by_surface: spheres that finally counted by their link's surface.
     """
 
     stamp_ns: Stamps
@@ -168,11 +168,10 @@ def closed_loop(
 ) -> ReplayTrace:
     """Integrate the commander's velocities at `config.period` until goal, stall or `config.max_time`.
 
-    field_at: field known at a stamp [ns], one object per scene; scene_step_at: two newest scenes, for
-    `config.distance_rate`; plan_detour: way out of a stall, `config.max_detours` times; record: None for memory;
-    distance_to: exact distance at the start, for `check_free`; balls_at: balls of a stamp's field, None where links'
-    surfaces do not count. Raises InputError for a start outside the limits or an unreachable goal, NotEvaluableError
-    for a start in collision or outside the field.
+    field_at: field known at a stamp [ns], one object per scene; scene_step_at: for `config.distance_rate`;
+    plan_detour: way out of a stall, `config.max_detours` times; record: None for memory; distance_to: for
+    `check_free`; balls_at: balls of a stamp's field, None where links' surfaces do not count. Raises InputError for a
+    start outside the limits or an unreachable goal, NotEvaluableError for a start in collision or outside the field.
     """
     field = field_at(task.stamp_ns)
     q, controller = _ready(model, config, task, field, distance_to)
@@ -332,7 +331,7 @@ class _Course:
 def divergence(
     model: ArmModel, frame: str, stamp_ns: Stamps, position: FloatRows, motion: LoggedMotion
 ) -> tuple[Float64, Float64, Float64]:
-    """Return distances of T postures (T, J) from those logged at the same stamps.
+    """Return distances of T postures (T, J) from those logged at their stamps.
 
     Joint norm [rad], frame position [m] and rotation [rad], each (T,); NaN after the log's end.
     """

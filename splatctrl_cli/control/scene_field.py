@@ -26,8 +26,7 @@ SceneStepAt = Callable[[int], SceneStep | None]
 def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> float | Float64:
     """Return dd/dt (Q,) [m/s] at fixed points (Q, 3) [m], from older to newer scene.
 
-    Clipped to [-limit, 0], so a row is only ever tightened. The rate of the past interval holds until the next scene;
-    missing distances give 0.
+    Clipped to [-limit, 0], so a row is only ever tightened; missing distances give 0.
     """
     if step is None:
         return 0.0
@@ -49,8 +48,8 @@ def rate_of(
 class PeopleGrown:
     """min(scene, people - extra): a field in which people extend `extra` [m] farther.
 
-    Where it is at least epsilon, the scene is at least epsilon away, and people epsilon + extra. The gradient is that
-    of the smaller one.
+    At epsilon or more, the scene is at least epsilon away, and people epsilon + extra. Distance and gradient are the
+    smaller one's.
     """
 
     def __init__(self, scene: DistanceField, people: DistanceField, extra: float) -> None:

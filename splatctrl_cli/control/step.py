@@ -57,8 +57,8 @@ class ControlStep:
     velocity (J,) [rad/s], already scaled by `scale` (1 unless the next distance broke a row's promise); pose_error
     (6,) [m, rad]; clearance [m] of the nearest moving sphere by the controller's own field; self_clearance [m] (inf
     without pairs); violated_fixed: violated rows that no joint velocity changes, fixed_distance [m]: their least (inf
-    without any); num_rows: in the QP; residual: worst KKT residual of the last solution; status: the solver's;
-    num_refused: solutions that failed the check; by_surface: spheres that count by their link's surface from now on.
+    without any); num_rows: in the QP; residual: worst KKT residual of the last solution; num_refused: solutions that
+    failed the check; by_surface: spheres that now count by their link's surface.
     """
 
     velocity: Float64
@@ -122,7 +122,7 @@ class QpIkController:
         solver: QpSolver | None = None,
         terms: Sequence[CostTerm | BarrierTerm] = (),
     ) -> None:
-        """home (J,) [rad] attracts free motion (default: amid the limits); terms add to the paper's.
+        """home (J,) [rad] attracts free motion (default: `middle`); terms add to the paper's.
 
         Raises InputError for a robot that no controller can run with.
         """
@@ -159,10 +159,9 @@ class QpIkController:
         """Return the joint velocity at q (J,) [rad] towards a goal pose (4, 4).
 
         distance_rate: dd/dt [m/s] of the moving spheres' distances, (M,) or one number. guide: the goal's motion
-        (None: at rest). last_velocity (J,) [rad/s]: reference of accelerations and smoothness (None: neither counts).
-        by_surface: spheres that count by their link's surface. A sphere whose row would relax joins them if its
-        surface is farther away. Raises InputError for a q that is not finite, NotEvaluableError where the field has
-        no distance.
+        (None: at rest). last_velocity (J,) [rad/s]: for acceleration and smoothness (None: neither counts).
+        by_surface: spheres that count by their link's surface; one whose row would relax joins them if its surface is
+        farther. Raises InputError for a q that is not finite, NotEvaluableError where the field has no distance.
         """
         config = self._config
         rest = self._limits.rest(last_velocity)
@@ -271,8 +270,8 @@ class QpIkController:
     def _descended(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
         """Return rows, the ladder's choice, and True if the later distances keep the promise.
 
-        If a sphere would meet another surface than its row's (a corner, a second splat), that becomes a row and the
-        ladder runs again: cutting planes, at most `config.max_cuts` rounds.
+        A sphere that would meet another surface than its row's (a corner, a second splat) adds a row, and the ladder
+        runs again: cutting planes, at most `config.max_cuts` rounds.
         """
         num_external, max_cuts = self._builder.num_external, self._config.max_cuts
         for num_cuts in range(max_cuts + 1):
@@ -297,10 +296,10 @@ class QpIkController:
         return np.asarray(raised > distance)
 
     def _broken(self, choice: Choice, rows: Rows, later: Float64) -> Bool:
-        """True for rows (M,) whose `later` (M,) distance, a period on, breaks their promise.
+        """True for rows (M,) whose `later` distance, a period on, breaks their promise.
 
         A row promises ``d(q + dt v) >= d - dt (h + s)``; a sphere on its way back out need only not lose ground.
-        Beyond the margin `promise_tolerance` applies; within it, where misses add up, a hundredth. Rows within their
+        Beyond the margin `promise_tolerance` applies; within it a hundredth, because misses add up. Rows within their
         margins may lose ground if the total shortfall shrinks: between several surfaces there may be no other way
         out.
         """
@@ -399,5 +398,4 @@ OURS = Ours()
 
 
 def _blend(velocity: Float64, rest: Float64, scale: float) -> Float64:
-    """Mix a velocity with rest by `scale`, exact at either end."""
     return velocity if scale == 1.0 else rest + scale * (velocity - rest)

@@ -1,7 +1,7 @@
-"""Terms of the QP of III-E: costs and rows over joint velocities; the solver adds them.
+"""Terms of the QP of III-E over joint velocities; the solver adds them.
 
-A further term is one class: a cost has ``rows(state) -> (H, c)``, a constraint is a `BarrierTerm`, with rows ``G v -
-s <= h``. `QpIkController` takes both.
+A further term for `QpIkController` is one class: a cost with ``rows(state) -> (H, c)``, or a `BarrierTerm` with rows
+``G v - s <= h``.
 """
 
 from abc import ABC, abstractmethod
@@ -29,10 +29,9 @@ NO_SPHERE: Bool = np.zeros(1, dtype=np.bool_)  # of the moving ones
 class State:
     """A step's state, as terms see it.
 
-    q (J,) [rad]; box: allowed velocities (J,), (J,) [rad/s]; reference (6,) [m/s, rad/s]: velocity for `frame` to
-    reach; guide: the goal's motion (None: at rest); last_velocity (J,) [rad/s] (None: unknown); distance_rate: dd/dt
-    [m/s] of the moving spheres' distances, (M,) or one number; by_surface (M,): spheres that count by their link's
-    surface.
+    q (J,) [rad]; box: allowed velocities (J,), (J,) [rad/s]; reference (6,) [m/s, rad/s]: for `frame` to reach;
+    guide: the goal's motion (None: at rest); last_velocity (J,) [rad/s] (None: unknown); distance_rate: dd/dt [m/s]
+    of the moving spheres' distances, (M,) or one number; by_surface (M,): spheres that count by their link's surface.
     """
 
     model: ArmModel
@@ -66,7 +65,7 @@ class CostTerm(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class ReachGoal:
-    """First two terms of III-E, ``(u - J v)' W (u - J v)``; u: reference, weight (6,): diagonal of W."""
+    """First terms of III-E, ``(u - J v)' W (u - J v)``: reference u, weight (6,) diagonal of W."""
 
     weight: Float64
 
@@ -82,9 +81,9 @@ class ReachGoal:
 
 @dataclass(frozen=True, kw_only=True)
 class LeanHome:
-    """Home bias of III-E, which also makes a redundant arm's QP strictly convex.
+    """Home bias of III-E, which makes a redundant arm's QP strictly convex.
 
-    It leads to home (J,) [rad], or to the guide's posture on top of that posture's motion.
+    It leads to home (J,) [rad], or to the guide's posture, added to that posture's motion.
     """
 
     home: Float64
@@ -162,10 +161,10 @@ class RowKind(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Barrier:
-    """M barrier rows ``G v - s <= h`` with ``G = -dd/dq`` (M, J), ``h = alpha (d - epsilon) + dd/dt`` (M,).
+    """M barrier rows ``G v - s <= h``, with ``G = -dd/dq`` (M, J).
 
-    distance d (M,) [m]; index (M,): place in the list of names (sphere, or pair). Slack costs ``slack_cost * s +
-    slack_weight * s^2`` per row [s in m/s].
+    ``h = alpha (d - epsilon) + dd/dt`` (M,); distance d (M,) [m]; index (M,): place among names (spheres, or pairs).
+    Slack costs ``slack_cost * s + slack_weight * s^2`` per row [s in m/s].
     """
 
     index: NDArray[np.integer]
@@ -196,7 +195,7 @@ class Barrier:
 class BarrierTerm(ABC):
     """A term of M rows that bound the velocity; `names` say what each guards.
 
-    A term without distances has `rows` alone: its distance is infinite, so no step is checked against it.
+    Without distances it has `rows` alone: the infinite distance exempts it from step checks.
     """
 
     kind = RowKind.LIMIT

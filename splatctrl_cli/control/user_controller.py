@@ -1,6 +1,6 @@
 """Python controllers: their input, and the process that serves them (docs/controllers.md).
 
-The class runs in a separate process with the same line protocol as any language.
+It speaks the same lines as a program in any language.
 """
 
 import json
@@ -25,9 +25,9 @@ PROTOCOL = 1
 class ControllerStart:
     """A controller's initial input.
 
-    joints (J,): names in the order of all vectors; lower, upper (J,) [rad]; velocity_limit (J,) [rad/s];
-    acceleration_limit (J,) [rad/s^2] (None: no limit); frame to drive; home (J,) [rad] to lean to; period [s] of a
-    velocity; margin [m] to the scene.
+    joints (J,): names, in the order of all vectors; lower, upper, home to lean to (J,) [rad]; velocity_limit (J,)
+    [rad/s]; acceleration_limit (J,) [rad/s^2] (None: no limit); frame to drive; period [s] of a velocity; margin [m]
+    to the scene.
     """
 
     joints: tuple[str, ...]
@@ -72,9 +72,9 @@ class ClearanceRow:
 class ControllerInput:
     """A controller's input at a step, in world.
 
-    stamp_ns; q (J,) [rad]; dq (J,) [rad/s]; goal, pose (4, 4) of goal and frame; error (6,) [m, rad]: twist from
-    frame to goal in a second, linear first; jacobian (6, J) of the frame. A moving goal has goal_twist (6,) [m/s,
-    rad/s], goal_posture (J,) [rad] to lean to, and its goal_velocity (J,) [rad/s]; all None for a plain pose.
+    q (J,) [rad]; dq (J,) [rad/s]; goal, pose (4, 4) of goal and frame; error (6,) [m, rad]: twist from frame to goal
+    in a second, linear first; jacobian (6, J) of the frame. A moving goal has goal_twist (6,) [m/s, rad/s],
+    goal_posture (J,) [rad] to lean to, and goal_velocity (J,) [rad/s] of that posture; else all None.
     """
 
     stamp_ns: int

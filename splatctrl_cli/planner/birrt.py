@@ -1,7 +1,7 @@
 """BiRRT: trees from start and goals grow towards samples and each other.
 
-RRT-Connect (Kuffner and LaValle, ICRA 2000) in batches: an iteration draws K samples and proves the K edges to them
-together. Conservative advancement proves every edge free, also of shortcuts. J joints, G goals, W waypoints.
+RRT-Connect (Kuffner and LaValle, ICRA 2000) on batches of K samples and edges. Conservative advancement proves every
+edge free, also of shortcuts. J joints, G goals, W waypoints.
 """
 
 import time
@@ -51,7 +51,7 @@ class Plan:
 
 @dataclass
 class _Tree:
-    """Nodes q (size, J) with their parent's index, -1 for a root."""
+    """Nodes q (size, J) and parent indices, -1 for a root."""
 
     roots: Float64
     q: Float64 = field(init=False)
@@ -115,7 +115,7 @@ class _Search:
     def grown(self, tree: _Tree, targets: Float64) -> Index:
         """Grow `tree` towards targets (K, J) by at most `reach`, where all is free.
 
-        Not partially: nodes near contact would be nearest to most samples, and lead nowhere.
+        Partial growth would put nodes near contact, nearest to most samples but leading nowhere.
         """
         near = tree.nearest(targets)
         way = targets - tree.q[near]
@@ -167,9 +167,9 @@ class _Search:
 def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig, *, seed: int = 0) -> Plan:
     """Plan a path from start (J,) to one of goals (G, J) or (J,) [rad].
 
-    The same seed gives the same path. `config` bounds iterations and time; exceeding either is an outcome, not an
-    error, and only time depends on the machine. Raises InputError for a start or goal outside the limits,
-    NotEvaluableError for one in collision, with sphere and depth.
+    The same seed gives the same path. Exceeding the iterations or time of `config` is an outcome, not an error; only
+    time depends on the machine. Raises InputError for a start or goal outside the limits, NotEvaluableError for one
+    in collision, with sphere and depth.
     """
     began = time.perf_counter()
     roots = checked_postures(clearance, start, goals, config)
@@ -223,10 +223,9 @@ def checked_postures(clearance: Clearance, start: Float64, goals: Float64, confi
 def shortened(
     clearance: Clearance, waypoints: Float64, config: PlannerConfig, random: np.random.Generator
 ) -> tuple[Float64, int, int]:
-    """Return a path (W', J) of proved edges, no longer, and its counts of edges and postures.
+    """Return a path (W', J) of proved edges, no longer; counts of edges, postures.
 
-    First the shortest way over waypoints, then rounds of shortcuts between random points, each with the most saving
-    one.
+    First the shortest way over waypoints, then rounds of random shortcuts, each with the most saving one.
     """
     path, num_edges, num_checks = _over_waypoints(clearance, waypoints, config)
     for _ in range(config.shortcut_rounds):
@@ -244,7 +243,6 @@ def shortened(
 
 
 def _over_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) -> tuple[Float64, int, int]:
-    """Shortest way over edges between waypoints, old or proved."""
     W = len(path)
     a, b = np.triu_indices(W, k=2)
     length = np.linalg.norm(path[:, None] - path[None], axis=2)
@@ -266,7 +264,7 @@ def _over_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) 
 
 
 def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float64:
-    """Places (K, 2) along the path, in waypoints, on different edges; most saving first."""
+    """Places on different edges, the most saving first."""
     places = np.sort(_places(path, random.random((num, 2))), axis=1)
     places = places[np.floor(places[:, 0]) < np.floor(places[:, 1])]
     along = _lengths(path)
@@ -287,12 +285,10 @@ def _cut(path: Float64, cut: Float64) -> Float64:
 
 
 def _lengths(path: Float64) -> Float64:
-    """(W,) joint length from the start to each waypoint."""
     return np.asarray(np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
 
 
 def _places(path: Float64, share: Float64) -> Float64:
-    """Shares of the length as places in waypoints."""
     along = _lengths(path)
     return np.asarray(np.interp(share * along[-1], along, np.arange(len(path))))
 

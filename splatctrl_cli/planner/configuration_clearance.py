@@ -1,6 +1,6 @@
 """Clearance of many postures, its loss over motions, and proofs of free edges.
 
-B postures, J joints; R rows: moving spheres against the scene, then pairs of spheres.
+B postures, J joints; R rows: moving spheres, then pairs of spheres.
 """
 
 from dataclasses import dataclass, replace
@@ -40,10 +40,9 @@ class HasDistance(Protocol):
 class Clearance:
     """Signed distances of an arm's spheres to a scene and each other, less margins.
 
-    taken (R,) [m]: radii and margins to subtract from centre distances; moving (M,) spheres; pairs (P, 2) of all
-    spheres; levers (R, J): a motion dq costs a row at most ``levers @ |dq|`` [m], if the scene's distance is
-    1-Lipschitz (exact distances are; else `lipschitz` scales its rows). names (R,). compiled: kernel for edges among
-    `Solids`, None without a chain.
+    taken (R,) [m]: radii and margins to subtract; moving (M,) spheres; pairs (P, 2) of all spheres; levers (R, J): a
+    motion dq costs a row at most ``levers @ |dq|`` [m], if the scene's distance is 1-Lipschitz (exact ones are; else
+    `lipschitz` scales its rows). compiled: kernel for edges among `Solids`, None without a chain.
     """
 
     model: ArmModel
@@ -138,10 +137,7 @@ class Clearance:
 
 
 def _apart(centers: Float64, pairs: NDArray[np.integer]) -> Float64:
-    """Distances (B, P) between pairs of centres (B, S, 3), by ``|a|^2 + |b|^2 - 2 a b``.
-
-    Good to 1e-8 m for coincident centres, 1e-14 m at a centimetre.
-    """
+    """Distances (B, P) of pairs, by ``|a|^2 + |b|^2 - 2 a b``: good to 1e-8 m."""
     B, S = centers.shape[:2]
     squares = np.einsum("bsk,bsk->bs", centers, centers)
     apart = centers @ np.swapaxes(-2.0 * centers, 1, 2)
@@ -152,7 +148,7 @@ def _apart(centers: Float64, pairs: NDArray[np.integer]) -> Float64:
 
 
 def _between(levers: Float64, pairs: NDArray[np.integer]) -> Float64:
-    """Approach (P, J) of two spheres; a joint that moves both moves neither against the other."""
+    """A joint that moves both spheres moves neither against the other."""
     a, b = levers[pairs[:, 0]], levers[pairs[:, 1]]
     moves_both: Bool = (a > 0) & (b > 0)
     return np.where(moves_both, 0.0, np.maximum(a, b))
@@ -188,9 +184,9 @@ def check_edges(
 ) -> EdgeCheck:
     """Prove edges start (E, J) to end (E, J) free.
 
-    A posture with less than `contact` [m] counts as in collision. This bounds the checks and rejects grazing edges,
-    never accepting a false one. Less than `give_up` [rad] before a collision stays unproved. With `only_whole`, an
-    edge's first collision drops it, with free_share 0.
+    Less than `contact` [m] counts as collision: this bounds the checks and rejects grazing edges, never accepting a
+    false one. Less than `give_up` [rad] before a collision stays unproved. With `only_whole`, an edge's first
+    collision sets its free_share to 0.
     """
     if clearance.compiled is None or not isinstance(clearance.scene, Solids):
         return check_sampled_edges(clearance, start, end, contact=contact, give_up=give_up, only_whole=only_whole)

@@ -1,4 +1,4 @@
-"""Timed paths for a replay's task: from its start to a pose, in the scene known then.
+"""Timed paths for a replay's task, from start to goal in the scene known then.
 
 G goal postures, K guesses, J joints.
 """
@@ -34,9 +34,9 @@ def resampled(waypoints: Float64, spacing: float) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class TimedPath:
-    """A path (W, J) with trapezoids of speed, at rest at waypoints to keep straight edges.
+    """A timed path (W, J), at rest at each waypoint to keep straight edges.
 
-    start_time (W,) [s] of each waypoint; top_speed, acceleration (W - 1,): share of each edge, per s and s^2.
+    start_time (W,) [s]; top_speed, acceleration (W - 1,): trapezoids of the share of each edge, per s and s^2.
     """
 
     waypoints: Float64
@@ -67,7 +67,7 @@ class TimedPath:
 def effector_rates(
     model: ArmModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
 ) -> Float64:
-    """Return edge shares per second (W - 1,) that keep a frame within speeds [m/s], [rad/s].
+    """Return edge shares per second (W - 1,) that keep a frame's speed limits [m/s], [rad/s].
 
     Sampled `FRAME_SPACING` apart; infinite where an edge does not move it.
     """
@@ -86,8 +86,8 @@ def timed(
 ) -> TimedPath:
     """Return the fastest trapezoids within velocity_limit (J,) [rad/s] and max_acceleration [rad/s^2].
 
-    max_rate (W - 1,): limits each edge's share per second. Raises InputError for fewer than two waypoints or limits
-    not above zero.
+    max_rate (W - 1,): limits edge shares per second. Raises InputError for fewer than two waypoints or limits not
+    above zero.
     """
     if len(waypoints) < 2:
         raise InputError(f"path: expected at least 2 waypoints, got {len(waypoints)}")
@@ -117,8 +117,8 @@ NO_POSTURE, START_BLOCKED, GOAL_BLOCKED = "no-goal-posture", "start-in-collision
 class PlannedPath:
     """A timed path; None where outcome says why.
 
-    margin, self_margin [m]: of planning, reduced where start or goal is nearer. num_proved of num_edges edges are
-    proved free. seconds [s]: of planning, with goal postures.
+    margin, self_margin [m]: reduced where start or goal is nearer. num_proved of num_edges edges are proved free.
+    seconds [s]: of planning.
     """
 
     outcome: str
@@ -143,7 +143,7 @@ def planned_path(
     """Plan a path from start to goal pose, within the controller's frame speeds.
 
     scene: lower bound of a 1-Lipschitz distance, so every edge is proved. Goal postures are sought from home, start
-    and random ones. approach [m]: final straight way along the frame's z axis, as far as it is free.
+    and random ones. approach [m]: straight end along the frame's z axis, as far as free.
     """
     began = time.perf_counter()
     start, frame = task.start, task.frame
@@ -183,7 +183,6 @@ def planned_path(
 def _found(
     room: Clearance, task: ReplayTask, goals: Float64, approach: float, planner: PlannerConfig, control: ControlConfig
 ) -> tuple[PlanOutcome, Float64]:
-    """Search a path to one of goals (G, J); no waypoints (W, J) if none."""
     last = [approach_to(room, task.frame, goal, approach, planner, control) for goal in goals]
     before = np.array([way[0] for way in last])
     found = path_to_nearest(room, np.clip(task.start, room.model.lower, room.model.upper), before, planner)
@@ -194,7 +193,7 @@ def _found(
 
 
 def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: PlannerConfig) -> Plan:
-    """Return a path to the goal (G, J) nearest to start within `NEAREST_ITERATIONS`, else to any.
+    """Return a path to the nearest goal (G, J) within `NEAREST_ITERATIONS`, else to any.
 
     Two trees meet first at a goal with much free space around, not at a near one.
     """
@@ -207,9 +206,9 @@ def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: Pl
 def approach_to(
     room: Clearance, frame: str, goal: Float64, length: float, planner: PlannerConfig, control: ControlConfig
 ) -> Float64:
-    """Return postures (W, J) to a goal (J,) along its frame's z axis, from up to `length` [m].
+    """Return postures (W, J) straight along the z axis of a goal's (J,) frame.
 
-    The way ends where no posture leads there or an edge is not free.
+    They start up to `length` [m] before it, as far as postures and free edges lead there.
     """
     model, way = room.model, [goal]
     T_world_goal = model.frame_pose(goal, frame)
@@ -227,10 +226,7 @@ def approach_to(
 
 
 def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlConfig) -> tuple[float, float, Float64]:
-    """Scene and pair margins that start and goal keep, and the goals that keep them.
-
-    A margin may be 0 or less; without a free goal there are none.
-    """
+    """Margins that start and goal keep, and the goals that keep them, if any is free."""
     rows = room.rows(np.vstack([start, goals])) - fixed.START_ROOM
     num = len(room.moving)
     scene, own = rows[:, :num].min(axis=1), rows[:, num:].min(axis=1, initial=np.inf)
@@ -266,9 +262,9 @@ def planned_detours(
 def goal_postures(
     model: ArmModel, frame: str, T_world_goal: Float64, guesses: Float64, config: ControlConfig, *, at_most: int
 ) -> Float64:
-    """Return distinct postures (G, J) within limits that bring `frame` to a pose, in guess order.
+    """Return distinct postures (G, J) within limits that bring `frame` to a pose.
 
-    They meet a tenth of the goal's tolerances; G is at most `at_most`, 0 if no guess (K, J) succeeds.
+    They meet a tenth of the goal's tolerances, in guess order; G is at most `at_most`, 0 if no guess (K, J) succeeds.
     """
     found: list[Float64] = []
     for guess in guesses:

@@ -1,6 +1,6 @@
 """A scene of exact solids: spheres, boxes, cylinders and capsules.
 
-Q points, P solids of one kind; rods lie along z of their own frame, centred. World, [m], float64.
+Q points, P solids of one kind; rods lie along their own z axis, centred. World, [m], float64.
 """
 
 from collections.abc import Sequence
@@ -48,8 +48,7 @@ Solid = Ball | Cuboid | Rod
 class Solids:
     """A `DistanceField` of solids: signed distance, negative inside, 1-Lipschitz.
 
-    Inside several solids it is the depth in the deepest, at most the way out. Raises InputError for a size not above
-    zero.
+    Inside several solids: the depth in the deepest, at most the way out. Raises InputError for a size not above zero.
     """
 
     solids: Sequence[Solid]
@@ -116,12 +115,11 @@ def _to_rods(points: Float64, turn: Float64, shift: Float64, shape: Float64) -> 
 
 
 def _local(points: Float64, turn: Float64, shift: Float64) -> Float64:
-    """(3, P, Q): points in the solids' frames."""
     return np.asarray((turn @ points.T).reshape(3, -1, len(points)) + shift[:, :, None])
 
 
 def _into(placements: Sequence[Float64]) -> tuple[Float64, Float64]:
-    """Rotation rows (3 P, 3) and shifts (3, P) from world, axis by axis."""
+    """Rotation rows (3 P, 3) and shifts (3, P) from world."""
     maps = np.array([invert_transform(T) for T in placements]).reshape(-1, 4, 4)
     return np.ascontiguousarray(np.swapaxes(maps[:, :3, :3], 0, 1)).reshape(-1, 3), maps[:, :3, 3].T
 
@@ -133,7 +131,7 @@ def _placed_rows(turn: Float64, shift: Float64, shape: Float64) -> Float64:
 
 
 def _core(rod: Rod) -> tuple[float, float, float]:
-    """Cylinder radius, half length, and the rod's distance outside it."""
+    """Cylinder radius, half length, distance of the surface outside it."""
     return (0.0, rod.length / 2, rod.radius) if rod.is_round else (rod.radius, rod.length / 2, 0.0)
 
 

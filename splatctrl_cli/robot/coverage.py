@@ -1,12 +1,12 @@
 """Coverage of a robot's collision surface by its spheres: proven bounds, not samples.
 
 phi(p) = min_i |p - c_i| - r_i is positive exactly outside a union of balls, and is then the distance to it. Each term
-is convex, so over a triangle it is largest at a corner, and
+is convex, so over a triangle it is largest at a corner:
 
     max over the triangle of phi  <=  min_i max_k |v_k - c_i| - r_i,
 
-which is exact where one ball is nearest to all of it. Triangles are halved until this bound and the largest phi at a
-corner agree to a tolerance. Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
+exact where one ball is nearest to all of it. Triangles are halved until this bound and the largest corner phi agree.
+Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
 """
 
 import pickle
@@ -43,9 +43,9 @@ class Deficit:
 class LinkCoverage:
     """Coverage of one link's collision surface by its spheres and those fixed to it.
 
-    area [m2]; uncovered_area [m2] and its proven bounds; deficit: None without spheres; protrusion [m]: bound on
-    spheres sticking out of the body, exact for a convex one; worst_sphere: its index in the sphere set; is_closed:
-    the surface has an inside, else its hull replaced it.
+    area [m2]; uncovered_area [m2], proven bounds; deficit: None without spheres; protrusion [m]: bound on how far
+    spheres leave the body, exact for a convex one; worst_sphere: its index in the sphere set; is_closed: else the
+    hull replaced the surface.
     """
 
     link: str
@@ -113,8 +113,8 @@ def coverage_of_solids(
 ) -> CoverageReport:
     """Measure how spheres cover the `solids` of each link of `urdf`.
 
-    Spheres of any link joined by fixed joints count. A process measures the same robot once. Raises InputError for a
-    sphere on an unknown link.
+    Spheres of any link joined by fixed joints count. Results are cached. Raises InputError for a sphere on an unknown
+    link.
     """
     bodies = urdf.rigid_bodies()
     unknown = [link for link in spheres.links if link not in bodies]
@@ -150,9 +150,9 @@ def _measured(packed: bytes) -> CoverageReport:
 
 
 def deficit_by_sphere(urdf: UrdfFile, spheres: SphereSet, report: CoverageReport) -> Float64:
-    """Return the proven deficit (S,) [m] of each sphere's rigid body; 0 without collision geometry.
+    """Return the proven deficit (S,) [m] of each sphere's rigid body; 0 without geometry.
 
-    Spheres of fixed links cover each other's surface, so the body's worst link counts for all.
+    Spheres of fixed links cover each other's surface, so the body's worst link counts.
     """
     leaders = {link: leader for link, (leader, _) in urdf.rigid_bodies().items()}
     worst: dict[str, float] = {}
@@ -188,8 +188,8 @@ def uncovered_area(
 ) -> tuple[float, float, float]:
     """Return the area [m2] with phi > 0: best guess and proven bounds.
 
-    Triangles are halved until certainly in one sphere, certainly outside all, or no longer than `resolution` [m];
-    their middle decides about the last.
+    Triangles are halved until in one sphere, outside all, or no longer than `resolution` [m]; then their middle
+    decides.
     """
     outside = unsure = guess = 0.0
     pending = triangles
@@ -280,7 +280,7 @@ def _chunks(triangles: Float64, num_spheres: int) -> Iterator[slice]:
 
 
 def _bounds(triangles: Float64, centers: Float64, radii: Float64) -> tuple[Float64, Float64]:
-    """The bound on phi over each triangle (F,), and phi at its corners (F, 3)."""
+    """The bound on phi (F,), and phi at the corners (F, 3)."""
     upper, at_corners = np.empty(len(triangles)), np.empty((len(triangles), 3))
     for part in _chunks(triangles, len(radii)):
         gap = (cdist(triangles[part].reshape(-1, 3), centers) - radii).reshape(-1, 3, len(radii))
@@ -294,13 +294,11 @@ def _phi(points: Float64, centers: Float64, radii: Float64) -> Float64:
 
 
 def _longest_edges(triangles: Float64) -> tuple[Float64, "np.ndarray[tuple[int], np.dtype[np.int64]]"]:
-    """Length (F,) of the longest edge, and the corner (F,) where it starts."""
     length = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2)
     return length.max(axis=1), length.argmax(axis=1)
 
 
 def _halves(triangles: Float64) -> Float64:
-    """Triangles (2F, 3, 3), cut in two at the middle of their longest edge."""
     rows = np.arange(len(triangles))
     first = _longest_edges(triangles)[1] if len(triangles) else rows
     a, b, c = (triangles[rows, (first + k) % 3] for k in range(3))

@@ -52,8 +52,8 @@ class ExpectedContact:
 class Declarations:
     """Declared entries in file order; empty without a file.
 
-    num_uses counts by (table, index) how often an entry changed a label or excused a contact: an unused one is stale,
-    or has a wrong link, box or time.
+    num_uses counts by (table, index) how often an entry changed a label or excused a contact: an unused one is stale
+    or wrong.
     """
 
     carried: tuple[Carried, ...] = ()
@@ -118,8 +118,8 @@ def carried_words(entry: Mapping[str, Any]) -> str:
 def read_declarations(path: Path, links: Collection[str] | None = None) -> Declarations:
     """Read declarations from TOML; `links`: of the robot, None if unknown.
 
-    Raises InputError for an unreadable file, unknown tables or keys, an unknown link, an invalid box, or an end
-    before the start.
+    Raises InputError for an unreadable file, unknown tables, keys or links, an invalid box, or an end before the
+    start.
     """
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))

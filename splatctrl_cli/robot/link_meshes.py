@@ -27,8 +27,8 @@ UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0}
 class Solid:
     """A piece of a link's collision geometry, in the frame of `link` [m].
 
-    slack: largest distance of the true surface from the triangles. body: closed mesh for inside tests: the surface,
-    or its convex hull if open, or None if open and flat. ball: centre (3,) and radius of a ball.
+    slack: the true surface's largest distance from the triangles. body: closed mesh for inside tests: the surface,
+    else its convex hull, None if flat. ball: centre (3,) and radius of a ball.
     """
 
     link: str
@@ -44,7 +44,7 @@ class Solid:
 
 
 def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple[Solid, ...]]:
-    """Read the solids of each link with collision geometry, in the file's order.
+    """Read each link's solids, in the file's order.
 
     folders: for ``package://`` paths, before those above the URDF. Raises InputError for a missing or unreadable
     mesh, other shapes, or no collision geometry.
@@ -106,8 +106,8 @@ def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path
 class SolidDistance:
     """A bound on the signed distance to a union of solids: the least to each.
 
-    Outside it is exact; inside it is negative and no deeper than the truth, so the ball of that radius lies inside.
-    To an open, flat surface it is unsigned.
+    Outside exact; inside no deeper than the truth, so the ball of that radius lies inside. Unsigned for an open, flat
+    surface.
     """
 
     def __init__(self, solids: Sequence[Solid]) -> None:
@@ -150,7 +150,6 @@ def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
 
 
 def _unit_words(shape: MeshShape, length: float) -> str:
-    """Units that would make the mesh as long as links are; else the remedy."""
     raw, signs = length / float(np.abs(shape.scale).max()), np.sign(shape.scale)
     words = [
         f'{name}: scale="{" ".join(f"{unit * sign:g}" for sign in signs)}"'
@@ -161,7 +160,7 @@ def _unit_words(shape: MeshShape, length: float) -> str:
 
 
 def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
-    """Return the mesh's solids, link frame; an open one as its closed pieces and the rest."""
+    """Return the mesh's solids, link frame; an open mesh as closed pieces and rest."""
     whole = placed(shape, mesh)
     pieces = [whole] if whole.is_closed else _taken_apart(whole)
     return [
@@ -171,7 +170,6 @@ def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
 
 
 def _taken_apart(mesh: TriangleMesh) -> list[TriangleMesh]:
-    """Split a mesh into its closed connected pieces, and all open ones together."""
     size = len(mesh.vertices)
     ends = mesh.faces[:, [0, 1, 2]].ravel(), mesh.faces[:, [1, 2, 0]].ravel()
     _, label = connected_components(coo_matrix((np.ones(len(ends[0])), ends), shape=(size, size)), directed=False)
@@ -196,7 +194,6 @@ def _is_closed(faces: Index) -> bool:
 
 
 def _hull(vertices: Float64) -> TriangleMesh | None:
-    """Convex hull, counter-clockwise from outside; None for coplanar vertices."""
     try:
         hull = ConvexHull(vertices)
     except QhullError:
@@ -216,7 +213,6 @@ def _box(size: Float64) -> tuple[Float64, Index]:
 
 
 def _prism(radius: float, length: float) -> tuple[Float64, Index]:
-    """A prism inside a cylinder along z, edges on its surface."""
     angle = 2 * np.pi * np.arange(CYLINDER_SIDES) / CYLINDER_SIDES
     ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(CYLINDER_SIDES)], axis=1)
     up = np.array([0.0, 0.0, length / 2])

@@ -30,7 +30,7 @@ class MeshDistance:
         np.add.at(self._of_edge, self._edge.reshape(-1), np.repeat(self._of_face, 3, axis=0))
 
     def closest(self, points: Float64) -> tuple[Float64, Float64, Bool]:
-        """Return distance (Q,) [m], nearest surface point (Q, 3), is_inside (Q,) of points (Q, 3) [m].
+        """Return distance (Q,) [m], nearest surface point (Q, 3) and is_inside (Q,).
 
         Inside by the angle-weighted normal of the nearest face, edge or vertex (Baerentzen, Aanaes, Signed distance
         computation using the angle weighted pseudonormal, 2005), exact for a closed mesh; all False for an open one.
@@ -52,7 +52,6 @@ class MeshDistance:
         return np.where(is_inside, -distance, distance)
 
     def _normals(self, face: Index, shares: Float64) -> Float64:
-        """Outward directions (Q, 3), not normalised, at barycentric coordinates of faces."""
         normal = np.asarray(self._of_face[face])
         num_zero = np.count_nonzero(shares == 0, axis=1)
         for k in range(3):

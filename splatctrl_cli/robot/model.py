@@ -34,10 +34,10 @@ from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 class RobotModel:
     """Kinematics, limits and collision spheres of one arm; world frame, SI units, float64.
 
-    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; frame_names: links for
-    `frame_pose`; left_out: links of the sphere file that the URDF lacks; bare_links: URDF links with a body but no
-    sphere; coverage: None if not measured (coverage_unknown says why); sphere_deficit (S,) [m]: largest distance of
-    the sphere's rigid body's surface outside the spheres, NaN if unknown; held: locked fingers and their values.
+    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; left_out: links of the
+    sphere file that the URDF lacks; bare_links: URDF links with a body but no sphere; coverage: None if not measured
+    (coverage_unknown says why); sphere_deficit (S,) [m]: how far a surface point of the sphere's rigid body may lie
+    outside all spheres, NaN if unknown; held: locked fingers and their values.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class RobotModel:
         """Build the robot of a URDF, with given spheres or the URDF's own.
 
         T_world_base (4, 4) places the root link (default: world origin). locked fixes joints at values [rad or m],
-        with their mimics. packages: folders for ``package://`` paths, before those above the URDF. Raises InputError.
+        with their mimics. packages: folders for ``package://``, before those above the URDF. Raises InputError.
         """
         file = urdf if isinstance(urdf, UrdfFile) else read_urdf(urdf)
         try:
@@ -330,8 +330,8 @@ class RobotModel:
     def self_pairs(self, posture: Float64 | None = None, touching: float = 0.0) -> Index:
         """Return pairs (P, 2) of spheres that could collide.
 
-        Excluded: pairs on one body or adjacent bodies (fixed joints merge bodies), and pairs with a gap of at most
-        `touching` [m] at `posture` (J,) (default: amid the limits). `with_self_pairs` replaces the default.
+        Excluded: pairs on one or adjacent bodies (fixed joints merge bodies), and pairs within `touching` [m] at
+        `posture` (J,) (default: `middle`). `with_self_pairs` replaces the default.
         """
         if self._chosen_pairs is not None and posture is None:
             return self._chosen_pairs

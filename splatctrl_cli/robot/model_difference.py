@@ -11,10 +11,10 @@ _POSTURES = 3
 
 
 def model_difference(one: UrdfFile, other: UrdfFile) -> str:
-    """Return how `other` differs mechanically from `one`, in words; empty if not at all.
+    """Return how `other` differs mechanically from `one`, in words; empty if not.
 
-    Compared: names and limits of movable joints, and places of common links from the first, at three postures. Meshes
-    and shapes are not, for spheres may replace them. Raises ValueError for an unbuildable URDF.
+    Compared: names and limits of movable joints, and places of common links at three postures. Meshes and shapes are
+    not, for spheres may replace them. Raises ValueError for an unbuildable URDF.
     """
     joints = [{joint.name for joint in file.joints if joint.kind in MOVABLE} for file in (one, other)]
     if joints[0] != joints[1]:
@@ -53,7 +53,6 @@ def _limits(model: pinocchio.Model, name: str) -> Float64:
 
 
 def _places(model: pinocchio.Model, links: list[str], number: int) -> list[Float64]:
-    """Link poses (4, 4) from the first, with joint angles by name and number."""
     q = pinocchio.neutral(model)
     for place, name in enumerate(sorted(str(name) for name in model.names[1:])):
         joint, angle = model.joints[model.getJointId(name)], 0.3 * number * (1 + place % 3)

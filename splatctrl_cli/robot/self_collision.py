@@ -1,7 +1,4 @@
-"""Pairs of links to check for self-collision, and reasons to omit the others.
-
-An SRDF is MoveIt's semantic description.
-"""
+"""Pairs of links to check for self-collision, and reasons to omit others (SRDF: MoveIt's)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -61,10 +58,9 @@ CHUNK = 200  # postures at a time
 
 @dataclass(frozen=True, kw_only=True)
 class LinkPair:
-    """Two links with spheres, and their gap over sampled postures.
+    """Two links with spheres, and the gap between these over sampled postures.
 
-    left_out: reason, None if kept. least_gap, largest_gap [m] between their spheres (nan: not sampled); hit_share:
-    share of postures in contact.
+    left_out: reason, None if kept. least_gap, largest_gap [m] (nan: not sampled); hit_share: of postures in contact.
     """
 
     links: tuple[str, str]
@@ -99,10 +95,9 @@ def self_collision_pairs(
 ) -> SelfCollisionPairs:
     """Return pairs of spheres that may collide.
 
-    Omitted: links of one rigid body, links joined by one joint, and `disabled` (an SRDF). Without `disabled`,
-    `num_postures` uniform postures within the limits (an unlimited joint: a whole turn) decide: pairs always in
-    contact are omitted, for no posture parts them; with `drop_never` also those never nearer than NEVER_MARGIN, a
-    guess from a sample, not a proof.
+    Omitted: links of one rigid body or joined by one joint, and `disabled` (an SRDF). Without `disabled`,
+    `num_postures` uniform postures decide: pairs always in contact are omitted, for no posture parts them; with
+    `drop_never` also those never nearer than NEVER_MARGIN, a guess from a sample, not a proof.
     """
     links = tuple(dict.fromkeys(model.sphere_set.links))
     owner = np.array([links.index(link) for link in model.sphere_set.links], dtype=np.int64)
@@ -189,7 +184,6 @@ def random_postures(model: RobotModel, num_postures: int, seed: int) -> Float64:
 
 
 def _gaps(model: RobotModel, owner: Index, pairs: Index, num_postures: int, seed: int) -> Float64:
-    """Least gap (T, P) between the spheres of each pair of links."""
     postures = random_postures(model, num_postures, seed)
     radii = model.sphere_set.radii
     members = [np.flatnonzero(owner == link) for link in range(int(owner.max(initial=-1)) + 1)]

@@ -49,7 +49,7 @@ BLOCK = 3  # cells along an edge
 def choose_moments(surface: RobotSurface, T_world_link: Float64, most: int = MOST_SETS) -> list[int]:
     """Return up to `most` of M moments, in order, with the links farthest apart.
 
-    Farthest-point sampling by link places and the way in between. T_world_link: (M, L, 4, 4).
+    Farthest-point sampling by places and ways in between. T_world_link: (M, L, 4, 4).
     """
     corners = _boxes(surface)[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
     placed = _moved(T_world_link, corners).reshape(len(T_world_link), -1, 3)
@@ -77,10 +77,10 @@ def learn(
     """Return the self-model that V frames show, in order of time.
 
     T_world_link (V, L, 4, 4): the surface's links; links: all of the robot's. reach [m]: search distance outside a
-    link's visual surface, grown to `MOST_REACH` with parts that extend as far. A cell of a link's grid is robot in a
-    run of configurations under four conditions. It is a surface in `NUM_CONFIGURATIONS` of them; at most `FREE_SHARE`
-    of those that see it see through it; it leaves its place in the world with the link; it moves against each nearer
-    link. Raises InputError where no link can be learned.
+    link's visual surface, grown to `MOST_REACH` with its parts. A cell of a link's grid is robot in a run of
+    configurations under four conditions. `NUM_CONFIGURATIONS` show it as a surface; at most `FREE_SHARE` of those
+    that see it see through it; it leaves its place in the world with the link; it moves against each nearer link.
+    Raises InputError where no link can be learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
@@ -115,10 +115,9 @@ def learn(
 
 @dataclass(frozen=True, kw_only=True)
 class _View:
-    """An image: depth (H, W) float32 [m] and what explains it.
+    """An image, thinned by `stride`.
 
-    links (h, w) int16: link that explains each `stride`-th pixel, `UNEXPLAINED`, or `EXPLAINED` by some link;
-    points_world (M, 3) [m]: unexplained.
+    links (h, w) int16: explaining link, `UNEXPLAINED`, or `EXPLAINED` by some; points_world (M, 3): unexplained.
     """
 
     stamp_ns: int
@@ -136,7 +135,7 @@ def _views(
 ) -> list[_View]:
     """Compare frames with the rendered robot, which explains pixels within the recording's noise.
 
-    boxes (V, L, 2, 3) [m], world: of the links; unexplained points within `reach` of them stay.
+    Unexplained points within `reach` of the boxes (V, L, 2, 3) stay.
     """
     thinned, ratios, views = [], [np.zeros(1)], []
     for frame, T in zip(frames, T_world_link, strict=True):
@@ -179,7 +178,6 @@ def _grow_link(
 def _learn_link(
     surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
 ) -> list[LearnedLink]:
-    """Learn a link's parts, per interval; empty if too few configurations see it."""
     points = [transform_points(invert_transform(v.T_world_link[number]), v.points_world) for v, _ in used]
     points = [part[_is_in(box, part, reach)] for part in points]
     at = np.array([k for _, k in used])
@@ -257,10 +255,10 @@ def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: i
 def _stays_in_world(
     cells: Float64, seen: Bool, shown: Sequence[tuple[_View, int]], poses: Float64
 ) -> tuple[Bool, Bool]:
-    """True for cells (N,) that stay in the world; and for those that move enough to tell.
+    """True for cells (N,) that stay in the world, and for cells that move enough.
 
-    A cell stays if, once the link has moved it `AWAY`, views show a surface at its old place at least as often as
-    they see through it. Near a joint's axis none moves that far.
+    A cell stays if views show a surface at its old place, `AWAY` from the new one, at least as often as they see
+    through it. Near a joint's axis none moves that far.
     """
     places, votes = _moved(poses, cells), np.zeros(len(cells), np.int64)
     for view, k in shown:
@@ -275,7 +273,6 @@ def _stays_in_world(
 
 
 def _landing(view: _View, points: Float64, numbers: Index) -> tuple[Index, Index, Index, Float64]:
-    """Points before a pixel with depth: number, pixel (v, u), distance [m] before it."""
     ahead = np.flatnonzero(points[:, 2] > TRUNCATION)
     u, v = np.floor(project(view.lens, points[ahead]) + 0.5).astype(int).T
     lands = (u >= 0) & (v >= 0) & (u < view.lens.width) & (v < view.lens.height)
@@ -300,19 +297,17 @@ def _is_on_other_link(
 
 
 def _moved(T: Float64, points: Float64) -> Float64:
-    """Points ([L,] N, 3) moved by T (K, [L,] 4, 4)."""
     return np.asarray(np.einsum("...ij,...nj->...ni", T[..., :3, :3], points) + T[..., None, :3, 3])
 
 
 def _span(values: Float64, seen: Bool) -> Float64:
-    """Box diagonals (N,) of values (K, N, D) where seen (K, N)."""
     is_seen = seen[..., None]
     span = np.where(is_seen, values, -np.inf).max(axis=0) - np.where(is_seen, values, np.inf).min(axis=0)
     return np.asarray(np.linalg.norm(span, axis=-1))
 
 
 def _candidates(points: Float64, configurations: Index) -> tuple[Float64, Bool]:
-    """First cell's centre (3,) and mask (X, Y, Z) of cells in enough configurations."""
+    """Origin and mask (X, Y, Z) of cells in enough configurations."""
     edge = BLOCK * VOXEL
     block = np.floor(points / edge).astype(np.int64)
     both = np.unique(np.column_stack([block, configurations]), axis=0)
@@ -336,7 +331,6 @@ def _without_scene(distance: Float32, stays: Bool) -> Float32:
 
 
 def _triangles(distance: Float32, origin: Float64) -> Float64:
-    """Closed surface (F, 3, 3) [m] around cells below 0, anticlockwise from outside."""
     if not (distance < 0).any():
         return np.zeros((0, 3, 3))
     vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="ascent")
@@ -344,14 +338,12 @@ def _triangles(distance: Float32, origin: Float64) -> Float64:
 
 
 def _own_distance(surface: RobotSurface, number: int, points: Float64, within: float) -> Float64:
-    """Signed distance (N,) [m] of points, link frame, to its visual surface; infinite beyond `within`."""
     others = [link for k, link in enumerate(surface.links) if k != number]
     still = np.tile(np.eye(4), (len(surface.links), 1, 1))
     return surface.distance(still, points, without=others, within=within)
 
 
 def _boxes(surface: RobotSurface) -> Float64:
-    """Corners (L, 2, 3) [m] of the links' boxes, in their frames."""
     extents = surface.extents(np.tile(np.eye(4), (len(surface.links), 1, 1)))
     return np.array([extents[link][:6] for link in surface.links]).reshape(-1, 2, 3)
 
@@ -361,7 +353,7 @@ def _is_in(box: Float64, points: Float64, reach: float) -> Bool:
 
 
 def _configurations(placed: Float64) -> Index:
-    """A link's configuration in each view (V,), -1: none; consecutive ones clearly differ."""
+    """A link's configuration by view (V,), -1: none."""
     newest, num = np.full((8, 3), np.inf), 0
     found = np.full(len(placed), -1)
     for number, corners in enumerate(placed):

@@ -1,6 +1,6 @@
 """Intervals in which cells of a link's grid are robot: always, or during a grasp.
 
-K configurations of a link in order of time, N cells.
+K configurations in order of time, N cells.
 """
 
 from collections.abc import Sequence
@@ -33,8 +33,8 @@ MOST_INTERVALS = 6  # of a link
 class Fused:
     """Depth at a link's cells in each configuration (K, N), in order of time.
 
-    total, weight float32: sum [m] and weight of distances before the measured surface, positive outside; seen: a
-    surface is there; free: a ray passes.
+    total, weight float32: sum [m] and weight of distances before the surface, positive outside; seen: a surface is
+    there; free: a ray passes.
     """
 
     total: Float32
@@ -43,7 +43,7 @@ class Fused:
     free: Bool
 
     def within(self, run: slice) -> tuple[Float64, Bool, Bool]:
-        """Return mean distance (N,) [m] or NaN, seen but not free (R, N), free (R, N), in a run."""
+        """Return mean distance (N,) [m] (NaN: none), seen and free (R, N) of a run."""
         total, weight = self.total[run].sum(axis=0), self.weight[run].sum(axis=0)
         mean = np.where(weight > 0.5, total / np.maximum(weight, 1e-9), np.nan).astype(np.float64)
         return mean, self.seen[run] & ~self.free[run], self.free[run]
@@ -51,8 +51,8 @@ class Fused:
     def is_robot(self, gap: Float64, run: slice, least: int, most_free: float) -> Bool:
         """True for cells (N,) inside a surface that is robot.
 
-        At least `least` configurations show it, a share of at most `most_free` sees through; gap (N,) [m]: from the
-        link's own surface.
+        `least` configurations show it, at most a share `most_free` sees through; gap (N,) [m]: from the link's own
+        surface.
         """
         mean, seen, free = self.within(run)
         num, num_free = seen.sum(axis=0), free.sum(axis=0)
@@ -76,7 +76,7 @@ class Interval:
 
 
 def _runs(fused: Fused) -> tuple[Index, Index]:
-    """First and last configuration (N,) of each cell's run with most votes, by one scan."""
+    """Each cell's run with most votes, by one scan."""
     num, N = fused.seen.shape
     best, sums = np.zeros(N, np.float32), np.zeros(N, np.float32)
     begun, first, last = (np.zeros(N, np.int64) for _ in range(3))
@@ -92,10 +92,9 @@ def _runs(fused: Fused) -> tuple[Index, Index]:
 def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> list[Interval]:
     """Return the whole recording, and intervals shared by the runs of enough connected cells.
 
-    A run begins after the last configuration before it that sees through the cell; without one it is unbounded. It
-    ends likewise. At a part's begin or end, some configuration sees through `GONE` of it: edges of static objects are
-    free in a few views, too. mask (X, Y, Z): of the cells; gap (N,) [m] from the link's own surface; stamps (K,)
-    [ns].
+    A run is bounded by the configurations before and after it that see through the cell, if any. At a part's begin or
+    end, some configuration sees through `GONE` of it: edges of static objects are free in a few views, too. mask (X,
+    Y, Z): of the cells; gap (N,) [m] from the link's own surface; stamps (K,) [ns].
     """
     num, rows = len(stamps), np.arange(len(stamps))[:, None]
     first, last = _runs(fused)
@@ -141,8 +140,8 @@ def _interval(before: int, first: int, last: int, after: int, stamps: Stamps) ->
 def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:
     """Return the interval (N,) in which each cell is robot, -1 for none.
 
-    Most votes of robot cells around it decide. In the first, the whole recording, cells next to robot also count with
-    fewer configurations: some rays pass structures as thin as a pixel.
+    Votes of robot cells around it decide. In the whole recording, the first, cells next to robot need fewer
+    configurations: some rays pass structures as thin as a pixel.
     """
     runs = [slice(interval.first, interval.last + 1) for interval in intervals]
     is_robot = np.array([fused.is_robot(gap, run, NUM_CONFIGURATIONS, FREE_SHARE) for run in runs])

@@ -1,8 +1,7 @@
 """Distances between a robot's link surfaces, and the margins that their spheres can keep.
 
 Spheres decide where far enough apart, else triangles, exactly (coal). A pair keeps less than the configured margin
-where no controller could keep it: its spheres protrude too far, or its links are too near. T postures, J joints, S
-spheres, K pairs.
+where no controller could keep it. T postures, J joints, S spheres, K pairs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -55,10 +54,7 @@ class LinkSurface:
         self._depths: list[Depth] = []
 
     def depth(self, points: Float64) -> float:
-        """Return the largest depth [m] of points, link frame; 0 outside.
-
-        Points (Q, 3). Open surfaces have no depth.
-        """
+        """Return the largest depth [m] of points (Q, 3); 0 outside or in open surfaces."""
         is_near = np.zeros(len(points), dtype=np.bool_)
         for lower, upper in self._boxes:
             is_near |= np.all((points >= lower) & (points <= upper), axis=1)
@@ -71,7 +67,7 @@ class LinkSurface:
 def depth_in(solid: Solid) -> Depth:
     """Return a function for depths (Q,) [m] in a closed solid, negative outside.
 
-    In a convex solid: the least depth below the face planes, which is the surface distance in a tenth of the time.
+    In a convex one the least depth below the face planes is the surface distance, in a tenth of the time.
     """
     corners = solid.surface.corners
     normals = face_normals(corners)
@@ -87,8 +83,8 @@ def depth_in(solid: Solid) -> Depth:
 def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
     """Return the gap [m] of two surfaces, b at T_a_b; negative where they overlap.
 
-    Exact between triangles; for round shapes a lower bound, by their triangles' error. A link inside the other
-    overlaps it, although the surfaces do not meet. The depth is the deepest vertex's, at least LEAST_OVERLAP.
+    Exact between triangles, a lower bound for round shapes. A link inside the other overlaps it, although the
+    surfaces do not meet. The depth is the deepest vertex's, at least LEAST_OVERLAP.
     """
     here, there = coal.Transform3s(), coal.Transform3s(T_a_b[:3, :3], T_a_b[:3, 3])
     request, result = coal.DistanceRequest(), coal.DistanceResult()
@@ -103,8 +99,8 @@ def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
 class SelfSurfaces:
     """Pairs of links that may collide, judged by surfaces; without surfaces, by spheres.
 
-    pairs: links on bodies neither identical nor joined by a joint, not named by an SRDF, and apart in some posture;
-    fused: never apart. names (K + P): of these and of P pairs of spheres on bodies without collision geometry.
+    pairs: links neither on one body nor joined by a joint, not named by an SRDF, and apart in some posture; fused:
+    never apart. names (K + P): of these and of P pairs of spheres on bodies without collision geometry.
     """
 
     def __init__(
@@ -204,10 +200,10 @@ class _SphereBodies:
 class KeptMargin:
     """Two links whose spheres keep `margin` [m] instead of the configured one.
 
-    margin: below 0 the spheres may overlap by that; None: they cannot be separated, and it stays configured. apart:
-    least gap [m] of their surfaces (of their spheres if unknown) that is not *near*, see `kept_margins`. is_fixture:
-    one stands still and carries none, such as a table of the URDF. surface_gap: least gap [m] of their surfaces in
-    the sampled postures whose spheres keep the margin, negative where they overlap; None without known surfaces.
+    margin: negative if the spheres may overlap; None: they cannot be separated, and it stays configured. apart: least
+    gap [m] of their surfaces (of their spheres if unknown) that is not *near* (`kept_margins`). is_fixture: one
+    stands still and carries none, such as a table of the URDF. surface_gap: least gap [m] of their surfaces in
+    sampled postures that keep the margin, negative where they overlap; None if unknown.
     """
 
     links: tuple[str, str]
@@ -233,11 +229,11 @@ def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) ->
 def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None) -> tuple[KeptMargin, ...]:
     """Return pairs whose spheres often break `margin` [m], with the margin they keep.
 
-    Often: in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* where the surfaces are nearer than the
+    Often: in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* where the surfaces are within the
     margin or half their largest gap, whichever is less. The pair keeps the largest sphere gap of the near postures if
-    most others keep more: its row then keeps the arm out of every sampled near posture. If the spheres are too
-    coarse, or the surfaces unknown, it keeps what nearly all other postures keep. Without surfaces this is at least
-    0, for sphere contact is then the only visible contact.
+    most others keep more: its row then keeps the arm out of all sampled near postures. With too coarse spheres or
+    unknown surfaces, it keeps what nearly all other postures keep; in the latter case at least 0, for sphere contact
+    is then the only visible contact.
     """
     names = model.sphere_set.links
     owners = [(names[a], names[b]) for a, b in model.self_pairs()]
@@ -281,7 +277,6 @@ def sphere_gaps(model: RobotModel, links: tuple[str, str], postures: Float64) ->
 
 
 def _kept(links: tuple[str, str], gap: Float64, margin: float, surface: Float64 | None) -> KeptMargin:
-    """The margin of a pair with these gaps (T,) of spheres and surfaces."""
     apart = min(margin, SELF_SHARE * float((gap if surface is None else surface).max()))
     if surface is None:
         least = min(margin, float(np.quantile(gap, SELF_KEPT)))

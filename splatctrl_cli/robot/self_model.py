@@ -24,9 +24,9 @@ class LearnedLink:
 
     Its parts last from start_ns to end_ns [ns], `ALWAYS` if unbounded. origin (3,) [m], link frame: first cell's
     centre; voxel [m]; distance (X, Y, Z) float32 [m], NaN if unknown; configurations (X, Y, Z) uint8 with a surface
-    in the cell; triangles (F, 3, 3) [m], link frame: closed surfaces of parts beyond the visual surface. outside_95,
-    outside_most [m]: how far their cells protrude; place (3,) [m], link frame: where most; since [s] from the first
-    frame: when knowable. Without parts 0 and NaN. first_ns [ns]: of the first frame.
+    there; triangles (F, 3, 3) [m], link frame: closed surfaces of parts beyond the visual surface. outside_95,
+    outside_most [m]: their protrusion; place (3,) [m], link frame: where most; since [s] from the first frame: when
+    knowable. Without parts 0 and NaN. first_ns [ns]: first frame.
     """
 
     link: str

@@ -1,9 +1,9 @@
 """Collision spheres of a robot: files, matching to URDF links, and joints' lever arms.
 
-Files: URDFs with collision spheres, and YAML of this tool, robometrics and cuRobo. cuRobo's reading (NVlabs/curobo,
+Files are URDFs, and YAML of this tool, robometrics and cuRobo. cuRobo's reading (NVlabs/curobo,
 cuda_robot_generator.py) is kept: `collision_sphere_buffer`, a number or one per link, adds to every radius;
 `collision_spheres` may name a file; a radius not above 0 then is switched off (objects not attached yet; older
-releases turned those above -1 m into one millimetre).
+releases made those above -1 m one millimetre).
 """
 
 from collections.abc import Sequence
@@ -66,10 +66,10 @@ def with_boxes(spheres: SphereSet, boxes: Sequence[tuple[str, Box]]) -> SphereSe
 
 
 def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[SphereSet, tuple[str, ...]]:
-    """Return the spheres by the URDF's link names, and the links it lacks.
+    """Return the spheres by the URDF's link names, and the links that it lacks.
 
     Those are left out, such as a hand not mounted. If no name agrees, names are compared without their first part:
-    `panda_link1` fits `fr3_link1`. name: in errors. Raises InputError if nothing fits even so.
+    `panda_link1` fits `fr3_link1`. Raises InputError if nothing fits even so, with `name`.
     """
     names = {link: link for link in urdf.links}
     asked = spheres.links
@@ -100,9 +100,9 @@ def _without_prefix(link: str) -> str:
 def lever_arms(chain: Chain, lower: Float64, upper: Float64) -> Float64:
     """Return bounds (S, J) on a centre's travel per radian (or metre) within the limits.
 
-    From the sphere towards the base: about its own joint it keeps to a circle, inside a ball about the circle's
-    middle on the axis. Carried by the next joint, the ball's middle keeps to a circle in turn; the ball around that
-    is larger by the middle's distance from that axis. 0 where the joint does not move the sphere.
+    About its own joint the centre keeps to a circle, inside a ball about the circle's middle on the axis. Towards the
+    base, each joint carries that middle on a circle in turn; the ball grows by its distance from that axis. 0 where
+    the joint does not move the sphere.
     """
     levers = np.zeros((len(chain.sphere_body), len(chain.parent) - 1))
     for s, (start, offset) in enumerate(zip(chain.sphere_body, chain.offset, strict=True)):
@@ -144,8 +144,8 @@ def read_spheres(path: Path) -> SphereSet:
 def read_sphere_file(path: Path) -> SphereFile:
     """Read the spheres of a YAML file or a URDF.
 
-    `collision_spheres` at the top or under robot_cfg.kinematics, by link or in Lula's list of links, or the groups of
-    an XRDF. Raises InputError for a missing file, another layout, a non-finite number, or no sphere.
+    `collision_spheres` at the top or under robot_cfg.kinematics, by link or as Lula's list, or an XRDF's groups.
+    Raises InputError for a missing file, another layout, a non-finite number, or no sphere.
     """
     if path.suffix.lower() in URDF_SUFFIXES:
         return SphereFile(path=path, layout="URDF", spheres=spheres_of(read_urdf(path)), num_off=0)
@@ -214,7 +214,6 @@ def _section(tree: Any) -> dict[Any, Any]:
 
 
 def _joined(path: Path, entries: list[dict[Any, Any]]) -> dict[Any, Any]:
-    """Merge a list of {link: spheres}."""
     table: dict[Any, Any] = {}
     for entry in entries:
         for link, spheres in entry.items():

@@ -1,15 +1,15 @@
 """Spheres that cover a robot's collision surface and protrude as little as their number allows.
 
 A ball at c that may protrude by t has the radius t - d(c), d the signed distance to the body (negative inside). The
-surface is cut into small triangles ("patches"); a ball holds a patch if it holds its three corners. So covering patch
-p from centre c takes the protrusion
+surface is cut into small triangles ("patches"); a ball holds a patch if it holds its corners. Covering patch p from
+centre c takes the protrusion
 
     K[c, p] = max_k |v_pk - c| + d(c),
 
-and the best n spheres of a link are a k-centre problem: the n centres that minimise the largest over p of the least K
-over centres. Greedy set cover at a bisected t gives the centres; alternating assignment (each patch to the ball that
-needs the least) and recentring lower t; then balls shrink to their patches. Each patch ends up inside one ball:
-covered by construction, and measured afterwards by `coverage`, independently of patches.
+and the best n spheres are a k-centre problem: minimise the largest over p of the least K over centres. Greedy set
+cover at a bisected t gives the centres; alternating assignment and recentring lower t; then balls shrink to their
+patches. Each patch ends up inside one ball: covered by construction, and measured afterwards by `coverage`,
+independently of patches.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,9 +31,8 @@ DIGITS = 6  # of a written sphere: micrometres
 class FitOptions:
     """Requirements on the spheres.
 
-    max_spheres: over all links; or max_protrusion [m], with as few spheres as found. max_deficit [m]: allowed
-    distance of surface points outside. restarts: greedy covers per link and protrusion; num_patches, num_candidates:
-    approximate patches and lattice points per link.
+    max_spheres: over all links; or max_protrusion [m], with few spheres. max_deficit [m]: of surface points outside.
+    restarts: greedy covers per link and protrusion; num_patches, num_candidates: about so many per link.
     """
 
     max_spheres: int | None = None
@@ -46,7 +45,7 @@ class FitOptions:
 
 
 def fit_spheres(solids: Mapping[str, Sequence[Solid]], options: FitOptions) -> SphereSet:
-    """Fit spheres to each link's solids, rounded outward to micrometres; deterministic by options and seed.
+    """Fit spheres to each link's solids, rounded outward to micrometres; deterministic by seed.
 
     Raises UsageError for contradictory options or fewer spheres than links; InputError for a link without surface
     area.
@@ -80,10 +79,7 @@ def _check(options: FitOptions, num_links: int) -> None:
 
 
 def _shared_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Float64]]:
-    """Centres and radii by link, `budget` in all, with a small largest protrusion.
-
-    One t for all links uses most of them; the rest go singly to the most protruding link.
-    """
+    """Distribute `budget` spheres: one t for all links, then singly to the most protruding."""
     low, high = 0.0, max(link.single for link in links)
     chosen = [np.array([link.middle]) for link in links]
     for _ in range(FIT_BISECTIONS):
@@ -103,7 +99,6 @@ def _shared_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Fl
 
 
 def _covers(links: Sequence["_Link"], t: float, budget: int) -> list[Index] | None:
-    """A cover of each link at protrusion t; None beyond `budget` spheres."""
     covers: list[Index] = []
     for index, link in enumerate(links):
         left = budget - sum(len(cover) for cover in covers) - (len(links) - index - 1)
@@ -141,9 +136,9 @@ class _Link:
         self.single = float(alone[self.middle])
 
     def cover(self, t: float, *, at_most: int) -> Index | None:
-        """Candidates (n,) whose balls of protrusion t hold every patch, few by greedy passes.
+        """Candidates (n,) whose balls of protrusion t hold every patch, by greedy passes.
 
-        None for more than `at_most`, or t below a single patch's need.
+        None beyond `at_most`, or if t is too small for a patch.
         """
         holds = self._cost <= t
         if not holds.any(axis=0).all():
@@ -233,21 +228,16 @@ class _Link:
         return centers, self._assigned(centers)[1]
 
     def _assigned(self, centers: Float64) -> tuple[Index, float]:
-        """Cheapest ball (P,) of each patch, and the largest such protrusion."""
         cost = self._reach(centers) + self._distance(centers)[:, None]
         owner = cost.argmin(axis=0)
         return owner.astype(np.int64), float(cost[owner, np.arange(cost.shape[1])].max())
 
     def _reach(self, centers: Float64) -> Float64:
-        """Radius (C, P) for each centre to hold each patch."""
         apart = cdist(centers, self._vertices)
         return np.asarray(apart[:, self._faces].max(axis=2) + self._slack)
 
     def _lattice(self, patches: Float64) -> tuple[Float64, float]:
-        """About `num_candidates` lattice points in the body, and their spacing [m].
-
-        A body too thin adds the patches' middles.
-        """
+        """Lattice points in the body; for a thin one also the patches' middles."""
         lower, upper = self._vertices.min(axis=0), self._vertices.max(axis=0)
         size, wanted = np.maximum(upper - lower, 1e-3), self._options.num_candidates
         spacing = float(np.cbrt(np.prod(size) / wanted))
@@ -265,10 +255,7 @@ class _Link:
 
 
 def _greedy(by_patch: Bool, rng: np.random.Generator | None, at_most: int) -> list[int] | None:
-    """Pick candidates for the most pending patches each; by_patch (P, C): who holds which.
-
-    With `rng`, one of the nearly best. None beyond `at_most`.
-    """
+    """Pick candidates for the most pending patches each; with `rng`, one of the best."""
     pending = np.ones(len(by_patch), dtype=np.bool_)
     gain = by_patch.sum(axis=0, dtype=np.int32)
     picked: list[int] = []

@@ -35,11 +35,11 @@ KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": BALL, "capsule": CAPSULE}
 class RobotSurface:
     """Solids (P) and triangles (F), each fixed to one of `links` (L) [m].
 
-    kinds (P,) as in `kernels.surface_image`; sizes (P, 3): half edges; radius and half length; radius; T_link_solid
-    (P, 4, 4); solid_links (P,); triangles (F, 3, 3) in the frame of triangle_links (F,); mesh: all of them, to draw;
-    trees: by link number, to measure. by_spheres: links that collision spheres replace, because their geometry is
-    missing or unreadable. notes: links whose visual geometry is replaced, and why. fixed: links that no joint moves.
-    num_carried: number of last `links`, repeated once per carried box.
+    kinds (P,) as in `kernels.surface_image`; sizes (P, 3) (half edges; radius and half length; or radius);
+    T_link_solid (P, 4, 4); triangles (F, 3, 3) in the frame of triangle_links (F,), as a `mesh` to draw and `trees`
+    by link number to measure. by_spheres: links whose geometry is missing or unreadable. notes: replaced visual
+    geometry, and why. fixed: links that no joint moves. num_carried: number of last `links`, repeated once per
+    carried box.
     """
 
     links: tuple[str, ...]
@@ -226,11 +226,11 @@ class RobotSurface:
         outside: Bool | None = None,
         num_threads: int = 1,
     ) -> Float64:
-        """Return signed distances (Q,) [m] of points (Q, 3) to the surface, negative inside.
+        """Return signed distances (Q,) [m] of points (Q, 3), negative inside.
 
         Infinite to triangles beyond `within` (Q,) [m]. With `enough` (Q,) [m] of at least 0, any distance on the same
         side of both bounds, which is faster. Links `without` do not count. Points `outside` (Q,) of all triangles
-        skip the inside test, which takes longest.
+        skip the slow inside test.
         """
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
         counts = np.array([link not in without for link in self.links], bool)
@@ -246,7 +246,7 @@ class RobotSurface:
     def distance_to(self, link: str, points: Float64, outside: Bool | None = None) -> Float64:
         """Return signed distances (Q,) [m] of points (Q, 3), link frame, to one link.
 
-        Its triangles, solids and carried boxes count. outside (Q,): known to be so.
+        Carried boxes count. outside (Q,): known to be so.
         """
         still = np.tile(np.eye(4), (len(self.links), 1, 1))
         return self.distance(still, points, without=[name for name in self.links if name != link], outside=outside)
@@ -254,9 +254,9 @@ class RobotSurface:
     def gaps(
         self, link: str, T_world_link: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
     ) -> Float64:
-        """Return one link's signed gap (T,) [m] to the nearest ball; infinite without balls.
+        """Return a link's signed gap (T,) [m] to the nearest ball; infinite without balls.
 
-        Its triangles, solids and carried boxes count. Balls (N, 3), (N,) [m]; T_world_link (T, 4, 4).
+        Carried boxes count. Balls (N, 3), (N,) [m]; T_world_link (T, 4, 4).
         """
         numbers = [number for number, name in enumerate(self.links) if name == link]
         to_link = np.asarray(np.linalg.inv(T_world_link), np.float64)
@@ -269,12 +269,10 @@ class RobotSurface:
         return np.asarray(np.min(found, axis=0))
 
     def _solids(self, T_solid: NDArray[np.floating]) -> Float64:
-        """`SurfaceScene` rows (P, 16); T_solid (P, 4, 4) maps into each solid's frame."""
         return np.column_stack([self.kinds, T_solid[:, :3, :3].reshape(-1, 9), T_solid[:, :3, 3], self.sizes])
 
 
 def _half_extents(kinds: Float64, sizes: Float64, R: Float64) -> Float64:
-    """Half edges (P, 3) [m] of axis-aligned boxes about turned solids."""
     radius, length = sizes[:, :1], np.abs(R[:, :, 2]) * sizes[:, 1:2]
     is_flat = np.isin(kinds, [CYLINDER])[:, None]
     across = radius * np.where(is_flat, np.sqrt(np.maximum(1 - np.square(R[:, :, 2]), 0.0)), 1.0)
@@ -290,7 +288,6 @@ def _areas(kinds: Float64, sizes: Float64) -> Float64:
 
 
 def _read(urdf: UrdfFile, folders: Sequence[Path]) -> tuple[list[tuple[str, Float64]], dict[str, str]]:
-    """Meshes' links and triangles (F, 3, 3), link frame; and why links are unreadable."""
     pieces, unread = [], {link: f"{urdf.path}: <{tag}> cannot be read" for link, tag in urdf.other_shapes}
     for mesh in urdf.meshes:
         try:
@@ -303,7 +300,6 @@ def _read(urdf: UrdfFile, folders: Sequence[Path]) -> tuple[list[tuple[str, Floa
 
 
 def _notes(by_spheres: Sequence[str], solid: Collection[str], unread: Mapping[str, str]) -> tuple[str, ...]:
-    """Sentences: what replaces links' visual geometry, and the first link's reason."""
     groups: dict[tuple[str, bool], list[str]] = {}
     for link in dict.fromkeys([*by_spheres, *unread]):
         rest = "collision geometry stands" if link in solid else "nothing stands"

@@ -18,7 +18,7 @@ LIMITED = ("revolute", "prismatic")
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """A primitive of one link: `box` (full x, y, z), `cylinder` (radius, length along z), `sphere` (radius).
+    """A link's primitive: `box` (full x, y, z), `cylinder` (radius, length along z), `sphere` (radius).
 
     size [m]; T_link_shape (4, 4) from the shape's frame, at its middle.
     """
@@ -55,8 +55,8 @@ class Joint:
 class UrdfFile:
     """Checked text of a URDF, with links, joints and collision shapes.
 
-    A capsule becomes a cylinder and two spheres. other_shapes: (link, tag) of other collision elements; solid_links:
-    with a collision or visual element.
+    A capsule becomes a cylinder and two spheres. other_shapes: (link, tag); solid_links: with a collision or visual
+    element.
     """
 
     path: Path
@@ -90,10 +90,10 @@ class UrdfFile:
         return tuple(link for link in self.links if link in named)
 
     def rigid_bodies(self, movable: Collection[str] | None = None) -> dict[str, tuple[str, Float64]]:
-        """Return each link's body leader, and T_leader_link (4, 4).
+        """Return the leader of each link's rigid body, and T_leader_link (4, 4).
 
-        Fixed joints merge links into a body, led by the link nearest to the root. movable: joints that move (default:
-        all not fixed), none of the others locked elsewhere than at 0.
+        Fixed joints merge links; the one nearest to the root leads. movable: joints that move (default: all not
+        fixed); the others are at 0.
         """
         still = {
             joint.child: joint
@@ -133,7 +133,7 @@ class UrdfFile:
     def fingers(self, moved: Collection[str]) -> tuple[str, ...]:
         """Return `grippers` that stand still while the `moved` joints move.
 
-        They are on the moved arm; neither moved, nor before a moved joint, nor in step with one.
+        They are on the moved arm, but neither before a moved joint nor in step with one.
         """
         by_name = {joint.name: joint for joint in self.joints}
         busy = set(moved).union(*(self._before(by_name[name]) for name in moved if name in by_name))
@@ -163,8 +163,8 @@ class UrdfFile:
 def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
     """Read and check the URDF at `path`, or its `text`.
 
-    Raises InputError for a missing file, no URDF, several roots, a joint without needed limits or with a zero axis,
-    or no movable joint (such as an unexpanded xacro).
+    Raises InputError for a missing file, no URDF, several roots, missing limits, a zero axis, or no movable joint
+    (such as an unexpanded xacro).
     """
     text, root = _parse(path, _read(path) if text is None else text)
     links = tuple(_attribute(path, element, "name") for element in root.findall("link"))
@@ -323,7 +323,6 @@ def _shapes(path: Path, link: str, collision: Any) -> Sequence[Shape | MeshShape
 
 
 def _capsule(link: str, size: tuple[float, ...], T_link_shape: Float64) -> list[Shape]:
-    """A cylinder without caps, and a sphere at either end."""
     radius, length = size
     parts = [Shape(link=link, kind="cylinder", size=size, T_link_shape=T_link_shape)]
     for z in (-0.5 * length, 0.5 * length):
