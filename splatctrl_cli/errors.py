@@ -52,7 +52,7 @@ class WriteError(SplatCtrlError):
 
 
 class DeviceFault(SplatCtrlError):  # noqa: N818  (the run can go on elsewhere)
-    """A card failed or was lost during computation (exit code 70); written results can resume."""
+    """A card failed or was lost during computation (exit code 70); the run can resume."""
 
 
 class DeviceFull(DeviceFault):

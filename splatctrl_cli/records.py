@@ -287,7 +287,10 @@ class DistanceField(Protocol):
     """Signed distance to the scene, positive outside."""
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """Return distance (Q,) [m] at points (Q, 3), and its own gradient (Q, 3), not normalised."""
+        """Return distance (Q,) [m] at points (Q, 3), and its own gradient (Q, 3).
+
+        The gradient is not normalised.
+        """
         ...
 
 

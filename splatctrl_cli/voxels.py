@@ -101,7 +101,7 @@ class OccupancyGrid:
 class Balls:
     """Equal balls for voxels: centers (K, 3) float32 [m], world; labels (K,) uint8 (`Label`).
 
-    radius [m]: half a voxel's diagonal, so that a ball contains its voxel.
+    radius [m]: half a voxel's diagonal, to contain the voxel.
     """
 
     centers: Float32

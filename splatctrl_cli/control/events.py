@@ -158,7 +158,7 @@ Near = Callable[[EventKind, str, int], Obstacle | None]
 
 @dataclass(kw_only=True)
 class _Run:
-    """An unfinished interval; state: index of the worst over all blocks."""
+    """An unfinished interval; state: worst index over all blocks."""
 
     order: int
     kind: EventKind

@@ -45,10 +45,10 @@ class Account:
 
     shares (C,): of points within the margin, by `EvidenceClass`. assumed: share not free, of points whose voxels
     reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places (C, 3).
-    unseen_to_surface [m]: least distance of a never-seen point to the map's surfaces, at unseen_place.
+    unseen_to_surface [m]: least distance of a never-seen point to the map's surfaces, at unseen_place;
     blind_to_surface [m]: likewise, about spheres with almost only such points (`NEAR_BLIND`). Infinite and NaN
-    without any. age [s]: of `NEAR_FRESH_SHARE` of the seen points, at most; ahead [s]: of the last view after the
-    state. NaN without views.
+    without any. age [s]: bound for `NEAR_FRESH_SHARE` of the seen points; ahead [s]: last view after the state. NaN
+    without views.
     """
 
     shares: Float64

@@ -55,7 +55,10 @@ class QpSolution:
 
 
 class QpSolver(Protocol):
-    """Solver of a QuadraticProgram; `is_solved` only if the solver reports exactly that."""
+    """Solver of a QuadraticProgram; a non-finite program returns unsolved.
+
+    `is_solved` only if the solver reports exactly that.
+    """
 
     def solve(self, program: QuadraticProgram) -> QpSolution: ...
 
@@ -89,7 +92,6 @@ class ClarabelSolver:
             self._settings.iterative_refinement_max_iter = 30
 
     def solve(self, program: QuadraticProgram) -> QpSolution:
-        """Solve; a non-finite program returns unsolved."""
         num_rows = len(program.h)
         if not is_finite(program):
             return unsolved(len(program.c), len(program.h), "NotFinite")
@@ -128,7 +130,6 @@ class DaqpSolver:
     }
 
     def solve(self, program: QuadraticProgram) -> QpSolution:
-        """Solve; a non-finite program returns unsolved."""
         if not is_finite(program):
             return unsolved(len(program.c), len(program.h), "NotFinite")
         z, _, flag, info = daqp.solve(
@@ -259,10 +260,10 @@ def held(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: i
 def assemble_hard(
     costs: Sequence[Cost], lowest: Float64, highest: Float64, barriers: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """Return the program over v alone; rows: upper, lower box (2 J), barriers (M).
+    """Return the program over v alone, which may be infeasible.
 
-    It may be infeasible. If no barrier's multiplier exceeds its slack cost, its solution is that of `assemble`: an L1
-    penalty above the multipliers is exact.
+    Rows: upper, lower box (2 J), barriers (M). If no barrier's multiplier exceeds its slack cost, its solution is
+    that of `assemble`: an L1 penalty above the multipliers is exact.
     """
     H, c = summed(costs)
     G, h = box_rows(lowest, highest)
@@ -275,9 +276,10 @@ def assemble_hard(
 def assemble(
     costs: Sequence[Cost], lowest: Float64, highest: Float64, barriers: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """Return the program over ``z = (v, s)``; rows: box (2 J), barriers (M), slack signs (M).
+    """Return the program over ``z = (v, s)``, always feasible.
 
-    The upper box comes first. Always feasible: the box is not empty and every barrier row has its own slack.
+    Rows: upper, lower box (2 J), barriers (M), slack signs (M). The box is not empty and every barrier row has its
+    own slack.
     """
     J, M = len(lowest), sum(len(barrier) for barrier in barriers)
     H, c = np.zeros((J + M, J + M)), np.zeros(J + M)

@@ -135,9 +135,9 @@ PRINTED = "printed"
 def assemble_printed(
     state: State, weights: tuple[Float64, Float64], posture: Cost, external: Barrier, firm: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """Return the program over ``z = (v, x, e)``; rows: box (2 J), external (M), firm.
+    """Return the program of III-E as printed, over ``z = (v, x, e)``.
 
-    The upper box comes first. As printed: an external row is ``grad d v >= -(d - epsilon) + e``; rows of
+    Rows: upper, lower box (2 J), external (M), firm. An external row is ``grad d v >= -(d - epsilon) + e``; rows of
     self-collision and further terms have no slack. weights: diagonals (6,) of Q and R; posture: "home pose bias" of
     III-E, without which seven joints on six dimensions are undetermined.
     """

@@ -50,9 +50,9 @@ class Waypoint:
 class ReplayTask:
     """Start (J,) [rad] at a stamp [ns] and goal pose (4, 4) of a frame.
 
-    home (J,) [rad]: attracts free motion (None: `middle`). via: earlier goals, in order. follow: the goal is each
-    time's logged pose, until the log ends. twists: velocity to reach instead, until end_ns. anchors: every
-    anchor_period [s] the arm returns to the logged posture.
+    home (J,) [rad]: attracts free motion (None: `middle`). via: earlier goals. follow: the goal is each time's logged
+    pose, until the log ends. twists: velocity to reach instead, until end_ns. anchors: every anchor_period [s] the
+    arm returns to the logged posture.
     """
 
     start: Float64
@@ -139,12 +139,10 @@ class InMemory:
 
     @property
     def stamp_ns(self) -> Stamps:
-        """(T,) [ns]."""
         return np.array(self._stamps, dtype=np.int64)
 
     @property
     def position(self) -> Float64:
-        """(T, J) [rad]."""
         return np.array(self._positions)
 
     def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
@@ -275,7 +273,6 @@ class _Course:
         return True
 
     def anchor(self, stamp_ns: int) -> tuple[Float64, Float64]:
-        """Return the logged posture and velocity."""
         assert self._task.anchors is not None
         return self._task.anchors.at(stamp_ns)
 
@@ -299,7 +296,6 @@ class _Course:
         return False
 
     def goal(self, stamp_ns: int, q: Float64) -> tuple[Float64, Guide | None]:
-        """Return the goal's pose and motion."""
         task = self._task
         if self._detour is not None:
             return self._detour.goal(self._model, task.frame)

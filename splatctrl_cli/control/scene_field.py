@@ -26,7 +26,8 @@ SceneStepAt = Callable[[int], SceneStep | None]
 def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> float | Float64:
     """Return dd/dt (Q,) [m/s] at fixed points (Q, 3) [m], from older to newer scene.
 
-    Clipped to [-limit, 0], so a row is only ever tightened; missing distances give 0.
+    Clipped to [-limit, 0], so a row is only ever tightened; missing distances give 0. The past rate holds until the
+    next scene.
     """
     if step is None:
         return 0.0

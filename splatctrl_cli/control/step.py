@@ -57,8 +57,8 @@ class ControlStep:
     velocity (J,) [rad/s], already scaled by `scale` (1 unless the next distance broke a row's promise); pose_error
     (6,) [m, rad]; clearance [m] of the nearest moving sphere by the controller's own field; self_clearance [m] (inf
     without pairs); violated_fixed: violated rows that no joint velocity changes, fixed_distance [m]: their least (inf
-    without any); num_rows: in the QP; residual: worst KKT residual of the last solution; num_refused: solutions that
-    failed the check; by_surface: spheres that now count by their link's surface.
+    without any); num_rows: in the QP; residual: worst KKT residual of the last solution; num_refused: failed
+    solutions; by_surface: spheres that now count by their link's surface.
     """
 
     velocity: Float64

@@ -31,7 +31,7 @@ class State:
 
     q (J,) [rad]; box: allowed velocities (J,), (J,) [rad/s]; reference (6,) [m/s, rad/s]: for `frame` to reach;
     guide: the goal's motion (None: at rest); last_velocity (J,) [rad/s] (None: unknown); distance_rate: dd/dt [m/s]
-    of the moving spheres' distances, (M,) or one number; by_surface (M,): spheres that count by their link's surface.
+    of the moving spheres, (M,) or one number; by_surface (M,): spheres that count by their link's surface.
     """
 
     model: ArmModel
@@ -65,7 +65,10 @@ class CostTerm(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class ReachGoal:
-    """First terms of III-E, ``(u - J v)' W (u - J v)``: reference u, weight (6,) diagonal of W."""
+    """First two terms of III-E, ``(u - J v)' W (u - J v)``: u the reference.
+
+    weight (6,): diagonal of W.
+    """
 
     weight: Float64
 
@@ -121,7 +124,7 @@ def configured_weights(config: ControlConfig) -> tuple[Float64, Float64]:
 
 
 def eliminated_weight(weight_task: Float64, weight_kinematics: Float64) -> Float64:
-    """Return the weight (6,) of III-E without end-effector velocity and slack.
+    """Return III-E's weight (6,) after elimination of end-effector velocity and slack.
 
     ``min over d of (e - d)' Q (e - d) + d' R d`` is ``e' W e`` with ``W = (Q^-1 + R^-1)^-1``; Q, R diagonal (6,).
     """
@@ -129,9 +132,9 @@ def eliminated_weight(weight_task: Float64, weight_kinematics: Float64) -> Float
 
 
 def reach_cost(jacobian: Float64, velocity: Float64, weight: Float64) -> Cost:
-    """Return the cost ``(u - J v)' W (u - J v)`` of missing the end-effector velocity u.
+    """Return the cost ``(u - J v)' W (u - J v)`` of missing velocity u.
 
-    jacobian (6, J); velocity u (6,) [m/s, rad/s], world; weight (6,): diagonal of W.
+    jacobian (6, J); u (6,) [m/s, rad/s], world; weight (6,): diagonal of W.
     """
     weighted = jacobian.T * weight
     return 2.0 * weighted @ jacobian, -2.0 * weighted @ velocity

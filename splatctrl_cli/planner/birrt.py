@@ -75,11 +75,9 @@ class _Tree:
         return new
 
     def nearest(self, q: Float64) -> Index:
-        """Node (K,) nearest to each q (K, J) in joint space."""
         return np.asarray(np.argmin(self.squares[: self.size] - 2.0 * (q @ self.q[: self.size].T), axis=1))
 
     def branch(self, node: int) -> tuple[Float64, int]:
-        """Nodes (V, J) from a root to `node`, and the root's index."""
         rows = [node]
         while self.parent[rows[-1]] >= 0:
             rows.append(int(self.parent[rows[-1]]))
@@ -138,7 +136,6 @@ class _Search:
         return None
 
     def run(self) -> tuple[PlanOutcome, Float64, int]:
-        """Return outcome, path (V, J) and goal index."""
         first, second = self.trees
         model = self.clearance.model
         direct = self.free_shares(
@@ -264,7 +261,6 @@ def _over_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) 
 
 
 def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float64:
-    """Places on different edges, the most saving first."""
     places = np.sort(_places(path, random.random((num, 2))), axis=1)
     places = places[np.floor(places[:, 0]) < np.floor(places[:, 1])]
     along = _lengths(path)

@@ -24,7 +24,6 @@ class OnlyDistance:
     field: DistanceField
 
     def distance(self, points: Float64) -> Float64:
-        """Return distance (Q,) [m] at points (Q, 3) [m], world."""
         return self.field.query(points)[0]
 
 
@@ -137,7 +136,7 @@ class Clearance:
 
 
 def _apart(centers: Float64, pairs: NDArray[np.integer]) -> Float64:
-    """Distances (B, P) of pairs, by ``|a|^2 + |b|^2 - 2 a b``: good to 1e-8 m."""
+    """Distances of pairs by ``|a|^2 + |b|^2 - 2 a b``, good to 1e-8 m."""
     B, S = centers.shape[:2]
     squares = np.einsum("bsk,bsk->bs", centers, centers)
     apart = centers @ np.swapaxes(-2.0 * centers, 1, 2)

@@ -67,7 +67,7 @@ class TimedPath:
 def effector_rates(
     model: ArmModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
 ) -> Float64:
-    """Return edge shares per second (W - 1,) that keep a frame's speed limits [m/s], [rad/s].
+    """Return edge shares per second (W - 1,) within a frame's speeds [m/s], [rad/s].
 
     Sampled `FRAME_SPACING` apart; infinite where an edge does not move it.
     """
@@ -226,7 +226,7 @@ def approach_to(
 
 
 def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlConfig) -> tuple[float, float, Float64]:
-    """Margins that start and goal keep, and the goals that keep them, if any is free."""
+    """Margins that start and goal keep, and goals that keep them, if any."""
     rows = room.rows(np.vstack([start, goals])) - fixed.START_ROOM
     num = len(room.moving)
     scene, own = rows[:, :num].min(axis=1), rows[:, num:].min(axis=1, initial=np.inf)

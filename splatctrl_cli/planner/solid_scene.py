@@ -119,13 +119,11 @@ def _local(points: Float64, turn: Float64, shift: Float64) -> Float64:
 
 
 def _into(placements: Sequence[Float64]) -> tuple[Float64, Float64]:
-    """Rotation rows (3 P, 3) and shifts (3, P) from world."""
     maps = np.array([invert_transform(T) for T in placements]).reshape(-1, 4, 4)
     return np.ascontiguousarray(np.swapaxes(maps[:, :3, :3], 0, 1)).reshape(-1, 3), maps[:, :3, 3].T
 
 
 def _placed_rows(turn: Float64, shift: Float64, shape: Float64) -> Float64:
-    """(P, 15): rotation (9), shift (3) from world, shape (3)."""
     rotations = np.swapaxes(turn.reshape(3, -1, 3), 0, 1).reshape(-1, 9)
     return np.ascontiguousarray(np.column_stack([rotations, shift.T, shape.T]))
 

@@ -127,7 +127,7 @@ def coverage_of_solids(
 
 @lru_cache(maxsize=32)
 def _measured(packed: bytes) -> CoverageReport:
-    """`coverage_of_solids` of pickled arguments, which only bytes make hashable."""
+    """`coverage_of_solids` of pickled arguments, hashable as bytes."""
     bodies, solids, spheres, resolution = pickle.loads(packed)
     leaders = {link: leader for link, (leader, _) in bodies.items()}
     measured = {leaders[link] for link in solids}
@@ -280,7 +280,6 @@ def _chunks(triangles: Float64, num_spheres: int) -> Iterator[slice]:
 
 
 def _bounds(triangles: Float64, centers: Float64, radii: Float64) -> tuple[Float64, Float64]:
-    """The bound on phi (F,), and phi at the corners (F, 3)."""
     upper, at_corners = np.empty(len(triangles)), np.empty((len(triangles), 3))
     for part in _chunks(triangles, len(radii)):
         gap = (cdist(triangles[part].reshape(-1, 3), centers) - radii).reshape(-1, 3, len(radii))

@@ -106,7 +106,7 @@ class Declarations:
 
 
 def carried_words(entry: Mapping[str, Any]) -> str:
-    """Return an entry of `Declarations.carried_uses` in words, with a warning if unused."""
+    """Return an entry of `Declarations.carried_uses` in words; warn if unused."""
     used = (
         f"{entry['num_uses']} points"
         if entry["num_uses"]

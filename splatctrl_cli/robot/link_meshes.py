@@ -104,10 +104,10 @@ def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path
 
 
 class SolidDistance:
-    """A bound on the signed distance to a union of solids: the least to each.
+    """A bound on the signed distance (Q,) [m] of points (Q, 3), link frame, to solids.
 
-    Outside exact; inside no deeper than the truth, so the ball of that radius lies inside. Unsigned for an open, flat
-    surface.
+    The least to each: outside exact; inside no deeper than the truth, so the ball of that radius lies inside.
+    Unsigned for an open, flat surface.
     """
 
     def __init__(self, solids: Sequence[Solid]) -> None:
@@ -116,7 +116,6 @@ class SolidDistance:
         self._balls = [solid.ball for solid in solids if solid.ball is not None]
 
     def __call__(self, points: Float64) -> Float64:
-        """Return signed distances (Q,) [m] of points (Q, 3), link frame."""
         to_meshes = [mesh.signed(points) for mesh in self._meshes]
         to_balls = [np.linalg.norm(points - center, axis=1) - radius for center, radius in self._balls]
         return np.asarray(np.min([*to_meshes, *to_balls], axis=0))

@@ -11,7 +11,7 @@ NEXT, OPPOSITE = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 class MeshDistance:
-    """Exact float64 distance from points to a triangle mesh."""
+    """Exact distances [m] of points (Q, 3) [m] to a mesh."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
         corners, faces = mesh.corners, mesh.faces
@@ -30,7 +30,7 @@ class MeshDistance:
         np.add.at(self._of_edge, self._edge.reshape(-1), np.repeat(self._of_face, 3, axis=0))
 
     def closest(self, points: Float64) -> tuple[Float64, Float64, Bool]:
-        """Return distance (Q,) [m], nearest surface point (Q, 3) and is_inside (Q,).
+        """Return distance (Q,), nearest surface point (Q, 3) and is_inside (Q,).
 
         Inside by the angle-weighted normal of the nearest face, edge or vertex (Baerentzen, Aanaes, Signed distance
         computation using the angle weighted pseudonormal, 2005), exact for a closed mesh; all False for an open one.
@@ -43,11 +43,11 @@ class MeshDistance:
         return distance, surface, is_inside
 
     def distance(self, points: Float64, within: float = np.inf) -> Float64:
-        """Return distances (Q,) [m] of points (Q, 3), infinite beyond `within` [m]."""
+        """Return distances (Q,), infinite beyond `within`."""
         return self._tree.closest(points, within)[0]
 
     def signed(self, points: Float64) -> Float64:
-        """Return distances (Q,) [m] of points (Q, 3), negative inside a closed mesh."""
+        """Return distances (Q,), negative inside a closed mesh."""
         distance, _, is_inside = self.closest(points)
         return np.where(is_inside, -distance, distance)
 

@@ -162,7 +162,7 @@ class RobotModel:
 
     @property
     def surface(self) -> RobotSurface:
-        """The collision geometry, read on first use; spheres where none can be read."""
+        """The visual geometry or its replacements, read on first use."""
         if self._surface is None:
             self._surface = RobotSurface.of(self.urdf, self.sphere_set, self._packages)
         return self._surface

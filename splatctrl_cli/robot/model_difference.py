@@ -43,7 +43,7 @@ def model_difference(one: UrdfFile, other: UrdfFile) -> str:
 
 
 def _limits(model: pinocchio.Model, name: str) -> Float64:
-    """Lower, upper, fastest; of an endless joint its speed alone."""
+    """Lower, upper, fastest; the last alone for an endless joint."""
     joint = model.joints[model.getJointId(name)]
     speed = model.velocityLimit[joint.idx_v : joint.idx_v + 1]
     if joint.nq == 2:

@@ -76,7 +76,6 @@ class Interval:
 
 
 def _runs(fused: Fused) -> tuple[Index, Index]:
-    """Each cell's run with most votes, by one scan."""
     num, N = fused.seen.shape
     best, sums = np.zeros(N, np.float32), np.zeros(N, np.float32)
     begun, first, last = (np.zeros(N, np.int64) for _ in range(3))
@@ -92,9 +91,9 @@ def _runs(fused: Fused) -> tuple[Index, Index]:
 def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> list[Interval]:
     """Return the whole recording, and intervals shared by the runs of enough connected cells.
 
-    A run is bounded by the configurations before and after it that see through the cell, if any. At a part's begin or
-    end, some configuration sees through `GONE` of it: edges of static objects are free in a few views, too. mask (X,
-    Y, Z): of the cells; gap (N,) [m] from the link's own surface; stamps (K,) [ns].
+    Configurations that see through a cell before or after its run bound it. At a part's begin or end, some
+    configuration sees through `GONE` of it: edges of static objects are free in a few views, too. mask (X, Y, Z): of
+    the cells; gap (N,) [m] from the link's own surface; stamps (K,) [ns].
     """
     num, rows = len(stamps), np.arange(len(stamps))[:, None]
     first, last = _runs(fused)
@@ -128,7 +127,6 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
 
 
 def _interval(before: int, first: int, last: int, after: int, stamps: Stamps) -> Interval:
-    """Bounds lie midway to the neighbours before and after, if any."""
     return Interval(
         first=first,
         last=last,

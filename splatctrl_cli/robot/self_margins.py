@@ -175,7 +175,7 @@ class SelfSurfaces:
 
 
 class _SphereBodies:
-    """Spheres by rigid body, grown by what they leave uncovered of it."""
+    """Spheres by rigid body, grown by its uncovered surface."""
 
     def __init__(self, model: RobotModel, leaders: Mapping[str, str]) -> None:
         self._leaders = leaders
@@ -231,9 +231,9 @@ def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None
 
     Often: in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* where the surfaces are within the
     margin or half their largest gap, whichever is less. The pair keeps the largest sphere gap of the near postures if
-    most others keep more: its row then keeps the arm out of all sampled near postures. With too coarse spheres or
-    unknown surfaces, it keeps what nearly all other postures keep; in the latter case at least 0, for sphere contact
-    is then the only visible contact.
+    most others keep more: its row then excludes all sampled near postures. With too coarse spheres or unknown
+    surfaces, it keeps what nearly all other postures keep; in the latter case at least 0, for sphere contact is then
+    the only visible contact.
     """
     names = model.sphere_set.links
     owners = [(names[a], names[b]) for a, b in model.self_pairs()]

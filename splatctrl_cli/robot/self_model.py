@@ -25,7 +25,7 @@ class LearnedLink:
     Its parts last from start_ns to end_ns [ns], `ALWAYS` if unbounded. origin (3,) [m], link frame: first cell's
     centre; voxel [m]; distance (X, Y, Z) float32 [m], NaN if unknown; configurations (X, Y, Z) uint8 with a surface
     there; triangles (F, 3, 3) [m], link frame: closed surfaces of parts beyond the visual surface. outside_95,
-    outside_most [m]: their protrusion; place (3,) [m], link frame: where most; since [s] from the first frame: when
+    outside_most [m]: their protrusion, most at place (3,) [m], link frame; since [s] from the first frame: when
     knowable. Without parts 0 and NaN. first_ns [ns]: first frame.
     """
 
@@ -138,7 +138,7 @@ class SelfModel:
 
 
 def surface_digest(surface: RobotSurface) -> str:
-    """Return sha256 of the geometry by links, without spheres' stand-ins."""
+    """Return sha256 of the links' geometry, except links that spheres replace."""
     digest = hashlib.sha256()
     for number, link in enumerate(surface.links):
         if link not in surface.by_spheres:

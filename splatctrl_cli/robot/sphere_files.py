@@ -2,8 +2,7 @@
 
 Files are URDFs, and YAML of this tool, robometrics and cuRobo. cuRobo's reading (NVlabs/curobo,
 cuda_robot_generator.py) is kept: `collision_sphere_buffer`, a number or one per link, adds to every radius;
-`collision_spheres` may name a file; a radius not above 0 then is switched off (objects not attached yet; older
-releases made those above -1 m one millimetre).
+`collision_spheres` may name a file; a radius not above 0 then is switched off, as for objects not attached yet.
 """
 
 from collections.abc import Sequence
@@ -206,7 +205,6 @@ def _yaml(path: Path) -> Any:
 
 
 def _section(tree: Any) -> dict[Any, Any]:
-    """The mapping with `collision_spheres`: top, or under robot_cfg and kinematics."""
     for key in ("robot_cfg", "kinematics"):
         if isinstance(tree, dict) and key in tree:
             tree = tree[key]

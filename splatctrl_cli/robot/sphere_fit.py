@@ -8,8 +8,8 @@ centre c takes the protrusion
 
 and the best n spheres are a k-centre problem: minimise the largest over p of the least K over centres. Greedy set
 cover at a bisected t gives the centres; alternating assignment and recentring lower t; then balls shrink to their
-patches. Each patch ends up inside one ball: covered by construction, and measured afterwards by `coverage`,
-independently of patches.
+patches. Each patch ends up inside one ball: covered by construction. `coverage` measures it afterwards without
+patches.
 """
 
 from collections.abc import Mapping, Sequence

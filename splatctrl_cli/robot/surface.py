@@ -246,7 +246,7 @@ class RobotSurface:
     def distance_to(self, link: str, points: Float64, outside: Bool | None = None) -> Float64:
         """Return signed distances (Q,) [m] of points (Q, 3), link frame, to one link.
 
-        Carried boxes count. outside (Q,): known to be so.
+        Carried boxes count. outside (Q,): known outside.
         """
         still = np.tile(np.eye(4), (len(self.links), 1, 1))
         return self.distance(still, points, without=[name for name in self.links if name != link], outside=outside)

@@ -1,4 +1,4 @@
-"""URDF contents apart from kinematics: links, joints, collision shapes. Parsing is safe for untrusted XML."""
+"""URDF contents apart from kinematics: links, joints, shapes. Untrusted XML is safe."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
