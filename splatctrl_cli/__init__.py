@@ -1,6 +1,6 @@
 """SplatCtrl: camera recordings of robots as splats, distance fields and replayed controllers.
 
-Public names are those of `splatctrl_cli.api`, imported on first use.
+`splatctrl_cli.api` has the public names, imported on first use.
 """
 
 from importlib import import_module

@@ -1,4 +1,7 @@
-"""Rigid transforms, rotations and the pinhole camera; float64."""
+"""Rigid transforms T (4, 4), rotations (3, 3), pinhole camera; float64.
+
+Quaternions are (x, y, z, w), positions (3,) [m].
+"""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -7,7 +10,7 @@ from splatctrl_cli.records import Float64, Intrinsics
 
 
 def invert_transform(T: Float64) -> Float64:
-    """Return the inverse of a rigid transform (4, 4)."""
+    """Return the inverse of a rigid transform."""
     inverse = np.eye(4)
     inverse[:3, :3] = T[:3, :3].T
     inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
@@ -15,12 +18,12 @@ def invert_transform(T: Float64) -> Float64:
 
 
 def transform_points(T: Float64, points: NDArray[np.floating]) -> Float64:
-    """Return points (..., 3) moved by T (4, 4)."""
+    """Return points (..., 3) moved by T."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3], dtype=np.float64)
 
 
 def rotation_from_quat(quat_xyzw: ArrayLike) -> Float64:
-    """Return the rotation (3, 3) of a finite, nonzero quaternion (x, y, z, w).
+    """Return the rotation of a finite, nonzero quaternion.
 
     Scaling by a power of two first rounds nothing: squares of a tiny one would underflow.
     """
@@ -37,7 +40,7 @@ def rotation_from_quat(quat_xyzw: ArrayLike) -> Float64:
 
 
 def quat_from_rotation(R: Float64) -> Float64:
-    """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation (3, 3)."""
+    """Return a rotation's unit quaternion with w >= 0."""
     K = np.array(
         [
             [R[0, 0] - R[1, 1] - R[2, 2], 0, 0, 0],
@@ -51,7 +54,7 @@ def quat_from_rotation(R: Float64) -> Float64:
 
 
 def pose_at(position: ArrayLike, R: ArrayLike | None = None) -> Float64:
-    """Return T (4, 4) of a position (3,) [m] and rotation (3, 3) (default: none)."""
+    """Return T of a position and a rotation (default: none)."""
     T = np.eye(4)
     T[:3, 3] = position
     if R is not None:
@@ -67,13 +70,13 @@ def compare_poses(T_world_a: Float64, T_world_b: Float64) -> tuple[float, float]
 
 
 def turn_about_z(angle: float) -> Float64:
-    """Return the rotation (3, 3) by an angle [rad] about z."""
+    """Return the rotation by an angle [rad] about z."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def frame_along(axis: Float64) -> Float64:
-    """Return a rotation (3, 3) with z along `axis` (3,)."""
+    """Return a rotation with z along `axis` (3,)."""
     z = axis / np.linalg.norm(axis)
     x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -89,7 +92,7 @@ def face_normals(corners: Float64) -> Float64:
 
 
 def transform_from(position: ArrayLike, quat_xyzw: ArrayLike) -> Float64:
-    """Return T (4, 4) of a position (3,) [m] and a quaternion (x, y, z, w)."""
+    """Return T of a position and a quaternion."""
     return pose_at(position, rotation_from_quat(quat_xyzw))
 
 
@@ -108,7 +111,7 @@ def interpolate_transform(T_a: Float64, T_b: Float64, fraction: float) -> Float6
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Float64:
-    """Return T_world_camera (4, 4) (z forward, y down) at `eye`, towards `target`."""
+    """Return T_world_camera (z forward, y down) at `eye`, towards `target`."""
     eye_world = np.asarray(eye, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - eye_world
     forward /= np.linalg.norm(forward)

@@ -22,9 +22,9 @@ UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 Index = NDArray[np.int64]
 Stamps = NDArray[np.int64]  # (T,) [ns]
-Posture = Callable[[int], Float64 | None]  # joint positions (J,) at a time [ns]; None where there are none
+Posture = Callable[[int], Float64 | None]  # joint positions (J,) at a time [ns], or None
 SECOND_NS = 1_000_000_000
-MILLIMETRE, MILLIMETRES = 0.001, 1000.0  # [m] of one, and how many a metre has
+MILLIMETRE, MILLIMETRES = 0.001, 1000.0  # [m], and [1/m]
 
 
 class FloatRows(Protocol):
@@ -65,7 +65,7 @@ class Intrinsics:
 
 @dataclass(frozen=True, kw_only=True)
 class RgbdFrame:
-    """One colour image with registered depth and pose.
+    """A colour image with registered depth and pose.
 
     color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = no return; T_world_camera (4, 4)
     float64, of the optical frame (z forward); human (H, W) uint8, nonzero on people, None if not segmented; valid (H,

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from splatctrl_cli.records import Bool, Float32, Float64, UInt8
 
 MOST_VOXELS = 400_000_000  # of a grid
-FIRST_REASON = 0xF0  # of one byte; of two 0xFFF0: from here on `last_seen` says why a voxel was never seen
-SWEPT = 0b100  # entity bit of a voxel that the robot was in at some time of the log
-SOLID = 0b1000  # entity bit, where a robot is known: an object's pixel hit the voxel since it was last seen free
+FIRST_REASON = 0xF0  # in one byte (0xFFF0 in two): from here on `last_seen` is the reason of a never-seen voxel
+SWEPT = 0b100  # entity bit of a voxel that the robot occupied at some time
+SOLID = 0b1000  # entity bit, with a known robot: an object's pixel hit the voxel after its last free view
 
 
 class VoxelState(IntEnum):
@@ -37,7 +37,7 @@ class Unseen(IntEnum):
     HIDDEN_BY_THING = 0xFFF3
     NO_RETURN = 0xFFF4  # a camera has no depth there now
     CONTRADICTED = 0xFFFE  # a ray passed it, through a surface that another camera measured
-    UNANSWERED = 0xFFFF  # a ray returned nothing, though it meets a surface, or depth is all about it
+    UNANSWERED = 0xFFFF  # no return, though the ray meets a surface or depth surrounds it
 
 
 class EvidenceClass(IntEnum):
@@ -48,11 +48,11 @@ class EvidenceClass(IntEnum):
     STALE = 2  # seen too long ago
     HIDDEN_BY_ARM = 3
     HIDDEN_BY_THING = 4
-    OUT_OF_VIEW = 5  # of all cameras; or never asked, far from where the arm was
-    NO_RETURN = 6  # no depth in a pixel that shows it, which may be of the empty background
+    OUT_OF_VIEW = 5  # of all cameras; or without a reason, far from the arm
+    NO_RETURN = 6  # no depth in its pixel, which may show empty background
     CONTRADICTED = 7
-    UNANSWERED = 8  # no depth where there should be some
-    DEPTH_EDGE = 9  # a surface may go on there, where its edge was lost
+    UNANSWERED = 8  # no depth where some is expected
+    DEPTH_EDGE = 9  # a surface may extend there past its lost edge
     OUTSIDE = 10  # of the workspace
     SURFACE = 11  # within a surface of the map
 
@@ -156,9 +156,9 @@ NO_EDGES = LostEdges.joined([])
 class SeenVoxels:
     """Last view of each voxel, centred at `origin` + index times `voxel` [m].
 
-    last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last step in which a
-    camera returned depth through or on the voxel; 0: never, without a reason; the type's largest numbers: the reason
-    (`Unseen`, its lower byte in uint8). edges: of the newest images.
+    last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last step with depth
+    through or on the voxel; 0: never, without a reason; the type's largest numbers: the reason (`Unseen`, its lower
+    byte in uint8). edges: of the newest images.
     """
 
     origin: Float64

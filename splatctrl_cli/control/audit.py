@@ -74,8 +74,8 @@ def part_clearances(
 ) -> tuple[Float64, Bool]:
     """Return the moving parts' clearances (T, M) [m], and which (M,) are of link surfaces.
 
-    Where a link has triangles and the scene is of balls, its surface decides: the nearest of its spheres has the
-    surface's clearance, the others at least that, or their own less `sphere_deficit`. centers (T, S, 3): if known.
+    A link's triangles decide if the scene is of balls: its nearest sphere has their clearance. Its others have at
+    least that, or their own less `sphere_deficit`. centers (T, S, 3): if known.
     """
     moving = np.flatnonzero(model.moving_spheres)
     there = model.sphere_centers_batch(positions) if centers is None else centers

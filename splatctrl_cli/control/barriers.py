@@ -19,7 +19,7 @@ MARGIN = "margin"
 
 
 class SceneRows(BarrierTerm):
-    """One row per moving sphere against a distance field's nearest surface.
+    """A row per moving sphere against a distance field's nearest surface.
 
     Spheres in `State.by_surface` count by their link's surface where that is farther.
     """
@@ -80,8 +80,8 @@ class SceneRows(BarrierTerm):
     def cut(self, state: State, velocity: Float64, chosen: NDArray[np.integer], distance: Float64) -> Barrier:
         """Return rows of `chosen` spheres against their nearest surfaces after a period of `velocity`.
 
-        distance (M,): now. The later distance is linearised where it was met. For a surface convex from there, as a
-        ball is, the true distance is larger; now it is no nearer than the present nearest surface.
+        distance (M,): now. The later distance is linearised, which is conservative for surfaces convex from there,
+        such as balls; now it is at least the present one.
         """
         period = self._config.period
         q = state.q + period * velocity
@@ -95,7 +95,7 @@ class SceneRows(BarrierTerm):
         return self._barrier(chosen, G, h, now)
 
     def distances(self, centers: Float64) -> Float64:
-        """Return distances (M,) [m]; NaN where the field has none, which keeps no promise."""
+        """Return distances (M,) [m]; NaN, where unknown, keeps no promise."""
         return self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii
 
     def _barrier(self, index: NDArray[np.integer], G: Float64, h: Float64, distance: Float64) -> Barrier:
@@ -117,7 +117,7 @@ class SceneRows(BarrierTerm):
 
 
 class SelfRows(BarrierTerm):
-    """One row per pair of spheres that could collide."""
+    """A row per pair of spheres that could collide."""
 
     kind = RowKind.SELF
 

@@ -13,8 +13,8 @@ from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import Bool, Float64, Index, Stamps
 
-UNREPRESENTED = "unrepresented voxel"  # label of an obstacle that is occupied and has no splat
-MAX_NAMES = 12  # of an event; how many there are is in num_names
+UNREPRESENTED = "unrepresented voxel"  # label of an occupied voxel without a splat
+MAX_NAMES = 12  # listed per event; num_names counts all
 
 
 class EventKind(StrEnum):
@@ -22,24 +22,24 @@ class EventKind(StrEnum):
 
     BELOW_MARGIN = "below-margin"  # least clearance [m]
     IN_COLLISION = "in-collision"  # least clearance [m]
-    WITHOUT_DISTANCE = "without-distance"  # number of fields without one
+    WITHOUT_DISTANCE = "without-distance"  # number of fields without a distance
     UNKNOWN_SPACE = "unknown-space"  # largest share of sphere centres
     BETWEEN_STATES = "between-states"  # least bound [m] of the clearance since the state before
-    NOT_BOUNDED = "not-bounded"  # longest time [s] in which nobody knows where the arm was
+    NOT_BOUNDED = "not-bounded"  # longest time [s] without a bound on the arm's place
     SELF_COLLISION = "self-collision"  # least distance of two spheres of the arm [m]
     OUTSIDE_LIMITS = "outside-limits"  # least distance to the limit, negative [rad]
     TOO_FAST = "too-fast"  # largest velocity, as a share of its limit
     TOO_SUDDEN = "too-sudden"  # largest acceleration, as a share of its limit
     STALE_MAP = "stale-map"  # oldest scene [s]
     SCENE = "scene"  # largest multiplier of a row against the scene
-    SELF = "self"  # the same of a self-collision row
-    LIMIT = "limit"  # the same of a joint's position or velocity limit
+    SELF = "self"  # likewise, of a self-collision row
+    LIMIT = "limit"  # likewise, of a joint's position or velocity limit
     RELAXED = "relaxed"  # largest slack [m/s]
     MINIMUM_VIOLATION = "minimum-violation"  # largest residual
     HOLD = "hold"  # least barrier clearance [m]
     SCALED_BACK = "scaled-back"  # least scale
-    ROW_BROKEN = "row-broken"  # largest excess over a barrier row, of a controller that is not ours [m/s]
-    CANNOT_ACT = "cannot-act"  # least distance [m] of a violated row that has no joint to turn
+    ROW_BROKEN = "row-broken"  # largest excess over a barrier row by an external controller [m/s]
+    CANNOT_ACT = "cannot-act"  # least distance [m] of a violated row that no joint moves
 
 
 INTERVENTIONS = frozenset(
@@ -50,7 +50,7 @@ INTERVENTIONS = frozenset(
 )
 """Kinds in which the controller did something else than it was asked for."""
 
-SHOWN = {"": "", "exact": "", "true": " (truth)"}  # measures whose events people are shown, with what it is called
+SHOWN = {"": "", "exact": "", "true": " (truth)"}  # measures with shown events, and their label
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ class Event:
 
 @dataclass(frozen=True, kw_only=True)
 class OneEach:
-    """One of `names` per state, by index (T,)."""
+    """A name of `names` per state, by index (T,)."""
 
     names: Sequence[str]
     index: Index

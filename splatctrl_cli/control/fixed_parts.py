@@ -1,4 +1,4 @@
-"""Obstacles that approach fixed links; those of the first scene do not count."""
+"""Obstacles that approach fixed links; obstacles of the first scene do not count."""
 
 from collections.abc import Callable
 
@@ -16,16 +16,16 @@ WasSeen = Callable[[Float64], Bool]
 class FixedParts:
     """`found`: each fixed sphere's clearance [m] in the first scene, and least to later arrivals.
 
-    A ball has arrived if none of the first scene stood within STATIC_CHANGE of it; near a sphere at its mount, whose
-    map grows, within MOUNTED_CHANGE. It is nearer than the first clearance by as much, a camera had seen its place
-    before, and the last scene had it too: noise is in one scene alone. A link's triangles replace its spheres.
+    A ball has arrived if none of the first scene stood within STATIC_CHANGE of it; near a sphere at its mount, where
+    the map grows, within MOUNTED_CHANGE. It is nearer than the first clearance by as much, and a camera had seen its
+    place before. The last scene had it too: noise is in one scene alone. A link's triangles replace its spheres.
     """
 
     def __init__(self, model: ArmModel, near: float) -> None:
         """near [m]: spheres with less first clearance stand near their mount."""
         self._model, self._near = model, near
         self._still = np.flatnonzero(~np.asarray(model.moving_spheres))
-        self._stood = self._new = np.zeros((0, 3))  # of the first scene, and what came in the last one
+        self._stood = self._new = np.zeros((0, 3))  # of the first scene; arrivals in the last one
         names = sphere_names(model.sphere_set)
         self._names = [names[s] for s in self._still]
         self.found: dict[str, tuple[float, float]] = {}

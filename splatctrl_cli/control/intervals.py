@@ -44,7 +44,7 @@ class Between:
     """Clearance bounds lower (T - 1,) [m] of intervals, ends included.
 
     Where is_met (T - 1,), lower is a witness: the clearance of a posture in between, below the margin. is_bounded (T
-    - 1,): False if the states say too little.
+    - 1,): False if the states do not determine a bound.
     """
 
     lower: Float64
@@ -92,7 +92,7 @@ def between_states(
         away = np.where(is_met[chosen], 0.0, 0.5 * beyond[chosen].max(axis=1))
         least[chosen] = np.minimum(refined - away, ends[chosen])
     short = ~is_long & ~is_open & (ends < margin)
-    least[short] = ends[short]  # the ends are below already; how far it is below in between does not turn it
+    least[short] = ends[short]  # the ends are below the margin already
     is_bounded = np.isfinite(least) & (~is_long | (least >= margin) | (ends < margin))
     return Between(lower=least, is_met=is_met, is_bounded=is_bounded)
 
@@ -122,10 +122,10 @@ def _refined(
         at_middle = clearances(model, reach, middle, distance_to)
         at_middle[np.isposinf(first[open_]) | np.isposinf(last[open_])] = (
             np.inf
-        )  # left out at an end: on the way, too
+        )  # excluded at an end: also in between
         reached = at_middle.min(axis=1) < margin  # a sample below the margin settles its interval
         is_first = reached & ~is_met[owner[open_]]
-        least[owner[open_[is_first]]] = np.inf  # of pieces that were settled: bounds, not postures
+        least[owner[open_[is_first]]] = np.inf  # drop the bounds of settled pieces
         is_met[owner[open_[reached]]] = True
         np.minimum.at(least, owner[open_[reached]], at_middle[reached].min(axis=1))
         settled = np.isin(owner[open_], owner[open_[reached]])

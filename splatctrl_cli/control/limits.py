@@ -15,7 +15,7 @@ from splatctrl_cli.records import Float64, Index, Stamps
 Rows = tuple[Float64, Float64]
 FR3 = "fr3"
 # Highest: min(v_max, max(0, sqrt(max(0, k (q_upper - q))) - v_0)); lowest: the same of q - q_lower, negative. The
-# numbers are those of Franka's control parameters and of libfranka (include/franka/rate_limiting.h,
+# numbers come from Franka's control parameters and libfranka (include/franka/rate_limiting.h,
 # computeUpperLimitsJointVelocity and computeLowerLimitsJointVelocity), without its tolerance of 1e-3 rad/s.
 FR3_JOINTS = (  # v_max [rad/s], v_0 [rad/s], k [rad/s^2], q_lower [rad], q_upper [rad]
     (2.62, 0.30, 12.0, -2.7501, 2.7501),
@@ -132,7 +132,7 @@ class JointLimits:
 
         Without last_velocity no acceleration counts. An acceleration in conflict with velocity and position yields to
         the nearest velocity within those, so the box is never empty. From a state that this box led to it never
-        yields, unless by_position asks for more.
+        yields, unless by_position is stricter.
         """
         lowest, highest = velocity_box(
             q, self.lower, self.upper, self.velocity, self.gain, acceleration=self.acceleration, period=self.period

@@ -10,8 +10,8 @@ from contextlib import suppress
 from enum import StrEnum
 
 MAX_LINE = 1 << 20  # bytes
-LEAVE_LIMIT = 20.0  # [s] for a process to end once it has closed its stdout: a busy machine takes seconds
-TAIL = 4096  # bytes of stderr that are kept
+LEAVE_LIMIT = 20.0  # [s] from closed stdout to the process's end: a busy machine takes seconds
+TAIL = 4096  # bytes of stderr to keep
 
 
 class Fault(StrEnum):
@@ -87,7 +87,7 @@ class LineProcess:
             if stream is not None:
                 with suppress(OSError):
                     stream.close()
-        self._has_left(0.2)  # by itself, now that there is nothing to read
+        self._has_left(0.2)  # by itself, after the end of its input
         self._kill()
 
     def _has_left(self, seconds: float) -> bool:
@@ -119,7 +119,7 @@ class LineProcess:
     def _send(self) -> None:
         try:
             del self._unsent[: os.write(self._stdin, self._unsent)]
-        except BrokenPipeError:  # what it says last, or how it ended, is still to come
+        except BrokenPipeError:  # its last words or its exit status are still to come
             self._unsent.clear()
         if not self._unsent:
             self._selector.unregister(self._stdin)

@@ -76,7 +76,7 @@ class NearSpace:
         self._surfaces = model.link_distances
         self._grids = dict[str, tuple[Float64, Float64]]()  # by link, as `_grid_of`
         self._next_ns = -(2**63)
-        self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres when they were last looked about
+        self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres at the last evaluation
 
     def due(self, stamps: NDArray[np.int64], centers: Float64) -> dict[int, bool]:
         """Return indices of states to evaluate; True if their ages count.
@@ -111,7 +111,7 @@ class NearSpace:
         centers, step = self._model.sphere_centers(q), _step_of(known.voxel)
         points = self._lattice(known.origin, step, centers)
         gaps, spheres = self._gaps(q, centers, points, self._margin + step / 2)
-        is_near = (gaps > 0) & (gaps <= self._margin + step / 2)  # the voxel of a point that far reaches into it
+        is_near = (gaps > 0) & (gaps <= self._margin + step / 2)  # the voxel of such a point reaches into the margin
         points, gaps, spheres = points[is_near], gaps[is_near], spheres[is_near]
         seen_ns, classes = known.look(points)
         ages, is_seen = (stamp_ns - seen_ns) * 1e-9, seen_ns >= 0

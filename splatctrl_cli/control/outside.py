@@ -24,11 +24,11 @@ from splatctrl_cli.control.user_controller import PROTOCOL
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64
 
-STEP_LIMIT = 10.0  # [s] for one answer: of a machine that has other things to do, too
-PATIENCE = 3.0  # times that limit, after which an answer is not waited for any more
-START_LIMIT = 120.0  # [s] for the first answer: a program may load much
+STEP_LIMIT = 10.0  # [s] for one answer, also on a busy machine
+PATIENCE = 3.0  # times that limit, after which waiting ends
+START_LIMIT = 120.0  # [s] for the first answer: loading may take long
 RUN_LIMIT = 3600.0  # [s] for all answers together
-MAX_SPEED = 10.0  # times a joint's velocity limit; faster is no command
+MAX_SPEED = 10.0  # times a joint's velocity limit; a faster command is a fault
 SERVE = "import sys; from splatctrl_cli.control.user_controller import serve; serve(sys.argv[1])"
 
 Document = dict[str, Any]

@@ -176,7 +176,7 @@ class Rung(StrEnum):
     RELAXED = "relaxed"
     MINIMUM_VIOLATION = "minimum-violation"
     HOLD = "hold"
-    OUTSIDE = "outside"  # given by a controller that is not ours
+    OUTSIDE = "outside"  # from an external controller
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -50,9 +50,9 @@ class Waypoint:
 class ReplayTask:
     """Start (J,) [rad] at a stamp [ns] and goal pose (4, 4) of a frame.
 
-    home (J,) [rad]: attracts free motion (None: `middle`). via: earlier goals. follow: the goal is each time's logged
-    pose, until the log ends. twists: velocity to reach instead, until end_ns. anchors: every anchor_period [s] the
-    arm returns to the logged posture.
+    home (J,) [rad]: attracts free motion (None: the model's `middle`). via: earlier goals. follow: the goal is each
+    time's logged pose, until the log ends. twists: velocity to reach instead, until end_ns. anchors: every
+    anchor_period [s] the arm returns to the logged posture.
     """
 
     start: Float64
@@ -254,7 +254,7 @@ class _Course:
         self.num_reached = 0
         self.detours: list[int] = []
         self._since = 0  # the step from which a stall counts: the last anchor, waypoint or detour
-        self._positions: list[Float64] = []  # of steps that may stall
+        self._positions: list[Float64] = []  # of the steps since then
         self._detour: Detour | None = None
         last_ns = task.last_ns
         left = config.max_time if last_ns is None else (last_ns - task.stamp_ns) * 1e-9 + config.period

@@ -1,4 +1,4 @@
-"""One step of the QP-IK controller (III-E): query field, build rows, solve, recheck."""
+"""The step of the QP-IK controller (III-E): query field, build rows, solve, recheck."""
 
 from collections.abc import Collection, Sequence
 from copy import copy
@@ -218,7 +218,7 @@ class QpIkController:
     def given(self, view: View, velocity: Float64 | None, status: str = "") -> ControlStep:
         """Return an external velocity (J,) [rad/s] as a step; slack is its row violation.
 
-        None: the arm comes to rest, with the reason in `status`.
+        None: the arm stops, with the reason in `status`.
         """
         rest, rows = self._limits.rest(view.state.last_velocity), view.rows
         J, M = len(rest), int(rows.in_qp.sum())
@@ -270,7 +270,7 @@ class QpIkController:
     def _descended(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
         """Return rows, the ladder's choice, and True if the later distances keep the promise.
 
-        A sphere that would meet another surface than its row's (a corner, a second splat) adds a row, and the ladder
+        A sphere that would meet another surface than its row's (a corner, a second splat) adds a row. Then the ladder
         runs again: cutting planes, at most `config.max_cuts` rounds.
         """
         num_external, max_cuts = self._builder.num_external, self._config.max_cuts

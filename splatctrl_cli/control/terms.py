@@ -22,7 +22,7 @@ from splatctrl_cli.records import Bool, Float64
 Cost = tuple[Float64, Float64]
 """H (J, J) and c (J,) of a cost ``1/2 v' H v + c' v`` over joint velocities v (J,)."""
 
-NO_SPHERE: Bool = np.zeros(1, dtype=np.bool_)  # of the moving ones
+NO_SPHERE: Bool = np.zeros(1, dtype=np.bool_)  # among the moving spheres
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +196,7 @@ class Barrier:
 
 
 class BarrierTerm(ABC):
-    """A term of M rows that bound the velocity; `names` say what each guards.
+    """A term of M rows that bound the velocity; `names` describes them.
 
     Without distances it has `rows` alone: the infinite distance exempts it from step checks.
     """

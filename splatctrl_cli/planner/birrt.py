@@ -235,7 +235,7 @@ def shortened(
         check = check_edges(clearance, start, end, contact=config.contact)
         num_edges, num_checks = num_edges + len(cuts), num_checks + check.num_checks
         if np.any(check.is_free):
-            path = _cut(path, cuts[int(np.argmax(check.is_free))])  # they are sorted by what they save
+            path = _cut(path, cuts[int(np.argmax(check.is_free))])  # sorted by saved length
     return path, num_edges, num_checks
 
 

@@ -153,7 +153,7 @@ def _between(levers: Float64, pairs: NDArray[np.integer]) -> Float64:
     return np.where(moves_both, 0.0, np.maximum(a, b))
 
 
-ROUNDING = 1e-9  # [m] taken off every clearance: far above the rounding of the distances
+ROUNDING = 1e-9  # [m] subtracted from every clearance: far above rounding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,7 +223,7 @@ def check_sampled_edges(
         low, high = np.concatenate([low, middle + covered]), np.concatenate([middle - covered, high])
         high = np.minimum(high, free[edge])
         is_open = low < high
-        is_last = (high >= free[edge]) & (free[edge] < 1.0)  # what is left before a collision
+        is_last = (high >= free[edge]) & (free[edge] < 1.0)  # remains before a collision
         is_short = is_open & is_last & ((high - low) * length[edge] < max(give_up, SHORTEST_EDGE))
         np.minimum.at(free, edge[is_short], 0.0 if only_whole else low[is_short])
         keep = is_open & ~is_short & (low < free[edge])

@@ -115,7 +115,7 @@ NO_POSTURE, START_BLOCKED, GOAL_BLOCKED = "no-goal-posture", "start-in-collision
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedPath:
-    """A timed path; None where outcome says why.
+    """A timed path; None with its reason in outcome.
 
     margin, self_margin [m]: reduced where start or goal is nearer. num_proved of num_edges edges are proved free.
     seconds [s]: of planning.
@@ -147,7 +147,7 @@ def planned_path(
     """
     began = time.perf_counter()
     start, frame = task.start, task.frame
-    extra = scene_margin(model, control) - control.margin  # what the spheres leave uncovered, where that is kept too
+    extra = scene_margin(model, control) - control.margin  # the spheres' deficit, if configured
     room = Clearance.of(model, scene, margin=extra)
     random = np.random.default_rng(planner.seed)
     drawn = random.uniform(model.lower, model.upper, (fixed.GOAL_GUESSES * planner.goal_postures, len(start)))
@@ -232,7 +232,7 @@ def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlCo
     scene, own = rows[:, :num].min(axis=1), rows[:, num:].min(axis=1, initial=np.inf)
     margin, self_margin = min(control.margin, float(scene[0])), min(control.self_margin, float(own[0]))
     short = np.maximum(margin - scene[1:], self_margin - own[1:])
-    if np.min(short) > 0:  # no goal keeps what the start keeps: as much as the best one does
+    if np.min(short) > 0:  # no goal keeps the start's margins: use those of the best goal
         best = int(np.argmin(short))
         margin, self_margin = min(margin, float(scene[1 + best])), min(self_margin, float(own[1 + best]))
     keeps = (scene[1:] >= margin) & (own[1:] >= self_margin)

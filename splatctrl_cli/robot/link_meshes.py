@@ -18,8 +18,8 @@ from splatctrl_cli.records import Float64, Index
 from splatctrl_cli.robot.mesh_distance import MeshDistance
 from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
 
-MESH_LENGTHS = (0.001, 10.0)  # [m] of a link's mesh: beyond them its unit is another
-LINK_LENGTHS = (0.01, 3.0)  # [m] that a link has in its own unit
+MESH_LENGTHS = (0.001, 10.0)  # [m] of a link's mesh: outside, it has another unit
+LINK_LENGTHS = (0.01, 3.0)  # [m] of a link in the right unit
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0}
 
 

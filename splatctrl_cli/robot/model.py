@@ -35,9 +35,9 @@ class RobotModel:
     """Kinematics, limits and collision spheres of one arm; world frame, SI units, float64.
 
     joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; left_out: links of the
-    sphere file that the URDF lacks; bare_links: URDF links with a body but no sphere; coverage: None if not measured
-    (coverage_unknown says why); sphere_deficit (S,) [m]: how far a surface point of the sphere's rigid body may lie
-    outside all spheres, NaN if unknown; held: locked fingers and their values.
+    sphere file missing from the URDF; bare_links: URDF links with a body but no sphere; coverage: None if not
+    measured, see coverage_unknown; sphere_deficit (S,) [m]: how far a surface point of the sphere's rigid body may
+    lie outside all spheres, NaN if unknown; held: locked fingers and their values.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class RobotModel:
         self.sphere_deficit: Float64 = np.full(len(spheres.radii), np.nan)
         self._surface: RobotSurface | None = None
         self.self_model: SelfModel | None = None
-        self._surfaces: dict[int, RobotSurface] = {}  # by how many of `changes` were before
+        self._surfaces: dict[int, RobotSurface] = {}  # by the number of earlier `changes`
         self._packages = packages
         self.held = dict(held or {})
         self._chosen_pairs: Index | None = None
@@ -154,7 +154,7 @@ class RobotModel:
         return robot
 
     def with_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
-        """Return the robot with measured coverage; `unknown` says why there is none."""
+        """Return the robot with measured coverage; `unknown` explains a missing one."""
         deficit = np.full(len(self.sphere_set.radii), np.nan)
         if coverage is not None:
             deficit = deficit_by_sphere(self.urdf, self.sphere_set, coverage)
@@ -177,7 +177,7 @@ class RobotModel:
         return [] if self.self_model is None else self.self_model.changes()
 
     def surface_at(self, stamp_ns: int) -> RobotSurface:
-        """Return `surface` plus the parts held at a stamp [ns]."""
+        """Return `surface` plus the temporary parts at a stamp [ns]."""
         if self.self_model is None or not self.changes:
             return self.surface
         number = bisect_right(self.changes, stamp_ns)
@@ -256,7 +256,7 @@ class RobotModel:
 
     @property
     def middle(self) -> Float64:
-        """Posture (J,) amid the limits; 0 without."""
+        """Mid-limit posture (J,); 0 if unlimited."""
         limited = np.isfinite(self.lower) & np.isfinite(self.upper)
         return np.where(limited, (np.where(limited, self.lower, 0) + np.where(limited, self.upper, 0)) / 2, 0.0)
 
@@ -280,7 +280,7 @@ class RobotModel:
         return self.chain.jacobians(self._checked(q))
 
     def frame_pose(self, q: Float64, frame: str) -> Float64:
-        """Return T_world_frame (4, 4) of a link. Raises InputError for an unknown frame."""
+        """Return T_world_frame (4, 4) of a link. Raises InputError if unknown."""
         return np.vstack([self._framed(q, frame)[0], [0.0, 0.0, 0.0, 1.0]])
 
     def surface_gaps(
@@ -365,7 +365,7 @@ class RobotModel:
         return np.array(order, dtype=np.int64), np.array(factor), np.array(offset)
 
     def positions_of(self, log_joint_names: Sequence[str], position: Float64) -> Float64:
-        """Return a log's positions (..., J) in the model's order."""
+        """Return a log's positions (..., J) in model order."""
         order, factor, offset = self.joint_columns(log_joint_names)
         return np.asarray(position[..., order] * factor + offset)
 

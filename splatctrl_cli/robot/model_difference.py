@@ -6,7 +6,7 @@ import pinocchio
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.urdf import MOVABLE, UrdfFile
 
-POSITION, ROTATION, LIMIT = 1e-4, 1e-3, 1e-4  # [m], [rad], [rad or m and 1/s] that rounding of text may be
+POSITION, ROTATION, LIMIT = 1e-4, 1e-3, 1e-4  # [m], [rad], [rad or m and 1/s]: rounding of text
 _POSTURES = 3
 
 

@@ -30,18 +30,18 @@ from splatctrl_cli.robot.self_intervals import (
 from splatctrl_cli.robot.self_model import LearnedLink, SelfModel, surface_digest
 from splatctrl_cli.robot.surface import RobotSurface
 
-REACH = 0.06  # [m] outside of a link's visual surface, in which its parts are looked for
-MOST_REACH = 0.24  # [m], to which it grows with parts that go as far
-STEP = 0.02  # [m] by which some corner of a link's box moves between clearly different configurations
-SAME = 0.01  # [m] within which cameras of one moment see a link in one configuration
-PATH_SHARE = 0.5  # of how far a link went between two moments, that parts them where it came back
-AWAY = 0.04  # [m] from where a cell was, beyond which what is still there is another thing
-MOST_ASKED = 8  # configurations whose places are looked at in the others
-MOST_LOST = 0.5  # of a piece, which more cells that belong elsewhere make no part
+REACH = 0.06  # [m] outside a link's visual surface: search distance for its parts
+MOST_REACH = 0.24  # [m]: its limit when parts extend as far
+STEP = 0.02  # [m] of some corner of a link's box between clearly different configurations
+SAME = 0.01  # [m] within which views of one moment share a configuration
+PATH_SHARE = 0.5  # of a link's way between two moments, which separates them even if it returned
+AWAY = 0.04  # [m] from a cell's old place, beyond which a surface there is another object
+MOST_ASKED = 8  # configurations with places to check in the others
+MOST_LOST = 0.5  # of a piece's cells that may belong elsewhere
 MOST_SETS = 40  # frame sets
-WIDE = 320  # pixels of an image across, to which it is thinned
-MEDIAN_SIGMA = 1.4826  # standard deviation of a normal distribution by its median size
-FAR_OFF = 0.03  # [m] from the rendered robot, beyond which a pixel shows something else
+WIDE = 320  # pixels across a thinned image
+MEDIAN_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute value
+FAR_OFF = 0.03  # [m] from the rendered robot, beyond which a pixel shows another surface
 UNEXPLAINED, EXPLAINED = -1, -2
 BLOCK = 3  # cells along an edge
 

@@ -17,15 +17,15 @@ from splatctrl_cli.robot.self_model import ALWAYS
 VOXEL = 0.004  # [m]
 TRUNCATION = 3 * VOXEL  # [m] before and behind a measured surface
 LEAST_CELLS = 24  # of a part, 1.5 cm^3
-NUM_CONFIGURATIONS = 5  # that a cell has to be a surface in
-TOUCHING = np.ones((3, 3, 3))  # cells that are one piece: thin things lie aslant
-FEWER_CONFIGURATIONS = 3  # the same of a cell beside such cells
-FREE_BESIDE = 0.5  # of the configurations that see such a cell, as `FREE_SHARE`
-SURE_SHARE = 0.25  # of a piece of cells, that has enough of them
-FREE_SHARE = 0.3  # of the configurations that see a cell; where more see through it, it is no robot
-FREE_WEIGHT = (1 - FREE_SHARE) / FREE_SHARE  # votes of a configuration that sees through a cell
-AROUND = 7  # cells across, whose votes choose an interval
-GONE = 0.5  # share of a part's cells that a configuration before or after it sees through, more than see a surface
+NUM_CONFIGURATIONS = 5  # in which a cell must be a surface
+TOUCHING = np.ones((3, 3, 3))  # neighbours in one piece: thin structures lie aslant
+FEWER_CONFIGURATIONS = 3  # likewise, of a cell next to such cells
+FREE_BESIDE = 0.5  # `FREE_SHARE` of such a cell
+SURE_SHARE = 0.25  # of a piece's cells: enough configurations show them
+FREE_SHARE = 0.3  # of the configurations that see a cell; above it, the cell is not robot
+FREE_WEIGHT = (1 - FREE_SHARE) / FREE_SHARE  # votes against a cell of a configuration that sees through it
+AROUND = 7  # cells across: their votes choose an interval
+GONE = 0.5  # of a part's cells: free less surface, in some configuration before or after it
 MOST_INTERVALS = 6  # of a link
 
 

@@ -31,7 +31,7 @@ from splatctrl_cli.robot.self_collision import DisabledPair, fixtures, joined_li
 LinkNames = tuple[str, str]
 Depth = Callable[[Float64], Float64]
 
-FLAT = 1e-9  # of a solid's size, by which a vertex may stick out of a face's plane: rounding
+FLAT = 1e-9  # of a solid's size: rounding of a vertex's height above a face's plane
 
 
 class LinkSurface:
@@ -112,7 +112,7 @@ class SelfSurfaces:
     ) -> None:
         """model: with coverage of these solids; recorded: logged postures (R, J)."""
         self._model, self._solids = model, solids
-        self._surfaces: dict[str, LinkSurface] = {}  # made when a pair first comes near
+        self._surfaces: dict[str, LinkSurface] = {}  # built when a pair is first near
         leaders = {link: leader for link, (leader, _) in model.urdf.rigid_bodies().items()}
         self._spheres = _SphereBodies(model, leaders)
         links = model.sphere_set.links
@@ -247,7 +247,7 @@ def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None
         if np.mean(gap < margin) > SELF_OFTEN:
             surface = None if surfaces is None else surfaces.gaps_of(links, postures, centers, margin)
             if surfaces is not None and surface is not None and surface.max() < margin / SELF_SHARE:
-                surface = surfaces.gaps_of(links, postures, centers)  # exact, for their share counts
+                surface = surfaces.gaps_of(links, postures, centers)  # exact, for a share of the largest counts
             found.append(_kept(links, gap, margin, surface))
     return tuple(pair for pair in found if pair.margin is None or pair.margin < margin)
 

@@ -15,7 +15,7 @@ from splatctrl_cli.robot.coverage import areas
 from splatctrl_cli.robot.surface import RobotSurface
 
 ALWAYS = (int(np.iinfo(np.int64).min), int(np.iinfo(np.int64).max))  # [ns]
-BOUNDS = ("start_ns", "end_ns", "first_ns")  # that files of earlier versions lack
+BOUNDS = ("start_ns", "end_ns", "first_ns")  # missing from files of earlier versions
 
 
 @dataclass(frozen=True, kw_only=True)

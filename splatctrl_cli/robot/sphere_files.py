@@ -65,7 +65,7 @@ def with_boxes(spheres: SphereSet, boxes: Sequence[tuple[str, Box]]) -> SphereSe
 
 
 def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[SphereSet, tuple[str, ...]]:
-    """Return the spheres by the URDF's link names, and the links that it lacks.
+    """Return the spheres by the URDF's link names, and the links missing there.
 
     Those are left out, such as a hand not mounted. If no name agrees, names are compared without their first part:
     `panda_link1` fits `fr3_link1`. Raises InputError if nothing fits even so, with `name`.

@@ -24,7 +24,7 @@ from splatctrl_cli.records import Bool, Float64, Index, SphereSet
 from splatctrl_cli.robot.coverage import areas, largest_deficit, refined
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 
-DIGITS = 6  # of a written sphere: micrometres
+DIGITS = 6  # decimals of a written sphere: micrometres
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,12 +201,12 @@ class _Link:
         reach = self._reach(centers)
         radii = np.array(
             [reach[k, owner == k].max(initial=0.0) for k in range(len(centers))]
-        )  # 0: rounded to idleness
+        )  # 0: of no use after rounding
         spare = -max(
             largest_deficit(part.surface.corners, centers, radii - part.slack, floor=-np.inf).proven
             for part in self._parts
         )
-        allowed = max(self._options.max_deficit - DEFICIT_GAP, 0.0)  # so that what is proven keeps to it
+        allowed = max(self._options.max_deficit - DEFICIT_GAP, 0.0)  # so that the proven bound stays within it
         radii = np.maximum(radii - max(spare, 0.0) - allowed, 10**-DIGITS)
         return centers, np.ceil(radii * 10**DIGITS + 1e-3) / 10**DIGITS
 
