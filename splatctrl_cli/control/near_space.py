@@ -47,8 +47,8 @@ class Account:
     reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places (C, 3).
     unseen_to_surface [m]: least distance of a never-seen point to the map's surfaces, at unseen_place;
     blind_to_surface [m]: likewise, about spheres with almost only such points (`NEAR_BLIND`). Infinite and NaN
-    without any. age [s]: bound for `NEAR_FRESH_SHARE` of the seen points; ahead [s]: last view after the state. NaN
-    without views.
+    without any. age [s]: quantile `NEAR_FRESH_SHARE` of seen points' ages; ahead [s]: from the state to the latest
+    view. NaN without views.
     """
 
     shares: Float64
@@ -81,8 +81,8 @@ class NearSpace:
     def due(self, stamps: NDArray[np.int64], centers: Float64) -> dict[int, bool]:
         """Return indices of states to evaluate; True if their ages count.
 
-        stamps (T,) [ns] never go back. Due: after `NEAR_MOVED` of a sphere (T, S, 3), and (True) `NEAR_EVERY_NS`
-        after the last timed one.
+        A state is due once a sphere has moved by `NEAR_MOVED`, and (True) every `NEAR_EVERY_NS`. stamps (T,) [ns]
+        never go back; centers (T, S, 3).
         """
         chosen, moving = dict[int, bool](), centers[:, self._moving]
         for index, stamp_ns in enumerate(stamps.tolist()):

@@ -5,8 +5,8 @@ is convex, so over a triangle it is largest at a corner:
 
     max over the triangle of phi  <=  min_i max_k |v_k - c_i| - r_i,
 
-exact where one ball is nearest to all of it. Triangles are halved until this bound and the largest corner phi agree.
-Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
+exact where one ball is nearest to all of it. Triangles are halved until this bound and the largest corner phi agree
+to a tolerance. Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
 """
 
 import pickle
@@ -167,7 +167,7 @@ def largest_deficit(
 ) -> Deficit:
     """Return the largest phi on `triangles`, between bounds that agree to `tolerance` [m].
 
-    Triangles certainly below `floor` are not refined.
+    Triangles below `floor` are not refined.
     """
     best, place, proven = -np.inf, np.zeros(3), -np.inf
     pending = triangles

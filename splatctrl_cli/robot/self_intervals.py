@@ -43,7 +43,7 @@ class Fused:
     free: Bool
 
     def within(self, run: slice) -> tuple[Float64, Bool, Bool]:
-        """Return mean distance (N,) [m] (NaN: none), seen and free (R, N) of a run."""
+        """Return a run's mean distance (N,) [m] or NaN, seen but not free (R, N), free (R, N)."""
         total, weight = self.total[run].sum(axis=0), self.weight[run].sum(axis=0)
         mean = np.where(weight > 0.5, total / np.maximum(weight, 1e-9), np.nan).astype(np.float64)
         return mean, self.seen[run] & ~self.free[run], self.free[run]

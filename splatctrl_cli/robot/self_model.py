@@ -25,8 +25,8 @@ class LearnedLink:
     Its parts last from start_ns to end_ns [ns], `ALWAYS` if unbounded. origin (3,) [m], link frame: first cell's
     centre; voxel [m]; distance (X, Y, Z) float32 [m], NaN if unknown; configurations (X, Y, Z) uint8 with a surface
     there; triangles (F, 3, 3) [m], link frame: closed surfaces of parts beyond the visual surface. outside_95,
-    outside_most [m]: their protrusion, most at place (3,) [m], link frame; since [s] from the first frame: when
-    knowable. Without parts 0 and NaN. first_ns [ns]: first frame.
+    outside_most [m]: protrusion of 95 % and of all of their cells, most at place (3,) [m]; since [s] from the first
+    frame: when knowable. Without parts 0 and NaN. first_ns [ns]: first frame.
     """
 
     link: str

@@ -68,7 +68,7 @@ def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[Sphere
     """Return the spheres by the URDF's link names, and the links missing there.
 
     Those are left out, such as a hand not mounted. If no name agrees, names are compared without their first part:
-    `panda_link1` fits `fr3_link1`. Raises InputError if nothing fits even so, with `name`.
+    `panda_link1` fits `fr3_link1`. Raises InputError about `name` if nothing fits even so.
     """
     names = {link: link for link in urdf.links}
     asked = spheres.links

@@ -32,7 +32,7 @@ class FitOptions:
     """Requirements on the spheres.
 
     max_spheres: over all links; or max_protrusion [m], with few spheres. max_deficit [m]: of surface points outside.
-    restarts: greedy covers per link and protrusion; num_patches, num_candidates: about so many per link.
+    restarts: greedy covers per link and protrusion; num_patches, num_candidates: approximate, per link.
     """
 
     max_spheres: int | None = None

@@ -37,9 +37,9 @@ class RobotSurface:
 
     kinds (P,) as in `kernels.surface_image`; sizes (P, 3) (half edges; radius and half length; or radius);
     T_link_solid (P, 4, 4); triangles (F, 3, 3) in the frame of triangle_links (F,), as a `mesh` to draw and `trees`
-    by link number to measure. by_spheres: links whose geometry is missing or unreadable. notes: replaced visual
-    geometry, and why. fixed: links that no joint moves. num_carried: number of last `links`, repeated once per
-    carried box.
+    by link number to measure. by_spheres: links of missing or unreadable geometry, where spheres replace it. notes:
+    replaced visual geometry, and why. fixed: links that no joint moves. num_carried: number of carried boxes, each
+    with its link again at the end of `links`.
     """
 
     links: tuple[str, ...]

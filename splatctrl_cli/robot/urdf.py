@@ -202,9 +202,9 @@ def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
 
 
 def visual_urdf(urdf: UrdfFile, without: Collection[str] = ()) -> UrdfFile:
-    """Return the URDF with visual geometry instead of collision geometry, where a link has some.
+    """Return the URDF with visual instead of collision geometry, where a link has some.
 
-    without: links to leave.
+    without: unchanged links.
     """
     root = ElementTree.fromstring(urdf.text)
     for link in root.findall("link"):
