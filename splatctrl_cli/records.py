@@ -129,7 +129,7 @@ class LossReport:
     """Losses of an input: `damaged` sets exit code 3, the rest is only counted.
 
     dropped_images: gaps in a topic of steady rate; invalid_depth: pixels with NaN, infinite, negative or 65535
-    counts, read as no return; differentiated_velocities: from positions; unsorted_states: stamps that went back;
+    counts, read as no return; differentiated_velocities: from positions; unsorted_states: with earlier stamps;
     conflicting_states: duplicates with other positions than the kept one; state_gaps: times without states.
     """
 

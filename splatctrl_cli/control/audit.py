@@ -117,8 +117,8 @@ def audit(
 ) -> AuditTrace:
     """Return clearances of states, by the distances known at their stamps.
 
-    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. In one scene, the audit of some states is that
-    part of the audit of all, to the bit.
+    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. Any part of one scene's states gives the same
+    bits.
     """
     parts: dict[str, list[Clearance]] = {}
     spheres: dict[str, list[Float64]] = {}

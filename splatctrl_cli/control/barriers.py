@@ -52,8 +52,8 @@ class SceneRows(BarrierTerm):
     def by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
         """Return distances (M,) [m]; `chosen` (M,) spheres have at least their link's surface gap.
 
-        Where that gap is larger, rows G (M, J) become its rows, in place. Such a row keeps `config.margin` from the
-        surface, wherever the sphere moves.
+        Where that gap is larger, rows G (M, J) become its rows, in place. They keep `config.margin` from the surface,
+        wherever the sphere moves.
         """
         if self._balls is None or not chosen.any():
             return distance

@@ -213,8 +213,8 @@ class Strain:
 class MotionLimits:
     """A motion's velocities and accelerations as shares of limits, less encoder error.
 
-    Velocities count from the last state and from `MOTION_WINDOW` earlier; accelerations from three places
-    `MOTION_WINDOW` apart. A sample covers the time before it.
+    Velocities since the last state and over `MOTION_WINDOW`; accelerations from three places `MOTION_WINDOW` apart. A
+    sample covers the time before it.
     """
 
     def __init__(self, velocity_limit: Float64, acceleration_limit: Float64 | None) -> None:

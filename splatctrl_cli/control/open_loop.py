@@ -62,7 +62,7 @@ def open_loop(
 ) -> OpenLoopTrace:
     """Ask the commander at every logged state, in the field known then; nothing is integrated.
 
-    For the logged motion, the command differs from the logged velocity only where a row shapes it: the intervention.
+    For the logged motion, command and logged velocity differ only where a row shapes it: the intervention.
     has_distance (T,): False skips a state. scene_step_at as in `closed_loop`.
     """
     field = field_at(int(motion.stamp_ns[0]))

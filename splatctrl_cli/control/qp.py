@@ -210,8 +210,8 @@ def descend(
 ) -> Choice:
     """Return the solved or relaxed program, else least violation, else standstill.
 
-    The first, far smaller program has no slacks: its solution stands if no multiplier exceeds its row's slack cost.
-    Programs with slacks are feasible by construction, so lower rungs are for failing solvers.
+    First without slacks, far smaller: its solution stands if no multiplier exceeds its row's slack cost. Programs
+    with slacks are feasible by construction, so lower rungs are for failing solvers.
     """
     J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
     firm = solver.solve(assemble_hard(costs, *box, barriers))

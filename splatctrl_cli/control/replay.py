@@ -96,8 +96,8 @@ class SceneChange:
 class ReplayTrace:
     """T steps with stamp_ns (T,) and position (T, J) [rad] before each.
 
-    anchored: steps before which the arm returned to the log; num_reached: goals; detours: steps after which a planned
-    detour began; by_surface: spheres that finally counted by their link's surface.
+    anchored: steps before which the arm returned to the log; num_reached: goals; detours: steps before a planned
+    detour; by_surface: spheres that finally counted by their link's surface.
     """
 
     stamp_ns: Stamps

@@ -69,7 +69,7 @@ class PeopleGrown:
 def guarded(scene: DistanceField, people: DistanceField | None, config: ControlConfig) -> DistanceField:
     """Return the field from which a controller keeps `config.margin`.
 
-    People count as nearer by the excess of `config.human_margin` over the margin.
+    People count as nearer by `config.human_margin` less the margin.
     """
     extra = config.human_margin - config.margin
     return scene if people is None or extra <= 0 else PeopleGrown(scene, people, extra)

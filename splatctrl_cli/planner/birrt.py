@@ -113,7 +113,7 @@ class _Search:
     def grown(self, tree: _Tree, targets: Float64) -> Index:
         """Grow `tree` towards targets (K, J) by at most `reach`, where all is free.
 
-        Partial growth would put nodes near contact, nearest to most samples but leading nowhere.
+        Nodes of partial growth, near contact, would be nearest to most samples but lead nowhere.
         """
         near = tree.nearest(targets)
         way = targets - tree.q[near]
@@ -164,9 +164,9 @@ class _Search:
 def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig, *, seed: int = 0) -> Plan:
     """Plan a path from start (J,) to one of goals (G, J) or (J,) [rad].
 
-    The same seed gives the same path. Exceeding the iterations or time of `config` is an outcome, not an error; only
-    time depends on the machine. Raises InputError for a start or goal outside the limits, NotEvaluableError for one
-    in collision, with sphere and depth.
+    The same seed gives the same path. Running out of iterations or time is an outcome, not an error; only time
+    depends on the machine. Raises InputError for a start or goal outside the limits, NotEvaluableError for one in
+    collision, naming sphere and depth.
     """
     began = time.perf_counter()
     roots = checked_postures(clearance, start, goals, config)

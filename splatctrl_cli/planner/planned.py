@@ -142,8 +142,8 @@ def planned_path(
 ) -> PlannedPath:
     """Plan a path from start to goal pose, within the controller's frame speeds.
 
-    scene: lower bound of a 1-Lipschitz distance, so every edge is proved. Goal postures are sought from home, start
-    and random ones. approach [m]: straight end along the frame's z axis, as far as free.
+    scene: lower bound of a 1-Lipschitz distance, so every edge is proved. Goal postures start from home, start and
+    random guesses. approach [m]: straight end along the frame's z axis, as far as free.
     """
     began = time.perf_counter()
     start, frame = task.start, task.frame

@@ -50,7 +50,7 @@ class ExpectedContact:
 
 @dataclass(frozen=True, kw_only=True)
 class Declarations:
-    """Declared entries in file order; empty without a file.
+    """Declared entries in file order.
 
     num_uses counts by (table, index) how often an entry changed a label or excused a contact: an unused one is stale
     or wrong.

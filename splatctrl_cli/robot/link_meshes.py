@@ -46,8 +46,8 @@ class Solid:
 def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple[Solid, ...]]:
     """Read each link's solids, in the file's order.
 
-    folders: for ``package://`` paths, before those above the URDF. Raises InputError for a missing or unreadable
-    mesh, other shapes, or no collision geometry.
+    folders: for ``package://``, before those above the URDF. Raises InputError for an unreadable mesh, other shapes,
+    or no collision geometry.
     """
     if urdf.other_shapes:
         link, tag = urdf.other_shapes[0]

@@ -26,7 +26,7 @@ class DisabledPair:
 def read_srdf(path: Path, urdf: UrdfFile) -> tuple[tuple[DisabledPair, ...], tuple[DisabledPair, ...]]:
     """Return the ``disable_collisions`` pairs within `urdf`, and those with an unknown link.
 
-    Raises InputError for a missing file, no SRDF, a pair without links, or no pair within the URDF.
+    Raises InputError for no SRDF, a pair without links, or no pair within the URDF.
     """
     try:
         root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
@@ -96,8 +96,8 @@ def self_collision_pairs(
     """Return pairs of spheres that may collide.
 
     Omitted: links of one rigid body or joined by one joint, and `disabled` (an SRDF). Without `disabled`,
-    `num_postures` uniform postures decide: pairs always in contact are omitted, for no posture parts them; with
-    `drop_never` also those never nearer than NEVER_MARGIN, a guess from a sample, not a proof.
+    `num_postures` uniform postures decide: pairs always in contact are omitted, for no posture parts them. With
+    `drop_never` also those never nearer than NEVER_MARGIN: a guess from a sample, not a proof.
     """
     links = tuple(dict.fromkeys(model.sphere_set.links))
     owner = np.array([links.index(link) for link in model.sphere_set.links], dtype=np.int64)

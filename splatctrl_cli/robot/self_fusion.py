@@ -77,10 +77,9 @@ def learn(
     """Return the self-model that V frames show, in order of time.
 
     T_world_link (V, L, 4, 4): the surface's links; links: all of the robot's. reach [m]: search distance outside a
-    link's visual surface, grown to `MOST_REACH` with its parts. A grid cell is robot in a run of configurations under
-    four conditions. `NUM_CONFIGURATIONS` show it as a surface; at most `FREE_SHARE` of those that see it see through
-    it; it leaves its place in the world with the link; it moves against each nearer link. Raises InputError where no
-    link can be learned.
+    link's visual surface, grown to `MOST_REACH` with its parts. A grid cell is robot in a run of configurations if
+    `NUM_CONFIGURATIONS` show it as a surface and at most `FREE_SHARE` see through it. It must also leave its place in
+    the world with the link, and move against each nearer link. Raises InputError where no link can be learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]

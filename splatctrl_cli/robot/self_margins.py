@@ -99,8 +99,8 @@ def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
 class SelfSurfaces:
     """Pairs of links that may collide, judged by surfaces; without surfaces, by spheres.
 
-    pairs: links neither on one body nor joined by a joint, not named by an SRDF, and apart in some posture; fused:
-    never apart. names (K + P): of these and of P pairs of spheres on bodies without collision geometry.
+    pairs: links neither on one body nor joined by a joint, not in an SRDF, and apart in some posture; fused: never
+    apart. names (K + P): of these and of P pairs of spheres on bodies without geometry.
     """
 
     def __init__(
@@ -202,8 +202,8 @@ class KeptMargin:
 
     margin: negative if the spheres may overlap; None: they cannot be separated, and it stays configured. apart: least
     gap [m] of their surfaces (of their spheres if unknown) that is not *near* (`kept_margins`). is_fixture: one
-    stands still and carries none, such as a table of the URDF. surface_gap: least gap [m] of their surfaces in
-    sampled postures that keep the margin, negative where they overlap; None if unknown.
+    stands still and carries none, such as a table. surface_gap: least gap [m] of their surfaces in sampled postures
+    that keep the margin, negative where they overlap; None if unknown.
     """
 
     links: tuple[str, str]

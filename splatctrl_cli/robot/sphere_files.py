@@ -1,8 +1,8 @@
 """Collision spheres of a robot: files, matching to URDF links, and joints' lever arms.
 
-Files are URDFs, and YAML of this tool, robometrics and cuRobo. cuRobo's reading (NVlabs/curobo,
-cuda_robot_generator.py) is kept: `collision_sphere_buffer`, a number or one per link, adds to every radius;
-`collision_spheres` may name a file; a radius not above 0 then is switched off, as for objects not attached yet.
+Files are URDFs, and YAML of this tool, robometrics and cuRobo. As in cuRobo (NVlabs/curobo, cuda_robot_generator.py),
+`collision_sphere_buffer`, a number or one per link, adds to every radius; `collision_spheres` may name a file; a
+radius not above 0 is switched off, as for objects not attached yet.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ def spheres_of(urdf: UrdfFile) -> SphereSet:
 
 
 def own_spheres(urdf: UrdfFile) -> SphereSet:
-    """Return the spheres of a URDF whose collision geometry is spheres only.
+    """Return the spheres of a URDF with no other collision geometry.
 
     Else none, as they would leave other shapes uncovered.
     """
@@ -99,9 +99,9 @@ def _without_prefix(link: str) -> str:
 def lever_arms(chain: Chain, lower: Float64, upper: Float64) -> Float64:
     """Return bounds (S, J) on a centre's travel per radian (or metre) within the limits.
 
-    About its own joint the centre keeps to a circle, inside a ball about the circle's middle on the axis. Towards the
-    base, each joint carries that middle on a circle in turn; the ball grows by its distance from that axis. 0 where
-    the joint does not move the sphere.
+    About its own joint the centre keeps to a circle, inside a ball about the circle's middle. Each joint towards the
+    base carries that middle on a circle in turn; the ball grows by its distance from the axis. 0 where the joint does
+    not move the sphere.
     """
     levers = np.zeros((len(chain.sphere_body), len(chain.parent) - 1))
     for s, (start, offset) in enumerate(zip(chain.sphere_body, chain.offset, strict=True)):
@@ -144,7 +144,7 @@ def read_sphere_file(path: Path) -> SphereFile:
     """Read the spheres of a YAML file or a URDF.
 
     `collision_spheres` at the top or under robot_cfg.kinematics, by link or as Lula's list, or an XRDF's groups.
-    Raises InputError for a missing file, another layout, a non-finite number, or no sphere.
+    Raises InputError for an unreadable file, another layout, a non-finite number, or no sphere.
     """
     if path.suffix.lower() in URDF_SUFFIXES:
         return SphereFile(path=path, layout="URDF", spheres=spheres_of(read_urdf(path)), num_off=0)

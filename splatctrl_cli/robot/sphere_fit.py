@@ -7,9 +7,8 @@ centre c takes the protrusion
     K[c, p] = max_k |v_pk - c| + d(c),
 
 and the best n spheres are a k-centre problem: minimise the largest over p of the least K over centres. Greedy set
-cover at a bisected t gives the centres; alternating assignment and recentring lower t; then balls shrink to their
-patches. Each patch ends up inside one ball: covered by construction. `coverage` measures it afterwards without
-patches.
+cover at a bisected t gives centres, which alternating assignment and recentring improve; then balls shrink. Each
+patch ends up inside one ball: covered by construction. `coverage` measures it independently.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,8 +46,7 @@ class FitOptions:
 def fit_spheres(solids: Mapping[str, Sequence[Solid]], options: FitOptions) -> SphereSet:
     """Fit spheres to each link's solids, rounded outward to micrometres; deterministic by seed.
 
-    Raises UsageError for contradictory options or fewer spheres than links; InputError for a link without surface
-    area.
+    Raises UsageError for contradictory options or too few spheres, InputError for a link without area.
     """
     _check(options, len(solids))
     links = [_Link(name, parts, options, index) for index, (name, parts) in enumerate(solids.items())]

@@ -60,7 +60,7 @@ class RobotSurface:
     def of(cls, urdf: UrdfFile, spheres: SphereSet, folders: Sequence[Path] = ()) -> "RobotSurface":
         """Build the visual geometry of a URDF, else collision geometry, else spheres, by link.
 
-        folders: for ``package://`` paths, before those above the URDF. Raises InputError for a mesh in another unit.
+        folders: for ``package://``, before those above the URDF. Raises InputError for a mesh in another unit.
         """
         seen = visual_urdf(urdf)
         pieces, unread = _read(seen, folders)
@@ -229,8 +229,7 @@ class RobotSurface:
         """Return signed distances (Q,) [m] of points (Q, 3), negative inside.
 
         Infinite to triangles beyond `within` (Q,) [m]. With `enough` (Q,) [m] of at least 0, any distance on the same
-        side of both bounds, which is faster. Links `without` do not count. Points `outside` (Q,) of all triangles
-        skip the slow inside test.
+        side of both bounds, which is faster. Points `outside` (Q,) of all triangles skip the slow inside test.
         """
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
         counts = np.array([link not in without for link in self.links], bool)

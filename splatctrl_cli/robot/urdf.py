@@ -113,8 +113,7 @@ class UrdfFile:
     def grippers(self) -> tuple[str, ...]:
         """Joints typical of fingers.
 
-        One of several prismatic joints on a rigid body, or a mimic or its leader, without a joint of another kind
-        beyond it.
+        Several prismatic joints on a rigid body, or mimics and their leaders, without another kind of joint beyond.
         """
         movable = [joint for joint in self.joints if joint.kind != "fixed"]
         leader = {link: led for link, (led, _) in self.rigid_bodies().items()}
@@ -163,8 +162,8 @@ class UrdfFile:
 def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
     """Read and check the URDF at `path`, or its `text`.
 
-    Raises InputError for a missing file, no URDF, several roots, missing limits, a zero axis, or no movable joint
-    (such as an unexpanded xacro).
+    Raises InputError for no URDF, several roots, missing limits, a zero axis, or no movable joint (such as an
+    unexpanded xacro).
     """
     text, root = _parse(path, _read(path) if text is None else text)
     links = tuple(_attribute(path, element, "name") for element in root.findall("link"))
