@@ -1,6 +1,6 @@
-"""SplatCtrl: what a robot's cameras recorded, as splats, distance fields and replayed controllers.
+"""SplatCtrl: camera recordings of robots as splats, distance fields and replayed controllers.
 
-The public names are those of `splatctrl_cli.api`, which is imported when the first of them is asked for.
+`splatctrl_cli.api` has the public names, imported on first use.
 """
 
 from importlib import import_module

@@ -1,6 +1,6 @@
-"""The parts that jobs are made of, for programs of one's own: robot, scene, fields, planner, controller, simulation.
+"""Parts for custom programs: robot, scene, fields, planner, controller, simulation.
 
-The jobs and their requests are in `splatctrl_cli.api`; these names may change with a minor version.
+Jobs and requests are in `splatctrl_cli.api`; these names may change with a minor version.
 """
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed

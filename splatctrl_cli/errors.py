@@ -1,6 +1,6 @@
-"""Errors the library raises; the command line alone turns them into a line on stderr and an exit code.
+"""Errors of the library; only the command line turns them into exit codes.
 
-Wording is ``thing: expected X, got Y``; the remedy follows on the same line after a semicolon.
+Wording is ``thing: expected X, got Y``; the remedy follows a semicolon.
 """
 
 import difflib
@@ -11,13 +11,13 @@ DAMAGE = "part of the recording is damaged and left out"
 
 
 def did_you_mean(word: str, known: Iterable[str], otherwise: str, *, prefix: str = "", cutoff: float = 0.6) -> str:
-    """The remedy for an unknown word: the nearest one that is known, after a prefix, and `otherwise` without one."""
+    """Return a remedy with the nearest known word after a prefix, else `otherwise`."""
     near = difflib.get_close_matches(word, list(known), n=1, cutoff=cutoff)
     return f"did you mean {prefix}{near[0]}?" if near else otherwise
 
 
 class SplatCtrlError(Exception):
-    """An expected failure: `message` names the thing, `remedy` says what to do about it."""
+    """An expected failure: `message` names the object, `remedy` the action."""
 
     exit_code = 70
 
@@ -28,7 +28,7 @@ class SplatCtrlError(Exception):
 
 
 class UsageError(SplatCtrlError):
-    """Usage, configuration, or an output that exists or cannot be written (exit code 2)."""
+    """Usage, configuration, or output that exists or is not writable (exit code 2)."""
 
     exit_code = 2
 
@@ -40,7 +40,7 @@ class InputError(SplatCtrlError):
 
 
 class NotEvaluableError(SplatCtrlError):
-    """The question cannot be answered from this input, e.g. a path leaves known space (exit code 5)."""
+    """The input cannot answer the question, e.g. a path leaves known space (exit code 5)."""
 
     exit_code = 5
 
@@ -52,10 +52,10 @@ class WriteError(SplatCtrlError):
 
 
 class DeviceFault(SplatCtrlError):  # noqa: N818  (the run can go on elsewhere)
-    """A card failed or was lost while it computed (exit code 70); what was written before can be gone on from."""
+    """A card failed or was lost during computation (exit code 70); the run can resume."""
 
 
 class DeviceFull(DeviceFault):
-    """A card has too little memory for what was asked (exit code 2)."""
+    """A card has too little memory (exit code 2)."""
 
     exit_code = 2

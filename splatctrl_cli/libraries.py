@@ -1,5 +1,6 @@
-"""Modules that are found by name: libraries that take most of a second to load, each loaded when a name of it is
-first used, those of extras, and a room's own modules, which declare what they add to its registry.
+"""Modules found by name: lazy libraries, extras, and registry entries of rooms.
+
+Lazy ones take most of a second to load.
 """
 
 from importlib import import_module
@@ -12,7 +13,7 @@ from splatctrl_cli.errors import UsageError
 
 
 class _LoadedLate(ModuleType):
-    """Stands for a library; a name of it may be one of its submodules."""
+    """A lazy library; a name may be a submodule."""
 
     def __getattr__(self, name: str) -> object:
         library = import_module(self.__name__)
@@ -32,7 +33,7 @@ else:
 
 
 def is_installed(module: str) -> bool:
-    """Whether a library of an extra is there; it is not loaded."""
+    """True if an extra's library is installed; it is not loaded."""
     try:
         return find_spec(module) is not None
     except ModuleNotFoundError:
@@ -40,7 +41,7 @@ def is_installed(module: str) -> bool:
 
 
 def of_extra(module: str, extra: str, what: str) -> Any:
-    """A library that reads `what`. Raises UsageError with the remedy where the extra is not installed."""
+    """Return a library that reads `what`. Raises UsageError if its extra is not installed."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -53,7 +54,7 @@ __all__ = ["distributed", "is_installed", "mpl", "of_extra", "scipy_io", "trimes
 
 
 class Ordered(Protocol):
-    """An entry of a registry; lists show the lowest `order` first, and things are tried in it."""
+    """A registry entry; lists and trials start with the lowest `order`."""
 
     @property
     def order(self) -> int: ...
@@ -63,7 +64,7 @@ Entry = TypeVar("Entry", bound=Ordered)
 
 
 def entries_of(room: str, kind: type[Entry]) -> tuple[Entry, ...]:
-    """The `kind` that the modules of the package `room` hold in their ``ENTRIES``, by order, then by module."""
+    """Return the `kind` in ``ENTRIES`` of the package's modules, by order, then module."""
     modules = [import_module(f"{room}.{found.name}") for found in iter_modules(import_module(room).__path__)]
     found = [entry for module in modules for entry in getattr(module, "ENTRIES", ()) if isinstance(entry, kind)]
     return tuple(sorted(found, key=lambda entry: entry.order))

@@ -1,6 +1,6 @@
-"""The plain data that rooms hand to each other. SI units, world frame, stamps in int nanoseconds.
+"""Plain records shared by rooms. SI units, world frame, stamps in int nanoseconds.
 
-Shapes: N splats, Q queries, S spheres, J joints, (X, Y, Z) voxels, (H, W) pixels.
+N splats, Q queries, S spheres, J joints, (X, Y, Z) voxels, (H, W) pixels.
 """
 
 import heapq
@@ -22,13 +22,13 @@ UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 Index = NDArray[np.int64]
 Stamps = NDArray[np.int64]  # (T,) [ns]
-Posture = Callable[[int], Float64 | None]  # joint positions (J,) at a time [ns]; None where there are none
+Posture = Callable[[int], Float64 | None]  # joint positions (J,) at a time [ns], or None
 SECOND_NS = 1_000_000_000
-MILLIMETRE, MILLIMETRES = 0.001, 1000.0  # [m] of one, and how many a metre has
+MILLIMETRE, MILLIMETRES = 0.001, 1000.0  # [m], and [1/m]
 
 
 class FloatRows(Protocol):
-    """Rows (T, ...) of float64 by number, slice or index (K,): an array, or what is read from a file as one."""
+    """Rows (T, ...) of float64 by number, slice or index (K,), in memory or a file."""
 
     @property
     def shape(self) -> tuple[int, ...]: ...
@@ -41,7 +41,7 @@ class FloatRows(Protocol):
 
 
 class Label(IntEnum):
-    """Two-bit entity labels of a splat or voxel (paper, III-C)."""
+    """Two-bit entity labels of a splat or voxel (III-C)."""
 
     OBJECT = 0b00
     ROBOT = 0b01
@@ -50,9 +50,9 @@ class Label(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics:
-    """Pinhole camera; pixel (0, 0) has its centre at u = v = 0 (the ROS and OpenCV convention).
+    """Pinhole camera; pixel (0, 0) has its centre at u = v = 0 (ROS, OpenCV).
 
-    A camera-frame point (x right, y down, z forward) lands at ``u = fx x / z + cx, v = fy y / z + cy`` [px].
+    A camera-frame point (x right, y down, z forward) projects to ``u = fx x / z + cx, v = fy y / z + cy`` [px].
     """
 
     fx: float
@@ -65,13 +65,12 @@ class Intrinsics:
 
 @dataclass(frozen=True, kw_only=True)
 class RgbdFrame:
-    """One colour image with its registered depth and pose.
+    """A colour image with registered depth and pose.
 
-    color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = none;
-    T_world_camera (4, 4) float64 maps optical camera coordinates (z forward) to world; human (H, W) uint8, not 0
-    where the pixel shows a person, None where nobody looked for one; valid (H, W), False where the pixel shows
-    nothing (the lens did not see it), None where all show something. What is not valid has no colour; a depth there,
-    of another lens, is not drawn and not scored.
+    color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = no return; T_world_camera (4, 4)
+    float64, of the optical frame (z forward); human (H, W) uint8, nonzero on people, None if not segmented; valid (H,
+    W), False outside the lens's view, None if all valid. Invalid pixels have no colour; their depth, of another lens,
+    is not drawn or scored.
     """
 
     stamp_ns: int
@@ -86,10 +85,9 @@ class RgbdFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class JointState:
-    """Joint positions (J,) float64 [rad or m] and velocities (J,) float64 [1/s], in the source's joint order.
+    """Joint positions (J,) float64 [rad or m] and velocities (J,) float64 [1/s], in source order.
 
-    Where a log has them: commanded_velocity (J,) [1/s], and the end effector's pose (4, 4) as the robot itself
-    reported it, in its base or in the world.
+    Where logged: commanded_velocity (J,) [1/s], and the robot's own end-effector pose (4, 4), in its base or world.
     """
 
     stamp_ns: int
@@ -107,12 +105,12 @@ Item = TypeVar("Item")
 
 
 def spread(items: Sequence[Item], most: int) -> list[Item]:
-    """At most so many of the items, in order, spread over all."""
+    """Return at most `most` items, in order, evenly spread."""
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).astype(int))]
 
 
 class Stamped(Protocol):
-    """What happened at a time."""
+    """An item with a time."""
 
     @property
     def stamp_ns(self) -> int: ...
@@ -122,19 +120,17 @@ _Item = TypeVar("_Item", bound=Stamped)
 
 
 def by_stamp(*streams: Iterable[_Item]) -> Iterator[_Item]:
-    """The items of streams that are each by stamp, by stamp; of one stamp those of an earlier stream come first."""
+    """Merge sorted streams by stamp; at equal stamps, earlier streams come first."""
     return heapq.merge(*streams, key=attrgetter("stamp_ns"))
 
 
 @dataclass(kw_only=True)
 class LossReport:
-    """What of an input did not become records: `damaged` sets exit code 3, the rest is only counted.
+    """Losses of an input: `damaged` sets exit code 3, the rest is only counted.
 
-    duplicate_images: images of a stamp that their topic had before; dropped_images: how many are missing where a
-    topic of a steady rate has gaps; invalid_depth: pixels whose depth is NaN, infinite, negative or 65535 counts,
-    which is taken as none. differentiated_velocities: joint states with a velocity that is the change of the
-    positions; unsorted_states, duplicate_states: stamps that went back, or came again; conflicting_states: of the
-    latter those whose positions differ from the one that was kept; state_gaps: times without joint states.
+    dropped_images: gaps in a topic of steady rate; invalid_depth: pixels with NaN, infinite, negative or 65535
+    counts, read as no return; differentiated_velocities: from positions; unsorted_states: with earlier stamps;
+    conflicting_states: duplicates with other positions than the kept one; state_gaps: times without states.
     """
 
     unpaired_color: int = 0
@@ -153,14 +149,14 @@ class LossReport:
     notes: list[str] = field(default_factory=list)
 
     def plus(self, other: "LossReport", notes: list[str], sign: int = 1) -> "LossReport":
-        """The counts of both together (-1: without those of the other), with these notes."""
+        """Return the sum of both counts (sign -1: the difference), with these notes."""
         names = [column.name for column in fields(self) if column.name != "notes"]
         counts = {name: getattr(self, name) + sign * getattr(other, name) for name in names}
         return LossReport(**counts, notes=notes)
 
 
 class RecordSource(Protocol):
-    """A recorded dataset as records in time order (a log, a capture, an image folder)."""
+    """A recorded dataset as records in time order (log, capture, image folder)."""
 
     @property
     def name(self) -> str: ...
@@ -173,48 +169,48 @@ class RecordSource(Protocol):
 
     @property
     def has_clock(self) -> bool:
-        """False when stamps are made up (a folder of views of a scene that does not move)."""
+        """False for invented stamps (static views)."""
         ...
 
     @property
     def loss(self) -> LossReport:
-        """Complete once `records` has been read to its end."""
+        """Complete once `records` is exhausted."""
         ...
 
     def records(self) -> Iterator[Record]:
-        """Yield records by stamp; joint states come before frames of the same stamp."""
+        """Yield records by stamp; joint states precede frames of the same stamp."""
         ...
 
     def digests(self) -> dict[str, str]:
-        """sha256 of every input file, by name."""
+        """Return sha256 of every input file, by name."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Arrays with one row for each of N items."""
+    """Arrays with one row per item (N)."""
 
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
     def joined(self, *others: Self) -> Self:
-        """These items, and then those of the others."""
+        """Return these items, then the others'."""
         names = [column.name for column in fields(self)]
         parts = {name: [getattr(one, name) for one in (self, *others)] for name in names}
         return replace(self, **{name: np.concatenate(arrays) for name, arrays in parts.items()})
 
     def select(self, which: Bool | NDArray[np.integer]) -> Self:
-        """The items where a mask (N,) is true, in order, or those of an index (K,)."""
+        """Return the items of a mask (N,) or an index (K,)."""
         return replace(self, **{column.name: getattr(self, column.name)[which] for column in fields(self)})
 
 
 @dataclass(frozen=True, kw_only=True)
 class SplatSet(Columns):
-    """Isotropic 3D Gaussians (paper, III-B).
+    """Isotropic 3D Gaussians (III-B).
 
-    centers (N, 3) float32 [m], world; radii (N,) float32 [m] (the Gaussian's sigma); colors (N, 3) float32 in
-    [0, 1]; opacities (N,) float32 in (0, 1); labels (N,) uint8 (`Label`); density (N,) float32, rho of III-D
-    (the row sum of the kernel, 0 where not computed).
+    centers (N, 3) float32 [m], world; radii (N,) float32 [m] (sigma); colors (N, 3) float32 in [0, 1]; opacities (N,)
+    float32 in (0, 1); labels (N,) uint8 (`Label`); density (N,) float32, rho of III-D (row sum of the kernel, 0 if
+    not computed).
     """
 
     centers: Float32
@@ -227,12 +223,11 @@ class SplatSet(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class GaussianSet(Columns):
-    """Anisotropic 3D Gaussians with view-dependent colour, as 3D Gaussian splatting fits them.
+    """Anisotropic 3D Gaussians with view-dependent colour, as in 3D Gaussian splatting.
 
-    centers (N, 3) float32 [m], world; scales (N, 3) float32 [m], sigmas along the Gaussian's own axes; quats_wxyz
-    (N, 4) float32, unit, from those axes to world; opacities (N,) float32 in (0, 1); harmonics (N, K, 3) float32,
-    real spherical harmonics of red, green and blue up to degree 0 to 3 (K = 1, 4, 9, 16; colour is 0.5 + their sum);
-    labels (N,) uint8 (`Label`).
+    centers (N, 3) float32 [m], world; scales (N, 3) float32 [m], sigmas along own axes; quats_wxyz (N, 4) float32,
+    unit, own axes to world; opacities (N,) float32 in (0, 1); harmonics (N, K, 3) float32, real spherical harmonics
+    of RGB, degree 0 to 3 (K = 1, 4, 9, 16; colour is 0.5 + their sum); labels (N,) uint8 (`Label`).
     """
 
     centers: Float32
@@ -260,7 +255,7 @@ class Box:
 
     @classmethod
     def from_text(cls, text: str) -> "Box":
-        """The box of ``x0,y0,z0,x1,y1,z1``. Raises UsageError unless within 1000 km, lower below upper."""
+        """Parse ``x0,y0,z0,x1,y1,z1``. Raises UsageError unless within 1000 km, lower below upper."""
         try:
             values = np.array([float(part) for part in text.split(",")])
         except ValueError:
@@ -272,7 +267,7 @@ class Box:
         return cls(lower=values[:3], upper=values[3:])
 
     def contains(self, points_world: NDArray[np.floating]) -> Bool:
-        """(…, 3) points -> (…,) True inside, borders included."""
+        """True (...,) for points (..., 3) inside, borders included."""
         inside = np.ones(points_world.shape[:-1], bool)
         for axis in range(3):  # a reduction over an axis of three is slow
             inside &= (points_world[..., axis] >= self.lower[axis]) & (points_world[..., axis] <= self.upper[axis])
@@ -281,7 +276,7 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class SphereSet:
-    """Spheres that stand for a robot's links: centers (S, 3) [m] in the frame of links[s], radii (S,) [m]."""
+    """Collision spheres: centers (S, 3) [m] in the frame of links[s], radii (S,) [m]."""
 
     links: tuple[str, ...]
     centers: Float64
@@ -289,10 +284,13 @@ class SphereSet:
 
 
 class DistanceField(Protocol):
-    """Distance to the scene: what a controller asks. Positive outside."""
+    """Signed distance to the scene, positive outside."""
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m], world -> distance (Q,) [m], gradient (Q, 3) of that very distance, not normalised."""
+        """Return distance (Q,) [m] at points (Q, 3), and its own gradient (Q, 3).
+
+        The gradient is not normalised.
+        """
         ...
 
 
@@ -300,10 +298,9 @@ class DistanceField(Protocol):
 class DistanceGrid:
     """A baked field; cell (i, j, k) is centred at ``origin + voxel * (i, j, k)``, world [m].
 
-    channels: `sdf` (X, Y, Z) float32 [m], `hard` (X, Y, Z) float32 [m] the exact distance to the spheres,
-    `gpdf` (X, Y, Z) float32 [m], `gradient` (X, Y, Z, 3) float32, `observed` (X, Y, Z) uint8 (0 never seen,
-    1 free, 2 occupied, 3 uncertain, 4 never seen but swept by the robot). header: sign, frame, units, kernel,
-    length scale, digests.
+    channels: `sdf` (X, Y, Z) float32 [m]; `hard` (X, Y, Z) float32 [m], exact distance to the spheres; `gpdf` (X, Y,
+    Z) float32 [m]; `gradient` (X, Y, Z, 3) float32; `observed` (X, Y, Z) uint8 (0 never seen, 1 free, 2 occupied, 3
+    uncertain, 4 never seen but swept by the robot). header: sign, frame, units, kernel, length scale, digests.
     """
 
     origin: Float64

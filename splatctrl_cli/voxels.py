@@ -1,4 +1,4 @@
-"""Voxels: what is known of space, since when, and what is occupied without a splat."""
+"""Voxels: state of space, age of evidence, and occupied voxels without a splat."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from splatctrl_cli.records import Bool, Float32, Float64, UInt8
 
 MOST_VOXELS = 400_000_000  # of a grid
-FIRST_REASON = 0xF0  # of one byte; of two 0xFFF0: from here on `last_seen` says why a voxel was never seen
-SWEPT = 0b100  # entity bit of a voxel that the robot was in at some time of the log
-SOLID = 0b1000  # entity bit, where a robot is known: an object's pixel hit the voxel since it was last seen free
+FIRST_REASON = 0xF0  # in one byte (0xFFF0 in two): from here on `last_seen` is the reason of a never-seen voxel
+SWEPT = 0b100  # entity bit of a voxel that the robot occupied at some time
+SOLID = 0b1000  # entity bit, with a known robot: an object's pixel hit the voxel after its last free view
 
 
 class VoxelState(IntEnum):
-    """What is known of a voxel."""
+    """State of a voxel."""
 
     NEVER_SEEN = 0
     FREE = 1
@@ -26,8 +26,9 @@ class VoxelState(IntEnum):
 
 
 class Unseen(IntEnum):
-    """Why no camera ever got depth through or on a voxel, in `last_seen` of two bytes. Of several cameras'
-    reasons the largest counts; the last two stay until a ray passes.
+    """Reason why no camera got depth through or on a voxel (two-byte `last_seen`).
+
+    The largest of several cameras' reasons counts; the last two stay until a ray passes.
     """
 
     SWEPT = 0xFFF0  # the robot's body was in it
@@ -36,22 +37,22 @@ class Unseen(IntEnum):
     HIDDEN_BY_THING = 0xFFF3
     NO_RETURN = 0xFFF4  # a camera has no depth there now
     CONTRADICTED = 0xFFFE  # a ray passed it, through a surface that another camera measured
-    UNANSWERED = 0xFFFF  # a ray returned nothing, though it meets a surface, or depth is all about it
+    UNANSWERED = 0xFFFF  # no return, though the ray meets a surface or depth surrounds it
 
 
 class EvidenceClass(IntEnum):
-    """What is known of a point beside the arm at one time. Each point has exactly one class."""
+    """Evidence about a point near the arm at one time; exactly one per point."""
 
     FREE = 0  # a camera got depth through or on it, not too long ago
     SWEPT = 1  # never seen, but the robot's body was there
     STALE = 2  # seen too long ago
     HIDDEN_BY_ARM = 3
     HIDDEN_BY_THING = 4
-    OUT_OF_VIEW = 5  # of all cameras; or never asked, far from where the arm was
-    NO_RETURN = 6  # no depth in a pixel that shows it, which may be of the empty background
+    OUT_OF_VIEW = 5  # of all cameras; or without a reason, far from the arm
+    NO_RETURN = 6  # no depth in its pixel, which may show empty background
     CONTRADICTED = 7
-    UNANSWERED = 8  # no depth where there should be some
-    DEPTH_EDGE = 9  # a surface may go on there, where its edge was lost
+    UNANSWERED = 8  # no depth where some is expected
+    DEPTH_EDGE = 9  # a surface may extend there past its lost edge
     OUTSIDE = 10  # of the workspace
     SURFACE = 11  # within a surface of the map
 
@@ -60,9 +61,8 @@ class EvidenceClass(IntEnum):
 class OccupancyGrid:
     """Log-odds voxels; voxel (i, j, k) is centred at ``origin + voxel * (i, j, k)``, world [m].
 
-    log_odds (X, Y, Z) float32; num_updates (X, Y, Z) uint16, 0 = never seen; entity (X, Y, Z) uint8 bits of
-    `Label`, `SWEPT` and `SOLID`. Occupancy is ``1 / (1 + exp(-log_odds))``; below 0.3 is observed free, above 0.7
-    occupied.
+    log_odds (X, Y, Z) float32; num_updates (X, Y, Z) uint16, 0 = never seen; entity (X, Y, Z) uint8 bits of `Label`,
+    `SWEPT` and `SOLID`. Occupancy is ``1 / (1 + exp(-log_odds))``; below 0.3 is free, above 0.7 occupied.
     """
 
     origin: Float64
@@ -72,7 +72,7 @@ class OccupancyGrid:
     entity: UInt8
 
     def states(self, free_below: float, occupied_above: float) -> UInt8:
-        """`VoxelState` (X, Y, Z) by these thresholds of occupancy."""
+        """Return `VoxelState` (X, Y, Z) by thresholds of occupancy."""
         low, high = (float(np.log(p / (1.0 - p))) for p in (free_below, occupied_above))
         states = np.full(self.log_odds.shape, np.uint8(VoxelState.UNCERTAIN))
         states[self.log_odds < low] = VoxelState.FREE
@@ -84,7 +84,10 @@ class OccupancyGrid:
 
     @classmethod
     def from_states(cls, origin: Float64, voxel: float, states: UInt8) -> "OccupancyGrid":
-        """A grid that has these `states` (X, Y, Z) by any thresholds: log-odds of -20, 0 or 20, updates of 0 or 1."""
+        """Build a grid with these `states` (X, Y, Z) by any thresholds.
+
+        Log-odds are -20, 0 or 20, updates 0 or 1.
+        """
         is_seen = (states != VoxelState.NEVER_SEEN) & (states != VoxelState.SWEPT_BY_ROBOT)
         log_odds = np.zeros(states.shape, np.float32)
         log_odds[states == VoxelState.FREE] = -20.0
@@ -96,8 +99,9 @@ class OccupancyGrid:
 
 @dataclass(frozen=True, kw_only=True)
 class Balls:
-    """Equal balls that stand for voxels: centers (K, 3) float32 [m], world; radius [m], half a voxel's diagonal, so
-    that a ball contains its voxel; labels (K,) uint8 (`Label`).
+    """Equal balls for voxels: centers (K, 3) float32 [m], world; labels (K,) uint8 (`Label`).
+
+    radius [m]: half a voxel's diagonal, to contain the voxel.
     """
 
     centers: Float32
@@ -109,36 +113,39 @@ class Balls:
 
     @classmethod
     def of_voxels(cls, centers: Float32, voxel: float, labels: UInt8) -> "Balls":
-        """The balls around voxels of edge `voxel` [m] at centers (K, 3)."""
+        """Return the balls around voxels at centers (K, 3)."""
         return cls(centers=centers, radius=0.5 * 3**0.5 * voxel, labels=labels)
 
     def select(self, which: Bool) -> "Balls":
-        """Some of them (K,)."""
+        """Return some of them (K,)."""
         return Balls(centers=self.centers[which], radius=self.radius, labels=self.labels[which])
 
     @property
     def volume(self) -> float:
-        """[m^3] of the voxels that they stand for."""
+        """[m^3] of their voxels."""
         return len(self) * (2.0 * self.radius / 3**0.5) ** 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class LostEdges:
-    """Where surfaces may go on in pixels without depth: balls, centers (K, 3) [m], world, radii (K,) [m], float32."""
+    """Balls in which surfaces may extend into pixels without depth.
+
+    centers (K, 3) [m], world, radii (K,) [m], float32.
+    """
 
     centers: Float32
     radii: Float32
 
     @classmethod
     def joined(cls, parts: Sequence["LostEdges"]) -> "LostEdges":
-        """All of them, none of no parts."""
+        """Return all of them, or none."""
         return cls(
             centers=np.concatenate([np.zeros((0, 3), np.float32), *(part.centers for part in parts)]),
             radii=np.concatenate([np.zeros(0, np.float32), *(part.radii for part in parts)]),
         )
 
     def select(self, which: Bool) -> "LostEdges":
-        """Some of them (K,)."""
+        """Return some of them (K,)."""
         return LostEdges(centers=self.centers[which], radii=self.radii[which])
 
 
@@ -147,11 +154,11 @@ NO_EDGES = LostEdges.joined([])
 
 @dataclass(frozen=True, kw_only=True)
 class SeenVoxels:
-    """When cameras last saw each voxel: its centre is `origin` [m] + its index times the edge `voxel` [m].
+    """Last view of each voxel, centred at `origin` + index times `voxel` [m].
 
-    last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last time step in which
-    a camera returned depth through or on the voxel; 0 never, nor was it asked why; one of the type's largest numbers,
-    why not (`Unseen`, its lower byte in uint8). edges: of the newest images.
+    last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last step with depth
+    through or on the voxel; 0: never, without a reason; the type's largest numbers: the reason (`Unseen`, its lower
+    byte in uint8). edges: of the newest images.
     """
 
     origin: Float64
@@ -161,8 +168,9 @@ class SeenVoxels:
     edges: LostEdges = NO_EDGES
 
     def look(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], UInt8]:
-        """When the voxels of points (Q, 3) [m], world, were last seen, and their class: stamps (Q,) [ns], -1 for
-        never; `EvidenceClass` (Q,), `FREE` for all that was ever seen.
+        """Return last stamps (Q,) [ns], -1 never, and `EvidenceClass` (Q,), `FREE` if ever seen.
+
+        points (Q, 3) [m], world.
         """
         cell = np.floor((points - self.origin) / self.voxel + 0.5)
         is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)
@@ -177,7 +185,7 @@ class SeenVoxels:
 
 
 def _classes() -> UInt8:
-    """`EvidenceClass` by one more than the lower four bits of `Unseen`; of 0, what nobody asked."""
+    """`EvidenceClass` by 1 + the lower four bits of `Unseen`; 0: no reason."""
     classes = np.full(17, np.uint8(EvidenceClass.OUT_OF_VIEW))
     for reason in Unseen:
         classes[1 + (reason & 0xF)] = EvidenceClass[reason.name]
@@ -189,10 +197,9 @@ _CLASS_OF = _classes()
 
 @dataclass(frozen=True, kw_only=True)
 class KnownVoxels:
-    """What was known of space at one moment, and how old that evidence is.
+    """State of space at one moment, and its evidence's age.
 
-    last_seen, step_stamps_ns, edges: as `SeenVoxels` has them. unrepresented: what is occupied, not the robot, and
-    has no splat.
+    last_seen, step_stamps_ns, edges: as in `SeenVoxels`. unrepresented: occupied, not robot, without a splat.
     """
 
     grid: OccupancyGrid
@@ -203,7 +210,7 @@ class KnownVoxels:
 
     @property
     def seen(self) -> SeenVoxels:
-        """When its voxels were last seen."""
+        """Times of the voxels' last views."""
         grid = self.grid
         return SeenVoxels(
             origin=grid.origin,

@@ -1,4 +1,4 @@
-"""What the controller asks of a robot: the one seam between control and kinematics."""
+"""The one seam between control and kinematics."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Protocol
@@ -11,15 +11,9 @@ from splatctrl_cli.records import Bool, Float64, SphereSet
 
 
 class ArmModel(Protocol):
-    """A kinematic chain with collision spheres; `splatctrl_cli.robot.model.RobotModel` is one.
+    """A kinematic chain with collision spheres; `splatctrl_cli.robot.model.RobotModel` documents its members.
 
-    J joints, S spheres; positions [m] and poses in world. sphere_deficit (S,) [m]: how far outside the spheres the
-    surface of a sphere's body may be, NaN where nobody measured it. lever_arms (S, J): how far [m] a sphere goes, at
-    most, per radian (or metre) of each joint. self_allowance (P,) [m]: how much less than the margin asked for each
-    of `self_pairs` keeps. surface_gaps: by link with triangles, of all `links` or some, its clearance (T,) [m] at
-    postures (T, J). link_distances: by link with triangles, the signed distance (Q,) [m] of points (Q, 3) in its
-    frame to all of its geometry, some of which (Q,) may be known to be outside. chain: its bodies and spheres as
-    the kernels walk them, None where only its methods know.
+    J joints, S spheres; positions [m] and poses in world. chain: None if only the methods know the kinematics.
     """
 
     @property
@@ -84,7 +78,7 @@ class ArmModel(Protocol):
 
 
 def sphere_names(spheres: SphereSet) -> tuple[str, ...]:
-    """A name for every sphere: its link and its place among that link's spheres, ``panda_hand[2]``."""
+    """Return each sphere's link and number on it: ``panda_hand[2]``."""
     seen: dict[str, int] = {}
     names = []
     for link in spheres.links:

@@ -1,4 +1,4 @@
-"""The clearance of logged joint states: what each field says of every state, and how much of it is known space."""
+"""Clearance of logged joint states by each field, and their share of unknown space."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -18,14 +18,13 @@ DistanceFunction = Callable[[Float64], Float64]
 
 @dataclass(frozen=True, kw_only=True)
 class BallDistance:
-    """A `DistanceFunction` of N balls, centers (N, 3) and radii (N,) [m], which surfaces are measured to."""
+    """A `DistanceFunction` of balls, centers (N, 3), radii (N,) [m], for surface measurement."""
 
     of_points: DistanceFunction
     centers: NDArray[np.floating]
     radii: NDArray[np.floating]
 
     def __call__(self, points: Float64) -> Float64:
-        """The distance (Q,) [m] of points (Q, 3)."""
         return self.of_points(points)
 
 
@@ -40,10 +39,9 @@ CHUNK = 256  # states per query
 
 @dataclass(frozen=True, kw_only=True)
 class Clearance:
-    """distance (T,) [m] of the nearest moving part (`part_clearances`), NaN where there is none; sphere (T,): the
-    index of its sphere.
+    """distance (T,) [m] of the nearest moving part, NaN if none, with its sphere (T,).
 
-    For self-collision, of the nearest pair; sphere is then the pair's index, -1 without pairs.
+    For self-collision: nearest pair, by index, -1 without pairs.
     """
 
     distance: Float64
@@ -52,10 +50,12 @@ class Clearance:
 
 @dataclass(frozen=True, kw_only=True)
 class AuditTrace:
-    """T states: stamp_ns (T,), position (T, J) [rad], clearance by field name, limit_margin (T,) [rad] to the nearest
-    position limit (negative outside) at limit_joint (T,), self_clearance (T,) [m] (inf without pairs) at self_pair
-    (T,), unknown_share (T,) of sphere centres in never-seen space (NaN where nobody asked); of_spheres: by field name
-    the clearance (T, M) [m] of every moving sphere, where it is kept.
+    """T audited states.
+
+    stamp_ns (T,); position (T, J) [rad]; clearance by field; limit_margin (T,) [rad]: to the nearest position limit,
+    negative outside, at limit_joint (T,); self_clearance (T,) [m] (inf without pairs) at self_pair (T,);
+    unknown_share (T,) of sphere centres in never-seen space (NaN if not measured); of_spheres: clearances (T, M) [m]
+    by field, if kept.
     """
 
     stamp_ns: Stamps
@@ -72,12 +72,10 @@ class AuditTrace:
 def part_clearances(
     model: ArmModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Float64, Bool]:
-    """Clearances (T, M) [m] at postures (T, J) of the parts that the moving spheres stand for, and which (M,) are of
-    a link's own surface: the rest are the spheres'.
+    """Return the moving parts' clearances (T, M) [m], and which (M,) are of link surfaces.
 
-    Where a link has triangles and the scene is of balls, its surface decides: the nearest of its spheres has the
-    surface's clearance, and the others at least that, or their own less `sphere_deficit`. centers (T, S, 3) [m] of
-    all spheres, where they are known.
+    A link's triangles decide if the scene is of balls: its nearest sphere has their clearance. Its others have at
+    least that, or their own less `sphere_deficit`. centers (T, S, 3): if known.
     """
     moving = np.flatnonzero(model.moving_spheres)
     there = model.sphere_centers_batch(positions) if centers is None else centers
@@ -101,7 +99,7 @@ def part_clearances(
 def moving_clearance(
     model: ArmModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Clearance, Float64]:
-    """The smallest of `part_clearances` of every posture (T, J), and all of them (T, M) [m]."""
+    """Return the least of `part_clearances` (T,), and all (T, M) [m]."""
     distance, _ = part_clearances(model, positions, distance_to, centers)
     moving = np.flatnonzero(model.moving_spheres)
     nearest = np.argmin(distance, axis=1)
@@ -117,10 +115,10 @@ def audit(
     *,
     observed: Observed | None = None,
 ) -> AuditTrace:
-    """The clearances of states, each by the distances that were known at its stamp: stamps (T,) [ns] that do not go
-    back, finite positions (T, J); T >= 1.
+    """Return clearances of states, by the distances known at their stamps.
 
-    Of states of the same scene, the audit of some is that part of the audit of all, to the bit.
+    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. Any part of one scene's states gives the same
+    bits.
     """
     parts: dict[str, list[Clearance]] = {}
     spheres: dict[str, list[Float64]] = {}
@@ -148,7 +146,7 @@ def audit(
 
 
 def observed_at(seen: Channel, origin: Float64, voxel: float, points: Float64) -> Channel:
-    """What the voxel nearest to each point says; 0 (never seen) outside. seen (X, Y, Z); origin (3,), voxel [m]."""
+    """Return the nearest voxel's value; 0 (never seen) outside. seen (X, Y, Z)."""
     cell = np.floor((points - origin) / voxel + 0.5).astype(np.int64)
     is_inside = np.all((cell >= 0) & (cell < seen.shape), axis=1)
     found = np.zeros(len(points), dtype=np.uint8)
@@ -157,7 +155,7 @@ def observed_at(seen: Channel, origin: Float64, voxel: float, points: Float64) -
 
 
 def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]]:
-    """Ranges of at most CHUNK consecutive states that see the same scene; of the scenes none but two is held."""
+    """Yield ranges of states in one scene; keep at most two scenes."""
     first, before = 0, distances_at(int(stamps[0]))
     for index, stamp in enumerate(stamps[1:], start=1):
         known = distances_at(int(stamp))

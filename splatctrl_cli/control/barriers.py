@@ -1,4 +1,4 @@
-"""The barrier rows of III-E: of the moving spheres against the scene, and of the pairs of spheres of the arm."""
+"""Barrier rows of III-E: moving spheres against the scene, and pairs of spheres."""
 
 from copy import copy
 
@@ -19,8 +19,9 @@ MARGIN = "margin"
 
 
 class SceneRows(BarrierTerm):
-    """A row for each moving sphere against the nearest surface of a distance field; those `State.by_surface` count
-    their link's own surface, where that is farther away.
+    """A row per moving sphere against a distance field's nearest surface.
+
+    Spheres in `State.by_surface` count by their link's surface where that is farther.
     """
 
     kind = RowKind.SCENE
@@ -28,7 +29,7 @@ class SceneRows(BarrierTerm):
     def __init__(
         self, model: ArmModel, config: ControlConfig, field: DistanceField, acceleration: Float64 | None
     ) -> None:
-        """acceleration (J,) [rad/s^2]: what joints can brake with; None: they stop at once."""
+        """acceleration (J,) [rad/s^2]: of braking; None: joints stop at once."""
         self._model, self._config, self._field, self._acceleration = model, config, field, acceleration
         self._balls: BallDistance | None = None
         self._moving = np.flatnonzero(model.moving_spheres)
@@ -43,16 +44,16 @@ class SceneRows(BarrierTerm):
         return self._margin
 
     def in_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
-        """The same rows in another field, which is of `balls` (None: links' surfaces are not measured)."""
+        """Return the rows in another field, of `balls` (None: links' surfaces do not count)."""
         other = copy(self)
         other._field, other._balls = field, balls
         return other
 
     def by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
-        """The distances (M,) [m] of the spheres at q (J,), those `chosen` (M,) at least the gap of their link's
-        surface; the rows G (M, J), where given, become rows of that gap where it is larger.
+        """Return distances (M,) [m]; `chosen` (M,) spheres have at least their link's surface gap.
 
-        Such a row asks of the surface what it asks of any sphere, `config.margin`, wherever the sphere moves on to.
+        Where that gap is larger, rows G (M, J) become its rows, in place. They keep `config.margin` from the surface,
+        wherever the sphere moves.
         """
         if self._balls is None or not chosen.any():
             return distance
@@ -68,7 +69,7 @@ class SceneRows(BarrierTerm):
         return distance
 
     def rows(self, state: State) -> Barrier:
-        """See `BarrierTerm`: gradient and distance come from one query of one function."""
+        """Return the rows; gradient and distance come from one query of one function."""
         centers, jacobians = state.spheres
         distance, gradient = self._queried(centers)
         G = -external_gradient(gradient, jacobians[self._moving])
@@ -77,11 +78,10 @@ class SceneRows(BarrierTerm):
         return self._barrier(self._moving, G, h, distance)
 
     def cut(self, state: State, velocity: Float64, chosen: NDArray[np.integer], distance: Float64) -> Barrier:
-        """One more for each of the `chosen` rows, which have a `distance` (M,) at the state: against what the
-        sphere is nearest to after a period of `velocity` (J,), which need not be what it is nearest to now.
+        """Return rows of `chosen` spheres against their nearest surfaces after a period of `velocity`.
 
-        That surface's distance is taken as linear about the place where it was met. Where it is convex seen from
-        there, as a ball is, it is farther than that in truth; and now it is no nearer than what is nearest now.
+        distance (M,): now. The later distance is linearised, which is conservative for surfaces convex from there,
+        such as balls; now it is at least the present one.
         """
         period = self._config.period
         q = state.q + period * velocity
@@ -95,7 +95,7 @@ class SceneRows(BarrierTerm):
         return self._barrier(chosen, G, h, now)
 
     def distances(self, centers: Float64) -> Float64:
-        """See `BarrierTerm`; NaN where the field has none, which keeps no promise."""
+        """Return distances (M,) [m]; NaN, where unknown, keeps no promise."""
         return self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii
 
     def _barrier(self, index: NDArray[np.integer], G: Float64, h: Float64, distance: Float64) -> Barrier:
@@ -103,7 +103,6 @@ class SceneRows(BarrierTerm):
         return Barrier(index=index, G=G, h=h, distance=distance, slack_cost=cost, slack_weight=weight)
 
     def _queried(self, centers: Float64) -> tuple[Float64, Float64]:
-        """Distance (M,) of the moving spheres' surfaces and the field's gradient (M, 3) at their centres."""
         points = np.ascontiguousarray(centers[self._moving])
         distance, gradient = self._field.query(points)
         bad = ~(np.isfinite(distance) & np.all(np.isfinite(gradient), axis=1))
@@ -118,7 +117,7 @@ class SceneRows(BarrierTerm):
 
 
 class SelfRows(BarrierTerm):
-    """A row for each pair of spheres of the arm that could collide."""
+    """A row per pair of spheres that could collide."""
 
     kind = RowKind.SELF
 
@@ -136,8 +135,9 @@ class SelfRows(BarrierTerm):
         return self._margin
 
     def rows(self, state: State) -> Barrier:
-        """See `BarrierTerm`. Where joints stop at once, G is zero for pairs whose spheres are too slow to use up h:
-        no velocity of the box brings them to bind.
+        """Return the rows.
+
+        Where joints stop at once, G is zero for pairs too slow to use up h: no velocity of the box makes them bind.
         """
         centers, jacobians = state.spheres
         distance, direction = pair_gaps(centers, self._radii, self._pairs)
@@ -172,11 +172,10 @@ class SelfRows(BarrierTerm):
 
 
 def scene_margin(model: ArmModel, config: ControlConfig) -> Float64:
-    """The distance (S,) [m] that every sphere keeps to the scene: epsilon, and where `config.coverage` is "margin"
-    also what the spheres leave uncovered of their body.
+    """Return spheres' scene margins (S,) [m]: epsilon, plus deficits if `config.coverage` is "margin".
 
-    A point of the surface is no farther than that deficit from a sphere, so by the triangle inequality the surface
-    keeps epsilon where the spheres keep this, of any distance that changes by no more than a metre per metre.
+    The surface is within that deficit of a sphere, so by the triangle inequality it keeps epsilon for any 1-Lipschitz
+    distance.
     """
     deficit = np.asarray(model.sphere_deficit) if config.coverage == MARGIN else np.zeros(len(model.moving_spheres))
     return config.margin + deficit
@@ -190,11 +189,10 @@ def distance_bound(
     G: Float64 | None,
     rate: float | Float64 = 0.0,
 ) -> Float64:
-    """h (M,) of rows G (M, J), which counts only where joints cannot stop at once: then with the way that braking
-    takes. rate is dd/dt of a field that changes with time.
+    """Return h (M,), with the braking distance where joints cannot stop at once.
 
-    A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it is counted on, for it changes on the
-    way and other rows want their part.
+    Only then G (M, J) counts. A row's approach G v can brake by at most ``|G| a``; BRAKING_SHARE of it counts,
+    because it changes on the way and other rows share it.
     """
     if acceleration is None or G is None:
         return barrier_bound(distance, margin=margin, gain=config.barrier_gain, rate=rate)
@@ -203,37 +201,37 @@ def distance_bound(
 
 
 def external_gradient(gradient: Float64, jacobians: Float64) -> Float64:
-    """``dd/dq`` (M, J) of field distances: gradient (M, 3), not normalised, times sphere Jacobians (M, 3, J)."""
+    """Return ``dd/dq`` (M, J): gradient (M, 3), not normalised, times Jacobians (M, 3, J)."""
     return np.asarray(np.matmul(gradient[:, None, :], jacobians)[:, 0, :])
 
 
 def pair_gradient(direction: Float64, jacobians: Float64, pairs: NDArray[np.integer]) -> Float64:
-    """``dd/dq`` (P, J) of sphere pair distances; jacobians (S, 3, J)."""
+    """Return ``dd/dq`` (P, J) of sphere pairs; jacobians (S, 3, J)."""
     relative = jacobians[pairs[:, 0]] - jacobians[pairs[:, 1]]
     return np.asarray(np.matmul(direction[:, None, :], relative)[:, 0, :])
 
 
 def barrier_bound(distance: Float64, *, margin: float | Float64, gain: float, rate: float | Float64 = 0.0) -> Float64:
-    """h (M,) of the rows: ``alpha (d - epsilon) + dd/dt`` [m/s]; rate is dd/dt of a field that changes with time."""
+    """Return h (M,): ``alpha (d - epsilon) + dd/dt`` [m/s]."""
     return np.asarray(gain * (distance - margin) + rate)
 
 
 def fastest_approach(G: Float64, lowest: Float64, highest: Float64) -> Float64:
-    """The largest G v (M,) over the box of joint velocities: how fast each row can be used up [m/s]."""
+    """Return the largest G v (M,) [m/s] over the box."""
     return np.asarray(np.maximum(G * lowest, G * highest).sum(axis=1))
 
 
 def can_bind(G: Float64, h: Float64, lowest: Float64, highest: Float64) -> NDArray[np.bool_]:
-    """Rows (M,) that some velocity of the box violates; the others hold for all of them and drop out exactly."""
+    """True for rows (M,) that some velocity of the box violates; others drop exactly."""
     return np.asarray(fastest_approach(G, lowest, highest) > h)
 
 
 def fastest_spheres(jacobians: Float64, lowest: Float64, highest: Float64) -> Float64:
-    """How fast each sphere (S,) can go over the box of joint velocities, at most [m/s]; jacobians (S, 3, J)."""
+    """Return top speeds (S,) [m/s] over the box; jacobians (S, 3, J)."""
     speed = np.abs(jacobians) @ np.maximum(np.abs(lowest), np.abs(highest))
     return np.asarray(np.sqrt(np.einsum("si,si->s", speed, speed)))
 
 
 def is_immovable(G: Float64, velocity_limit: Float64) -> NDArray[np.bool_]:
-    """Rows (M,) that no joint velocity changes: no sphere of theirs moves, or the field is flat there."""
+    """True for rows (M,) that no joint velocity changes: fixed spheres or flat field."""
     return np.asarray(np.abs(G) @ velocity_limit < IMMOVABLE_ROW)

@@ -1,6 +1,4 @@
-"""When and why: runs of states with something to say about them, as intervals with their worst value and names; and
-the signals of an audit and of a controller that these are made of.
-"""
+"""Events of an audit and a controller: intervals with worst value and names."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -15,33 +13,33 @@ from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import Bool, Float64, Index, Stamps
 
-UNREPRESENTED = "unrepresented voxel"  # label of an obstacle that is occupied and has no splat
-MAX_NAMES = 12  # of an event; how many there are is in num_names
+UNREPRESENTED = "unrepresented voxel"  # label of an occupied voxel without a splat
+MAX_NAMES = 12  # listed per event; num_names counts all
 
 
 class EventKind(StrEnum):
-    """What happened over an interval; the comment says what its worst value is."""
+    """Kind of an event; the comment describes its worst value."""
 
     BELOW_MARGIN = "below-margin"  # least clearance [m]
     IN_COLLISION = "in-collision"  # least clearance [m]
-    WITHOUT_DISTANCE = "without-distance"  # number of fields without one
+    WITHOUT_DISTANCE = "without-distance"  # number of fields without a distance
     UNKNOWN_SPACE = "unknown-space"  # largest share of sphere centres
     BETWEEN_STATES = "between-states"  # least bound [m] of the clearance since the state before
-    NOT_BOUNDED = "not-bounded"  # longest time [s] in which nobody knows where the arm was
+    NOT_BOUNDED = "not-bounded"  # longest time [s] without a bound on the arm's place
     SELF_COLLISION = "self-collision"  # least distance of two spheres of the arm [m]
     OUTSIDE_LIMITS = "outside-limits"  # least distance to the limit, negative [rad]
     TOO_FAST = "too-fast"  # largest velocity, as a share of its limit
     TOO_SUDDEN = "too-sudden"  # largest acceleration, as a share of its limit
     STALE_MAP = "stale-map"  # oldest scene [s]
     SCENE = "scene"  # largest multiplier of a row against the scene
-    SELF = "self"  # the same of a self-collision row
-    LIMIT = "limit"  # the same of a joint's position or velocity limit
+    SELF = "self"  # likewise, of a self-collision row
+    LIMIT = "limit"  # likewise, of a joint's position or velocity limit
     RELAXED = "relaxed"  # largest slack [m/s]
     MINIMUM_VIOLATION = "minimum-violation"  # largest residual
     HOLD = "hold"  # least barrier clearance [m]
     SCALED_BACK = "scaled-back"  # least scale
-    ROW_BROKEN = "row-broken"  # largest excess over a barrier row, of a controller that is not ours [m/s]
-    CANNOT_ACT = "cannot-act"  # least distance [m] of a violated row that has no joint to turn
+    ROW_BROKEN = "row-broken"  # largest excess over a barrier row by an external controller [m/s]
+    CANNOT_ACT = "cannot-act"  # least distance [m] of a violated row that no joint moves
 
 
 INTERVENTIONS = frozenset(
@@ -52,13 +50,14 @@ INTERVENTIONS = frozenset(
 )
 """Kinds in which the controller did something else than it was asked for."""
 
-SHOWN = {"": "", "exact": "", "true": " (truth)"}  # measures whose events people are shown, with what it is called
+SHOWN = {"": "", "exact": "", "true": " (truth)"}  # measures with shown events, and their label
 
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:
-    """What is nearest: its surface's distance [m] to a point and its place (3,) [m], world; a splat's index in the
-    file of its scene and its label (UNREPRESENTED without a splat), a grid's cell, or the name of what it is.
+    """Nearest obstacle: distance [m] of its surface to a point, place (3,) [m], world.
+
+    splat: index in its scene's file; label: the splat's, or UNREPRESENTED; cell: of a grid; name: of others.
     """
 
     distance: float
@@ -81,10 +80,10 @@ class Obstacle:
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """An interval of consecutive states: first and last stamp [ns] and time [s], how many, the worst value and when,
-    its names in the order they came up (at most MAX_NAMES of num_names), and the obstacle at the worst.
+    """An interval of consecutive states with its worst value.
 
-    source: the field it is by, empty where none is; state: index of the worst, worst_name: who it is of.
+    names: in order of appearance, at most MAX_NAMES of num_names; source: field, or empty; state: index of the worst;
+    worst_name, obstacle: there.
     """
 
     kind: EventKind
@@ -105,7 +104,7 @@ class Event:
 
 @dataclass(frozen=True, kw_only=True)
 class OneEach:
-    """One of `names` at each state, by index (T,)."""
+    """A name of `names` per state, by index (T,)."""
 
     names: Sequence[str]
     index: Index
@@ -114,15 +113,16 @@ class OneEach:
         return [self.names[int(self.index[i])]]
 
     def over(self, first: int, end: int) -> Sequence[str]:
-        """Each name of these states once, in the order they come up."""
+        """Return each name of these states once, in order."""
         found, at = np.unique(self.index[first:end], return_index=True)
         return [self.names[int(i)] for i in found[np.argsort(at)]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Signal:
-    """What makes events of one kind: is_on (T,), value (T,), the names at a state (the one that the value is of comes
-    first), and which end is the worse.
+    """Source of events of one kind: is_on (T,), value (T,).
+
+    names_at: names at a state, the value's own first.
     """
 
     kind: EventKind
@@ -133,20 +133,20 @@ class Signal:
     source: str = ""
 
     def names_over(self, first: int, end: int) -> Iterable[str]:
-        """The names at these states, in the order they come up."""
+        """Return the names at these states, in order."""
         if isinstance(self.names_at, OneEach):
             return self.names_at.over(first, end)
         return (name for i in range(first, end) for name in self.names_at(i))
 
 
 def runs_of(is_on: Bool) -> list[tuple[int, int]]:
-    """First and one past the last index of every run of true values (T,)."""
+    """Return first and one past the last index of each run of true values (T,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_on, [False]]).astype(np.int8)))
     return [(int(first), int(end)) for first, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def events_of(stamp_ns: Stamps, signals: Iterable[Signal]) -> tuple[Event, ...]:
-    """The intervals of all signals (T,), by their start."""
+    """Return the intervals of all signals (T,), by start."""
     fold = EventFold()
     fold.add(stamp_ns, signals)
     return fold.events()
@@ -158,7 +158,7 @@ Near = Callable[[EventKind, str, int], Obstacle | None]
 
 @dataclass(kw_only=True)
 class _Run:
-    """An interval as far as it is known; state: of the worst, counted from the first block on."""
+    """An unfinished interval; state: worst index over all blocks."""
 
     order: int
     kind: EventKind
@@ -175,7 +175,7 @@ class _Run:
 
 
 class EventFold:
-    """The intervals of signals that come in blocks of states; one that crosses a border is one interval."""
+    """Intervals of signals in blocks of states; an interval may cross blocks."""
 
     def __init__(self) -> None:
         self._num, self._start_ns = 0, 0
@@ -183,9 +183,9 @@ class EventFold:
         self._closed: list[_Run] = []
 
     def add(self, stamp_ns: Stamps, signals: Iterable[Signal], near: Near | None = None) -> None:
-        """The next block's stamps (T,) and signals (T,), the same kinds in the same order every time.
+        """Add a block of stamps (T,) and signals (T,), in the same order each time.
 
-        near: asked for the obstacle of every worst value in this block.
+        near: gives the obstacle of each worst value here.
         """
         if not self._num:
             self._start_ns = int(stamp_ns[0])
@@ -208,12 +208,11 @@ class EventFold:
         self._num += len(stamp_ns)
 
     def events(self) -> tuple[Event, ...]:
-        """All intervals so far, by their start; one that is not over ends with the last state."""
+        """Return all intervals so far, by start; an open one ends with the last state."""
         runs = [*self._closed, *self._open.values()]
         return tuple(self._event(run) for run in sorted(runs, key=lambda r: (r.first_ns, -r.last_ns, r.order)))
 
     def _grown(self, run: _Run, stamp_ns: Stamps, signal: Signal, first: int, end: int, near: Near | None) -> None:
-        """The run, with states `first` up to `end` of a block."""
         values = signal.value[first:end]
         at = first + int(np.argmax(values) if signal.is_high_worse else np.argmin(values))
         worst = float(signal.value[at])
@@ -249,14 +248,17 @@ class EventFold:
 
 
 def first_intervention(events: Sequence[Event]) -> Event | None:
-    """The earliest event in which the controller did something else than it was asked for."""
+    """Return the earliest event in which the controller deviated from its request."""
     return next((event for event in events if event.kind in INTERVENTIONS), None)
 
 
 def audit_signals(
     audit: AuditTrace, margin: float, spheres: Sequence[str], joints: Sequence[str], pairs: Sequence[str] = ()
 ) -> list[Signal]:
-    """Signals of T audited states: clearance, limits, known space. pairs: names of what may collide."""
+    """Return signals of T audited states: clearance, limits, known space.
+
+    pairs: names of possible self-collisions.
+    """
     signals = []
     for source, clearance in audit.clearance.items():
         signals += clearance_signals(source, clearance.distance, clearance.sphere, margin, spheres)
@@ -287,7 +289,7 @@ def audit_signals(
 def clearance_signals(
     source: str, distance: Float64, sphere: Index, margin: float, spheres: Sequence[str]
 ) -> list[Signal]:
-    """Below the margin, and in contact, by the clearance (T,) [m] of the sphere (T,) that is nearest."""
+    """Return signals below the margin and in contact, by the nearest sphere's clearance (T,) [m]."""
     names = OneEach(names=spheres, index=sphere)
     return [
         _low(kind, distance < bound, distance, names, source)
@@ -296,7 +298,7 @@ def clearance_signals(
 
 
 def limit_signals(strain: Strain, joints: Sequence[str]) -> list[Signal]:
-    """Signals of joint velocity and acceleration above their limits."""
+    """Return signals of joint velocity and acceleration above their limits."""
     return [
         Signal(kind=kind, is_on=value > 1, value=value, names_at=OneEach(names=joints, index=joint))
         for kind, value, joint in (
@@ -307,7 +309,7 @@ def limit_signals(strain: Strain, joints: Sequence[str]) -> list[Signal]:
 
 
 def interval_signals(lower: Float64, unbounded: Float64, margin: float) -> list[Signal]:
-    """Since the state before each of T: a clearance bound (T,) [m] below the margin, and time (T,) [s] unbounded."""
+    """Return signals between states: clearance bound (T,) [m] below the margin, unbounded time (T,) [s]."""
     is_low = lower < margin
     return [
         _low(EventKind.BETWEEN_STATES, is_low, lower, _nobody),
@@ -316,12 +318,12 @@ def interval_signals(lower: Float64, unbounded: Float64, margin: float) -> list[
 
 
 def stale_signal(age_s: Float64, max_age_s: float) -> Signal:
-    """Signal of a scene older than allowed; age_s (T,) [s], NaN where a scene has no time."""
+    """Return the signal of a stale scene; age_s (T,) [s], NaN for an unstamped scene."""
     return Signal(kind=EventKind.STALE_MAP, is_on=age_s > max_age_s, value=np.nan_to_num(age_s), names_at=_nobody)
 
 
 def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
-    """Signals of the controller's steps at T states; None where it was not asked."""
+    """Return signals of the controller's steps at T states; None: no step."""
 
     def relaxed(i: int) -> Sequence[str]:
         return [row.name for row in sorted(_asked(steps, i).relaxed, key=lambda row: -row.slack)]

@@ -1,4 +1,4 @@
-"""Things that come near the links that no joint moves. What stood there in the first scene does not count."""
+"""Obstacles that approach fixed links; obstacles of the first scene do not count."""
 
 from collections.abc import Callable
 
@@ -14,25 +14,24 @@ WasSeen = Callable[[Float64], Bool]
 
 
 class FixedParts:
-    """`found`: for each fixed sphere its clearance [m] in the first scene, and the least to anything that came later.
+    """`found`: each fixed sphere's clearance [m] in the first scene, and least to later arrivals.
 
-    A ball of the scene has come where none stood about its place in the first, by STATIC_CHANGE; beside a sphere at
-    its mount, whose map grows, by MOUNTED_CHANGE. It is nearer than the first clearance by as much, and a camera has
-    seen its place before. The last scene had a ball there, too: noise is in one scene alone. Where the link has
-    triangles, the ball is as near as to its surface.
+    A ball has arrived if none of the first scene stood within STATIC_CHANGE of it; near a sphere at its mount, where
+    the map grows, within MOUNTED_CHANGE. It is nearer than the first clearance by as much, and a camera had seen its
+    place before. The last scene had it too: noise is in one scene alone. A link's triangles replace its spheres.
     """
 
     def __init__(self, model: ArmModel, near: float) -> None:
-        """near [m]: a sphere whose first clearance is less stands near its mount."""
+        """near [m]: spheres with less first clearance stand near their mount."""
         self._model, self._near = model, near
         self._still = np.flatnonzero(~np.asarray(model.moving_spheres))
-        self._stood = self._new = np.zeros((0, 3))  # of the first scene, and what came in the last one
+        self._stood = self._new = np.zeros((0, 3))  # of the first scene; arrivals in the last one
         names = sphere_names(model.sphere_set)
         self._names = [names[s] for s in self._still]
         self.found: dict[str, tuple[float, float]] = {}
 
     def look(self, distance_to: DistanceFunction, q: Float64, was_seen: WasSeen | None) -> None:
-        """Take in the next scene, at joint positions q (J,). was_seen: None where nobody knows."""
+        """Add the next scene, at q (J,). was_seen: None if unknown."""
         if not len(self._still):
             return
         centers = np.ascontiguousarray(self._model.sphere_centers(q)[self._still])
@@ -54,9 +53,7 @@ class FixedParts:
     def _came(
         self, balls: BallDistance, centers: Float64, q: Float64, was_seen: WasSeen | None, change: Float64
     ) -> Float64:
-        """Clearance (M,) [m] of each sphere, at centers (M, 3), from balls that stand farther than `change` (M,) [m]
-        from all that stood before; infinite without any.
-        """
+        """Clearance (M,) [m] of each sphere from new balls; infinite without any."""
         model, least = self._model, np.full(len(centers), np.inf)
         radii = model.sphere_set.radii[self._still]
         away = np.linalg.norm(centers[:, None] - balls.centers, axis=2) - radii[:, None] - balls.radii

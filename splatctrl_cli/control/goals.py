@@ -1,5 +1,4 @@
-"""Where the frame should be at each time, and the velocity that leads there: a pose, a logged motion that is followed
-pose by pose, a planned way out of a local minimum, or the twists that a person or another controller commanded.
+"""Goals over time: a pose, a logged motion, a planned detour, or commanded twists.
 
 Twists are world-aligned, linear part first.
 """
@@ -18,8 +17,9 @@ from splatctrl_cli.records import Bool, Float64, FloatRows, Stamps
 
 @dataclass(frozen=True, kw_only=True)
 class Guide:
-    """How a goal itself moves: twist (6,) [m/s, rad/s], world, of its pose; posture (J,) [rad] that the arm leans to,
-    and the velocity (J,) [rad/s] of that posture.
+    """A goal's motion: twist (6,) [m/s, rad/s], world, and posture (J,) [rad] to lean to.
+
+    velocity (J,) [rad/s]: of that posture.
     """
 
     twist: Float64
@@ -28,7 +28,7 @@ class Guide:
 
 
 def rotation_vector(R: Float64) -> Float64:
-    """The logarithm (3,) [rad] of a rotation (3, 3): axis times an angle in [0, pi]."""
+    """Return the logarithm (3,) [rad] of a rotation (3, 3): axis times angle in [0, pi]."""
     quat_xyzw = quat_from_rotation(R)
     half_sine = float(np.linalg.norm(quat_xyzw[:3]))
     if half_sine == 0.0:
@@ -37,13 +37,13 @@ def rotation_vector(R: Float64) -> Float64:
 
 
 def pose_error(T_world_frame: Float64, T_world_goal: Float64) -> Float64:
-    """The twist (6,) [m, rad] in world that carries a frame to its goal in one second."""
+    """Return the twist (6,) [m, rad], world, that reaches the goal in one second."""
     rotation = rotation_vector(T_world_goal[:3, :3] @ T_world_frame[:3, :3].T)
     return np.concatenate([T_world_goal[:3, 3] - T_world_frame[:3, 3], rotation])
 
 
 def reference_velocity(error: Float64, *, gain: float, max_linear: float, max_angular: float) -> Float64:
-    """The reference (6,) [m/s, rad/s]: gain times the pose error, each part capped in norm, direction kept."""
+    """Return gain times the pose error (6,) [m/s, rad/s], each part capped in norm."""
     velocity = gain * error
     return np.concatenate([_capped(velocity[:3], max_linear), _capped(velocity[3:], max_angular)])
 
@@ -55,9 +55,7 @@ def _capped(vector: Float64, limit: float) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class LoggedMotion:
-    """T logged states by time: stamp_ns (T,) that never go back, position and velocity (T, J) [rad, rad/s], which may
-    be read from a file.
-    """
+    """T logged states: stamp_ns (T,), never going back, position, velocity (T, J) [rad, rad/s]."""
 
     stamp_ns: Stamps
     position: FloatRows
@@ -69,8 +67,9 @@ class LoggedMotion:
         return int(self.stamp_ns[-1])
 
     def at(self, stamp_ns: int) -> tuple[Float64, Float64]:
-        """Position and velocity (J,) at a stamp, linear between states; the first before all, and the last, at rest,
-        after all.
+        """Return position and velocity (J,) at a stamp, linear between states.
+
+        The first before all; the last, at rest, after all.
         """
         if stamp_ns > self.last_ns:
             return np.asarray(self.position[-1]), np.zeros(self.position.shape[1])
@@ -85,19 +84,19 @@ class LoggedMotion:
         return position, velocity
 
     def goal_at(self, model: ArmModel, frame: str, stamp_ns: int) -> tuple[Float64, Guide]:
-        """The logged pose (4, 4) of a frame at a stamp, and how it and the posture moved then."""
+        """Return a frame's logged pose (4, 4) and motion at a stamp."""
         position, velocity = self.at(stamp_ns)
         return guided_goal(model, frame, position, velocity)
 
 
 def guided_goal(model: ArmModel, frame: str, position: Float64, velocity: Float64) -> tuple[Float64, Guide]:
-    """The pose (4, 4) of a frame at a posture (J,) that moves with a velocity (J,), as a goal that moves."""
+    """Return a frame's pose (4, 4) and motion at a posture and velocity (J,)."""
     twist = model.frame_jacobian(position, frame) @ velocity
     return model.frame_pose(position, frame), Guide(twist=twist, posture=position, velocity=velocity)
 
 
 class Path(Protocol):
-    """A motion with a clock; `planner.path.TimedPath` is one."""
+    """A timed motion, such as `planner.planned.TimedPath`."""
 
     @property
     def duration(self) -> float:
@@ -105,13 +104,13 @@ class Path(Protocol):
         ...
 
     def at(self, time: float) -> tuple[Float64, Float64]:
-        """Position and velocity (1, J) at a time [s]."""
+        """Return position and velocity (1, J) at a time [s]."""
         ...
 
 
 @dataclass
 class Detour:
-    """A path with a clock that runs on only while the frame is within `wait_distance` [m] of its goal on the path."""
+    """A path whose clock runs while the frame is within `wait_distance` [m] of its goal."""
 
     path: Path
     wait_distance: float
@@ -119,16 +118,16 @@ class Detour:
 
     @property
     def is_over(self) -> bool:
-        """True once the goal stands at the path's end."""
+        """True at the path's end."""
         return self.clock >= self.path.duration
 
     def goal(self, model: ArmModel, frame: str) -> tuple[Float64, Guide]:
-        """The pose (4, 4) of a frame where the clock stands, and how it and the posture move there."""
+        """Return a frame's pose (4, 4) and motion at the clock."""
         position, velocity = self.path.at(self.clock)
         return guided_goal(model, frame, position[0], velocity[0])
 
     def advance(self, seconds: float, pose_error: Float64) -> None:
-        """Let the clock run, unless the frame is behind by its pose error (6,)."""
+        """Run the clock, unless the frame lags by its pose error (6,)."""
         if float(np.linalg.norm(pose_error[:3])) < self.wait_distance:
             self.clock = min(self.clock + seconds, self.path.duration)
 
@@ -139,9 +138,9 @@ PlanDetour = Callable[[int, Float64, Float64], Detour | None]
 
 @dataclass(frozen=True, kw_only=True)
 class TwistTrack:
-    """N twists by time: stamp_ns (N,) that rise, twist (N, 6) [m/s, rad/s] of the controlled frame, linear first.
+    """N twists (N, 6) [m/s, rad/s] of the controlled frame, linear first.
 
-    axes: the frame whose axes they are in, turned with it as the arm moves; None for those of the world.
+    stamp_ns (N,) rise; axes: frame of the axes, turning with the arm; None: world.
     """
 
     stamp_ns: Stamps
@@ -149,20 +148,20 @@ class TwistTrack:
     axes: str | None = None
 
     def at(self, stamp_ns: int, timeout: float) -> Float64:
-        """The newest twist (6,) not later than a stamp [ns]; zero where it is older than `timeout` [s] or none is."""
+        """Return the newest twist (6,); zero if none or older than `timeout` [s]."""
         index = int(np.searchsorted(self.stamp_ns, stamp_ns, side="right")) - 1
         if index < 0 or (stamp_ns - self.stamp_ns[index]) * 1e-9 > timeout:
             return np.zeros(6)
         return np.asarray(self.twist[index])
 
     def is_known(self, stamp_ns: Stamps, timeout: float) -> Bool:
-        """Whether a twist holds at each stamp (T,)."""
+        """True for stamps (T,) with a current twist."""
         index = np.searchsorted(self.stamp_ns, stamp_ns, side="right") - 1
         age = (stamp_ns - self.stamp_ns[np.maximum(index, 0)]) * 1e-9
         return np.asarray((index >= 0) & (age <= timeout))
 
     def asked(self, model: ArmModel, q: Float64, stamp_ns: int, timeout: float) -> Float64:
-        """The twist (6,) of a stamp in the world's axes, at a posture (J,); not capped."""
+        """Return a stamp's twist (6,) in world axes at q (J,), not capped."""
         twist = self.at(stamp_ns, timeout)
         if self.axes is None:
             return twist
@@ -170,7 +169,7 @@ class TwistTrack:
         return np.concatenate([R @ twist[:3], R @ twist[3:]])
 
     def reference(self, model: ArmModel, config: ControlConfig, q: Float64, stamp_ns: int) -> Float64:
-        """What the controller reaches for (6,), world: the twist, each part capped in norm as any reference."""
+        """Return the twist (6,), world, each part capped in norm."""
         return reference_velocity(
             self.asked(model, q, stamp_ns, config.twist_timeout),
             gain=1.0,
@@ -181,6 +180,6 @@ class TwistTrack:
     def goal_at(
         self, model: ArmModel, config: ControlConfig, frame: str, q: Float64, stamp_ns: int
     ) -> tuple[Float64, Guide]:
-        """The frame's own pose (4, 4) as a goal that moves with the twist; the posture leans nowhere."""
+        """Return the frame's own pose (4, 4), moving with the twist, without a posture."""
         twist = self.reference(model, config, q, stamp_ns)
         return model.frame_pose(q, frame), Guide(twist=twist, posture=q, velocity=np.zeros(len(q)))

@@ -1,8 +1,7 @@
-"""How near an arm comes to the scene between two logged states: a bound from both ends, refined where it is too low.
+"""Clearance bounds between two logged states, from both ends, refined where too low.
 
-Over an interval in which sphere s travels at most L_s, its distance to the scene is nowhere below
-``(d_0s + d_1s - L_s) / 2``, d_0s and d_1s being those at the two ends, because the exact distance is 1-Lipschitz. L_s
-follows from the joints' motion and the spheres' lever arms (`robot.levers`).
+If sphere s travels at most L_s in between, its distance is never below ``(d_0s + d_1s - L_s) / 2``, d_0s and d_1s at
+the ends, because exact distance is 1-Lipschitz. L_s follows from joint motion and `RobotModel.lever_arms`.
 """
 
 from dataclasses import dataclass
@@ -17,8 +16,9 @@ from splatctrl_cli.records import Bool, Float64
 
 @dataclass(frozen=True, kw_only=True)
 class Reach:
-    """What moves of an arm, and how far: moving (M,) sphere indices, radii (M,) [m] with what the spheres leave of
-    the surface uncovered, levers (M, J) [m per rad or m], velocity_limit (J,) [1/s].
+    """Moving spheres (M,) of an arm and their travel.
+
+    radii (M,) [m], with the uncovered surface; levers (M, J) [m per rad or m]; velocity_limit (J,) [1/s].
     """
 
     moving: "np.ndarray[tuple[int], np.dtype[np.intp]]"
@@ -28,7 +28,7 @@ class Reach:
 
     @classmethod
     def of(cls, model: ArmModel) -> "Reach":
-        """The reach of a model's moving spheres."""
+        """Return the reach of a model's moving spheres."""
         moving = np.flatnonzero(model.moving_spheres)
         deficit = np.maximum(np.nan_to_num(np.asarray(model.sphere_deficit, np.float64)[moving]), 0.0)
         return cls(
@@ -41,10 +41,10 @@ class Reach:
 
 @dataclass(frozen=True, kw_only=True)
 class Between:
-    """Of T - 1 intervals: lower (T - 1,) [m], a bound that the clearance within, ends included, is not below. Where
-    is_met (T - 1,) it is a witness instead: the clearance of a posture in between that is below the margin, so that
-    the least clearance is at most that. is_bounded (T - 1,): False where the states say too little of what the
-    arm did in between.
+    """Clearance bounds lower (T - 1,) [m] of intervals, ends included.
+
+    Where is_met (T - 1,), lower is a witness: the clearance of a posture in between, below the margin. is_bounded (T
+    - 1,): False if the states do not determine a bound.
     """
 
     lower: Float64
@@ -64,14 +64,11 @@ def between_states(
     margin: float,
     longest: float,
 ) -> Between:
-    """Bounds for the intervals between states (T, J) at stamps (T,) [ns] in one scene.
+    """Return bounds between states (T, J) at stamps (T,) [ns] in one scene.
 
-    at_states (T, M) [m]: the clearance of every moving sphere's surface at the states, by `clearances`; infinite
-    where a sphere is left out, as its contact is meant.
-
-    Up to `longest` [s] the arm is taken to have moved in a straight line of joint space, plus what its velocities
-    (T, J) say beyond that. Over a longer interval it may have gone anywhere that its velocity limits allow: it is
-    bounded only where that does not reach the margin [m].
+    at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. Up to `longest` [s] the arm
+    moved straight in joint space, plus any excess of its velocities (T, J). Over longer intervals it may have gone
+    anywhere within its velocity limits: bounded only where that stays above the margin [m].
     """
     seconds = np.diff(stamps) * 1e-9
     motion = np.abs(np.diff(positions, axis=0))
@@ -95,7 +92,7 @@ def between_states(
         away = np.where(is_met[chosen], 0.0, 0.5 * beyond[chosen].max(axis=1))
         least[chosen] = np.minimum(refined - away, ends[chosen])
     short = ~is_long & ~is_open & (ends < margin)
-    least[short] = ends[short]  # the ends are below already; how far it is below in between does not turn it
+    least[short] = ends[short]  # the ends are below the margin already
     is_bounded = np.isfinite(least) & (~is_long | (least >= margin) | (ends < margin))
     return Between(lower=least, is_met=is_met, is_bounded=is_bounded)
 
@@ -110,9 +107,7 @@ def _refined(
     distance_to: DistanceFunction,
     margin: float,
 ) -> tuple[Float64, Bool]:
-    """Least clearance bound (K,) of K straight motions: halved until every piece is above the margin, or short; and
-    (K,) whether a posture on the way is below the margin: then the least clearance of such postures.
-    """
+    """Halve straight motions until each bound reaches the margin, or the piece is short."""
     least, is_met = np.full(len(q_first), np.inf), np.zeros(len(q_first), dtype=np.bool_)
     owner = np.arange(len(q_first))
     for level in range(MAX_HALVINGS + 1):
@@ -127,10 +122,10 @@ def _refined(
         at_middle = clearances(model, reach, middle, distance_to)
         at_middle[np.isposinf(first[open_]) | np.isposinf(last[open_])] = (
             np.inf
-        )  # left out at an end: on the way, too
+        )  # excluded at an end: also in between
         reached = at_middle.min(axis=1) < margin  # a sample below the margin settles its interval
         is_first = reached & ~is_met[owner[open_]]
-        least[owner[open_[is_first]]] = np.inf  # of pieces that were settled: bounds, not postures
+        least[owner[open_[is_first]]] = np.inf  # drop the bounds of settled pieces
         is_met[owner[open_[reached]]] = True
         np.minimum.at(least, owner[open_[reached]], at_middle[reached].min(axis=1))
         settled = np.isin(owner[open_], owner[open_[reached]])
@@ -143,6 +138,6 @@ def _refined(
 
 
 def clearances(model: ArmModel, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:
-    """(T, M) [m] of every moving sphere's part of the body at postures (T, J), with what it leaves uncovered."""
+    """Return moving spheres' clearances (T, M) [m], less their uncovered surface."""
     each, is_surface = part_clearances(model, positions, distance_to)
     return np.asarray(each - np.where(is_surface, 0.0, reach.radii - model.sphere_set.radii[reach.moving]))

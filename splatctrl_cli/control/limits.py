@@ -1,6 +1,4 @@
-"""Joint position, velocity and acceleration limits, merged into one box of joint velocities that is never empty; and
-whether a motion keeps them, from its positions, a block at a time.
-"""
+"""Joint limits merged into one velocity box, never empty; and checks of motions."""
 
 import re
 from collections.abc import Sequence
@@ -17,7 +15,7 @@ from splatctrl_cli.records import Float64, Index, Stamps
 Rows = tuple[Float64, Float64]
 FR3 = "fr3"
 # Highest: min(v_max, max(0, sqrt(max(0, k (q_upper - q))) - v_0)); lowest: the same of q - q_lower, negative. The
-# numbers are those of Franka's control parameters and of libfranka (include/franka/rate_limiting.h,
+# numbers come from Franka's control parameters and libfranka (include/franka/rate_limiting.h,
 # computeUpperLimitsJointVelocity and computeLowerLimitsJointVelocity), without its tolerance of 1e-3 rad/s.
 FR3_JOINTS = (  # v_max [rad/s], v_0 [rad/s], k [rad/s^2], q_lower [rad], q_upper [rad]
     (2.62, 0.30, 12.0, -2.7501, 2.7501),
@@ -32,8 +30,10 @@ FR3_JOINTS = (  # v_max [rad/s], v_0 [rad/s], k [rad/s^2], q_lower [rad], q_uppe
 
 @dataclass(frozen=True, kw_only=True)
 class VelocityLimits:
-    """The velocity limits of J joints by position: most (J,) [rad/s] everywhere; near a position limit
-    ``sqrt(slope (limit - q)) - offset`` with slope (J,) [rad/s^2], offset (J,) [rad/s]; lower, upper (J,) [rad].
+    """Position-dependent velocity limits of J joints.
+
+    most (J,) [rad/s] everywhere; near a position limit ``sqrt(slope (limit - q)) - offset`` with slope (J,)
+    [rad/s^2], offset (J,) [rad/s]; lower, upper (J,) [rad].
     """
 
     most: Float64
@@ -43,7 +43,7 @@ class VelocityLimits:
     upper: Float64
 
     def at(self, q: Float64) -> tuple[Float64, Float64]:
-        """Lowest and highest velocity (J,), (J,) [rad/s] at q (J,): zero lies between them."""
+        """Return lowest and highest velocity (J,), (J,) [rad/s]; zero lies between."""
         return -self._towards(q - self.lower), self._towards(self.upper - q)
 
     def _towards(self, room: Float64) -> Float64:
@@ -52,9 +52,9 @@ class VelocityLimits:
 
 
 def fr3_limits(joint_names: Sequence[str]) -> VelocityLimits:
-    """The limits of the FR3's joints, which are known by the ends of their names.
+    """Return the limits of the FR3's joints, matched by the ends of their names.
 
-    Raises UsageError for a joint of another name, or one named twice.
+    Raises UsageError for other names or duplicates.
     """
     found = [re.search(r"(?:^|_)joint([1-7])$", name) for name in joint_names]
     numbers = [0 if match is None else int(match.group(1)) for match in found]
@@ -69,15 +69,15 @@ def fr3_limits(joint_names: Sequence[str]) -> VelocityLimits:
 
 
 def braking_speed(room: Float64, gain: float, deceleration: Float64, period: float) -> Float64:
-    """The highest speed (M,) at which a room (M,) may be used up, so that a later step need never brake harder.
+    """Return the highest speed (M,) into room (M,) that never requires harder braking later.
 
-    Up to ``v = a / alpha`` the linear bound ``alpha r`` itself asks for no more than the deceleration a (M,), inf
-    where there is no limit. Faster, the room must hold the way to that speed at a, and one period more:
+    Up to ``v = a / alpha`` the linear bound ``alpha r`` itself needs at most the deceleration a (M,), inf without a
+    limit. Faster, the room must hold the way to that speed at a, and one period more:
 
         r(v) = a / alpha^2 + (v^2 - a^2 / alpha^2) / (2 a) + (v - a / alpha) dt,
 
-    which is continuous at a / alpha. Along it ``r(v - a dt) <= r(v) - v dt``: after a step at v the room that is left
-    allows v - a dt. Never above ``alpha r``, so what that bound guarantees holds; the same where r < 0.
+    which is continuous at a / alpha. Along it ``r(v - a dt) <= r(v) - v dt``: after a step at v, the room left allows
+    v - a dt. Never above ``alpha r``, so that bound's guarantee holds; equal to it where r < 0.
     """
     linear = gain * room
     knee = deceleration / gain
@@ -92,16 +92,15 @@ def braking_speed(room: Float64, gain: float, deceleration: Float64, period: flo
 
 
 def brought_to_rest(last_velocity: Float64, change: Float64) -> Float64:
-    """The velocity (J,) nearest to zero that is no farther than `change` (J,) from the last one."""
+    """Return the velocity (J,) nearest zero within `change` (J,) of the last."""
     return np.asarray(np.clip(0.0, last_velocity - change, last_velocity + change))
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointLimits:
-    """The limits of J joints: lower, upper [rad], velocity [rad/s], acceleration [rad/s^2] (None: no limit).
+    """Limits of J joints: lower, upper [rad], velocity [rad/s], acceleration [rad/s^2] (None: none).
 
-    gain [1/s] is that of the position limits, period [s] how long a velocity is held; by_position: velocity limits
-    that hold beside `velocity` and depend on the position.
+    gain [1/s]: of position limits; period [s]: of one velocity; by_position: further velocity limits.
     """
 
     lower: Float64
@@ -114,8 +113,9 @@ class JointLimits:
 
     @classmethod
     def of(cls, model: ArmModel, config: ControlConfig) -> "JointLimits":
-        """The limits of an arm as the configuration has them. Raises UsageError for an acceleration below 0, or one
-        per joint for another number of joints.
+        """Return an arm's configured limits.
+
+        Raises UsageError for a wrong number of accelerations.
         """
         return cls(
             lower=model.lower,
@@ -128,12 +128,11 @@ class JointLimits:
         )
 
     def box(self, q: Float64, last_velocity: Float64 | None = None) -> tuple[Float64, Float64]:
-        """Lowest and highest joint velocity (J,), (J,) [rad/s] allowed at q after a last velocity (None: not known,
-        so that no acceleration counts).
+        """Return lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
-        The acceleration gives way where it cannot be kept together with velocity and position, to the velocity within
-        those two that is nearest to it: so the box is not empty. From a state that this box led to it never has to,
-        unless the limits by position ask for more.
+        Without last_velocity no acceleration counts. An acceleration in conflict with velocity and position yields to
+        the nearest velocity within those, so the box is never empty. From a state that this box led to it never
+        yields, unless by_position is stricter.
         """
         lowest, highest = velocity_box(
             q, self.lower, self.upper, self.velocity, self.gain, acceleration=self.acceleration, period=self.period
@@ -147,7 +146,7 @@ class JointLimits:
         return (np.clip(last_velocity - change, lowest, highest), np.clip(last_velocity + change, lowest, highest))
 
     def rest(self, last_velocity: Float64 | None) -> Float64:
-        """What holding still is (J,) [rad/s]: zero, or the nearest to it that the acceleration allows."""
+        """Return standstill (J,) [rad/s]: zero, or the nearest that the acceleration allows."""
         if self.acceleration is None or last_velocity is None:
             return np.zeros(len(self.lower))
         return brought_to_rest(last_velocity, self.acceleration * self.period)
@@ -163,12 +162,11 @@ def velocity_box(
     acceleration: Float64 | None = None,
     period: float = 0.0,
 ) -> tuple[Float64, Float64]:
-    """Lowest and highest joint velocity (J,), (J,) [rad/s] allowed at q.
+    """Return lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
-    III-E: ``v <= alpha (q_max - q)``, ``v >= -alpha (q - q_min)``, ``|v| <= v_max``, alpha the gain [1/s]; where an
-    acceleration (J,) [rad/s^2] is given, `braking_speed` of the same room. Both position rows are clipped into the
-    velocity range, so the box is not empty where q lies outside its limits: there it asks for the way back, at the
-    velocity limit when far.
+    III-E: ``v <= alpha (q_max - q)``, ``v >= -alpha (q - q_min)``, ``|v| <= v_max``, alpha the gain [1/s]; with an
+    acceleration (J,) [rad/s^2], `braking_speed` of that room. Clipping into the velocity range keeps the box
+    non-empty for q outside its limits: there it demands the way back, at the velocity limit when far.
     """
     above, below = upper - q, q - lower
     if acceleration is None:
@@ -182,13 +180,12 @@ def velocity_box(
 
 
 def box_rows(lowest: Float64, highest: Float64) -> Rows:
-    """The box as rows ``G v <= h``: J upper rows, then J lower rows."""
+    """Return the box as rows ``G v <= h``: J upper, then J lower."""
     identity = np.eye(len(lowest))
     return np.vstack([identity, -identity]), np.concatenate([highest, -lowest])
 
 
 def _acceleration(value: float | tuple[float, ...], joints: Sequence[str]) -> Float64 | None:
-    """One acceleration per joint (J,) [rad/s^2], None where there is no limit."""
     each = np.atleast_1d(np.asarray(value, dtype=np.float64))
     if len(each) not in (1, len(joints)):
         raise UsageError(
@@ -202,8 +199,9 @@ def _acceleration(value: float | tuple[float, ...], joints: Sequence[str]) -> Fl
 
 @dataclass(frozen=True, kw_only=True)
 class Strain:
-    """Of T states: the largest velocity (T,) as a share of its joint's limit, at joint (T,); likewise acceleration,
-    0 throughout where there is no limit.
+    """Largest velocity (T,) as a share of its joint's limit, at joint (T,); likewise acceleration.
+
+    Acceleration is 0 without a limit.
     """
 
     velocity: Float64
@@ -213,8 +211,10 @@ class Strain:
 
 
 class MotionLimits:
-    """Velocities from the last state, and from `MOTION_WINDOW` earlier, each less what the encoder may be off;
-    accelerations from three places `MOTION_WINDOW` apart. A sample is of the time before it.
+    """A motion's velocities and accelerations as shares of limits, less encoder error.
+
+    Velocities since the last state and over `MOTION_WINDOW`; accelerations from three places `MOTION_WINDOW` apart. A
+    sample covers the time before it.
     """
 
     def __init__(self, velocity_limit: Float64, acceleration_limit: Float64 | None) -> None:
@@ -224,7 +224,7 @@ class MotionLimits:
         self._positions: Float64 = np.zeros((0, len(velocity_limit)))
 
     def add(self, stamps: Stamps, positions: Float64) -> Strain:
-        """The next states: stamps (T,) [ns], positions (T, J)."""
+        """Return the strain of the next states: stamps (T,) [ns], positions (T, J)."""
         num = len(stamps)
         all_stamps = np.concatenate([self._stamps, stamps])
         everything = np.concatenate([self._positions, positions])
@@ -253,7 +253,7 @@ class MotionLimits:
         )
 
     def _accelerations(self, stamps: Stamps, all_stamps: Stamps, everything: Float64) -> Float64:
-        """(T, J) [1/s^2], less what the encoder may be off; 0 where the motion is not old enough."""
+        """(T, J) [1/s^2], less encoder error; 0 while the motion is too short."""
         seconds = (all_stamps - all_stamps[0]) * 1e-9
         now = (stamps - all_stamps[0]) * 1e-9
         found = np.zeros((len(stamps), everything.shape[1]))

@@ -1,6 +1,4 @@
-"""A process of somebody else that is asked a line at a time; what it may do wrong has a name, and bounds in time and
-memory.
-"""
+"""An external process of lines, with named faults and bounded time and memory."""
 
 import os
 import selectors
@@ -12,12 +10,12 @@ from contextlib import suppress
 from enum import StrEnum
 
 MAX_LINE = 1 << 20  # bytes
-LEAVE_LIMIT = 20.0  # [s] for a process to end once it has closed its stdout: a busy machine takes seconds
-TAIL = 4096  # bytes of stderr that are kept
+LEAVE_LIMIT = 20.0  # [s] from closed stdout to the process's end: a busy machine takes seconds
+TAIL = 4096  # bytes of stderr to keep
 
 
 class Fault(StrEnum):
-    """What a controller can do wrong."""
+    """Fault of a controller."""
 
     LATE = "late"
     HUNG = "hung"
@@ -43,10 +41,10 @@ class Misbehaved(Exception):  # noqa: N818  (a result, kept by name)
 
 
 class LineProcess:
-    """A process that is asked a line at a time; its lines and what is kept of its stderr are bounded."""
+    """A process that answers lines; its lines and stored stderr are bounded."""
 
     def __init__(self, command: Sequence[str]) -> None:
-        """Raises OSError where it cannot be started."""
+        """Raises OSError if it cannot start."""
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(
             command, stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0, start_new_session=True
@@ -61,7 +59,7 @@ class LineProcess:
             self._selector.register(number, selectors.EVENT_READ)
 
     def exchange(self, line: bytes, limit: float) -> bytes:
-        """Send a line, and return the next one that comes. Raises Misbehaved where none comes within `limit` [s]."""
+        """Send a line and return the next one. Raises Misbehaved after `limit` [s]."""
         deadline = time.monotonic() + limit
         if not self._unsent:
             self._selector.register(self._stdin, selectors.EVENT_WRITE)
@@ -78,22 +76,22 @@ class LineProcess:
         return answer
 
     def last_words(self) -> str:
-        """The last line of its stderr as an addition to a sentence, empty without one."""
+        """Return the last stderr line to append to a sentence, or nothing."""
         lines = [line.strip() for line in self._tail.decode("utf-8", "replace").splitlines() if line.strip()]
         return f": {shown(lines[-1])}" if lines else ""
 
     def close(self) -> None:
-        """End it, with whatever it has started."""
+        """End it and its children."""
         self._selector.close()
         for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
             if stream is not None:
                 with suppress(OSError):
                     stream.close()
-        self._has_left(0.2)  # by itself, now that there is nothing to read
+        self._has_left(0.2)  # by itself, after the end of its input
         self._kill()
 
     def _has_left(self, seconds: float) -> bool:
-        """Whether it ends by itself within so long. It is left as it is, so that nobody else gets its number."""
+        """True if it ends by itself in time. It is not reaped, so its number stays reserved."""
         deadline, how = time.monotonic() + seconds, os.WEXITED | os.WNOWAIT | os.WNOHANG
         while self._process.returncode is None and os.waitid(os.P_PID, self._process.pid, how) is None:
             if time.monotonic() > deadline:
@@ -102,13 +100,11 @@ class LineProcess:
         return True
 
     def _kill(self) -> None:
-        """End it, with whatever it has started."""
         if self._process.returncode is None:
             os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
 
     def _transfer(self, timeout: float) -> None:
-        """Write and read what can be, after `timeout` [s] at most."""
         for key, _ in self._selector.select(timeout):
             if key.fd == self._stdin:
                 self._send()
@@ -123,19 +119,18 @@ class LineProcess:
     def _send(self) -> None:
         try:
             del self._unsent[: os.write(self._stdin, self._unsent)]
-        except BrokenPipeError:  # what it says last, or how it ended, is still to come
+        except BrokenPipeError:  # its last words or its exit status are still to come
             self._unsent.clear()
         if not self._unsent:
             self._selector.unregister(self._stdin)
 
     def _keep_tail(self) -> bool:
-        """Read of stderr what is there; False at its end."""
+        """Read available stderr; False at its end."""
         part = os.read(self._stderr, 1 << 16)
         self._tail = (self._tail + part)[-TAIL:]
         return bool(part)
 
     def _ended(self) -> Misbehaved:
-        """How it ended, after its stdout did."""
         has_left = self._has_left(LEAVE_LIMIT)
         self._kill()
         with suppress(BlockingIOError):
@@ -149,6 +144,6 @@ class LineProcess:
 
 
 def shown(text: str) -> str:
-    """A program's words, short, on one line, and nothing in it that a terminal acts on."""
+    """Return a program's words: short, on one line, without terminal controls."""
     printable = "".join(c if c.isprintable() else "?" for c in text[:120])
     return f"{printable} ..." if len(text) > 120 else printable

@@ -1,7 +1,7 @@
-"""What cameras knew of the space beside a moving arm: each point within the margin has exactly one class of evidence.
+"""Camera evidence near a moving arm: each point within the margin has one class.
 
-The space inside the arm is never seen. The points are those of a lattice outside of the robot and within the margin
-of its moving links: of their own surfaces where these have triangles, else of their spheres.
+The arm's inside is never seen. The points form a lattice outside the robot, near its moving links' triangles, else
+spheres.
 """
 
 from collections.abc import Callable
@@ -26,11 +26,11 @@ NEVER_SEEN = (
 
 @dataclass(frozen=True, kw_only=True)
 class Seen:
-    """What cameras had seen at one moment.
+    """Camera evidence at one moment.
 
-    look: points (Q, 3) [m], world -> stamps (Q,) [ns] at which a camera last returned depth through or on them, -1
-    never, and `EvidenceClass` (Q,), `FREE` whenever they were seen. edges: centre and radius (K, 4) [m], world, of
-    balls in which a surface may go on where its edge was lost. origin (3,), voxel [m]: of the voxels behind it.
+    look: points (Q, 3) [m], world -> stamps (Q,) [ns] of the last depth through or on them, -1 never, and
+    `EvidenceClass` (Q,), `FREE` if ever seen. edges (K, 4) [m], world: balls that a surface past its lost edge may
+    reach. origin (3,), voxel [m].
     """
 
     look: Callable[[Float64], tuple[NDArray[np.int64], UInt8]]
@@ -41,14 +41,14 @@ class Seen:
 
 @dataclass(frozen=True, kw_only=True)
 class Account:
-    """What was known of the space beside the arm in one posture.
+    """Evidence near the arm in one posture.
 
-    shares (C,): of the points within the margin, by `EvidenceClass`. assumed: the share that is not free, of the
-    points whose voxels reach into the margin. nearest (C,) [m]: how near each class comes to the arm, and places
-    (C, 3) [m]. unseen_to_surface [m]: how near a never-seen point is to the map's surfaces, and its place (3,).
-    blind_to_surface [m]: the same of points about a sphere that comes to almost nothing else (`NEAR_BLIND`). Infinite
-    and NaN where there is none. age [s]: within which `NEAR_FRESH_SHARE` of the seen points were last seen. ahead
-    [s]: how long after the state the last of them was seen. NaN where nothing was seen.
+    shares (C,): of points within the margin, by `EvidenceClass`. assumed: share not free, of points whose voxels
+    reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places (C, 3).
+    unseen_to_surface [m]: least distance of a never-seen point to the map's surfaces, at unseen_place;
+    blind_to_surface [m]: likewise, about spheres with almost only such points (`NEAR_BLIND`). Infinite and NaN
+    without any. age [s]: quantile `NEAR_FRESH_SHARE` of seen points' ages; ahead [s]: from the state to the latest
+    view. NaN without views.
     """
 
     shares: Float64
@@ -64,10 +64,10 @@ class Account:
 
 
 class NearSpace:
-    """Takes account of the states of a motion that are far enough apart, in time or in space."""
+    """Evaluates states of a motion far enough apart in time or space."""
 
     def __init__(self, model: ArmModel, margin: float, max_age: float = np.inf) -> None:
-        """max_age [s]: what was seen longer ago is stale."""
+        """max_age [s]: older evidence is stale."""
         self._model, self._margin, self._max_age = model, margin, max_age
         self._moving = model.moving_spheres
         self._radii = np.asarray(model.sphere_set.radii, np.float64)
@@ -76,12 +76,13 @@ class NearSpace:
         self._surfaces = model.link_distances
         self._grids = dict[str, tuple[Float64, Float64]]()  # by link, as `_grid_of`
         self._next_ns = -(2**63)
-        self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres when they were last looked about
+        self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres at the last evaluation
 
     def due(self, stamps: NDArray[np.int64], centers: Float64) -> dict[int, bool]:
-        """Of states at stamps (T,) [ns] that do not go back, with their spheres' centres (T, S, 3), those to look at:
-        each time a sphere has moved by `NEAR_MOVED`, and True for those `NEAR_EVERY_NS` after the last such, whose
-        ages count.
+        """Return indices of states to evaluate; True if their ages count.
+
+        A state is due once a sphere has moved by `NEAR_MOVED`, and (True) every `NEAR_EVERY_NS`. stamps (T,) [ns]
+        never go back; centers (T, S, 3).
         """
         chosen, moving = dict[int, bool](), centers[:, self._moving]
         for index, stamp_ns in enumerate(stamps.tolist()):
@@ -93,13 +94,12 @@ class NearSpace:
         return chosen
 
     def _has_moved(self, centers: Float64) -> bool:
-        """Whether one of the moving spheres (M, 3) is `NEAR_MOVED` from where it was last looked about."""
         if self._looked is None:
             return False
         return bool(np.sum((centers - self._looked) ** 2, axis=1).max(initial=0.0) >= fixed.NEAR_MOVED**2)
 
     def on_the_way(self, first: Float64, last: Float64) -> Float64:
-        """Postures (K, J) between two (J,), so many that no sphere moves by `NEAR_MOVED` from one to the next."""
+        """Return postures (K, J) in between, so dense that no sphere moves by `NEAR_MOVED`."""
         begin, end = self._model.sphere_centers_batch(np.stack([first, last]))[:, self._moving]
         num = int(np.ceil(np.linalg.norm(end - begin, axis=1).max(initial=0.0) / fixed.NEAR_MOVED))
         return np.asarray(first + (last - first) * (np.arange(1, num) / max(num, 1))[:, None])
@@ -107,11 +107,11 @@ class NearSpace:
     def look(
         self, stamp_ns: int, q: Float64, known: Seen, distance: Callable[[Float64], Float64] | None = None
     ) -> Account:
-        """What was known about the posture q (J,) at a stamp; distance: of points (Q, 3) from the map's surfaces."""
+        """Return the evidence at posture q (J,); distance: to the map's surfaces."""
         centers, step = self._model.sphere_centers(q), _step_of(known.voxel)
         points = self._lattice(known.origin, step, centers)
         gaps, spheres = self._gaps(q, centers, points, self._margin + step / 2)
-        is_near = (gaps > 0) & (gaps <= self._margin + step / 2)  # the voxel of a point that far reaches into it
+        is_near = (gaps > 0) & (gaps <= self._margin + step / 2)  # the voxel of such a point reaches into the margin
         points, gaps, spheres = points[is_near], gaps[is_near], spheres[is_near]
         seen_ns, classes = known.look(points)
         ages, is_seen = (stamp_ns - seen_ns) * 1e-9, seen_ns >= 0
@@ -144,7 +144,6 @@ class NearSpace:
         )
 
     def _lattice(self, origin: Float64, step: float, centers: Float64) -> Float64:
-        """Points (Q, 3) [m], `step` [m] apart from `origin` (3,), in the moving spheres grown by the margin."""
         at = (centers[self._moving] - origin) / step
         reaches = (self._radii[self._moving] + self._margin) / step + 0.5
         first = np.floor((at - reaches[:, None]).min(axis=0)).astype(int)
@@ -157,9 +156,7 @@ class NearSpace:
         return np.asarray(origin + step * (first + np.argwhere(is_near)))
 
     def _gaps(self, q: Float64, centers: Float64, points: Float64, reach: float) -> tuple[Float64, Index]:
-        """The distance (Q,) [m] of points (Q, 3) to the moving links, infinite beyond `reach` [m], negative within
-        any link; and the number (Q,) of the nearest moving sphere.
-        """
+        """Distance (Q,) to the moving links, infinite beyond `reach`, negative inside; nearest sphere (Q,)."""
         to_spheres = cdist(points, centers) - self._radii
         gaps = np.full(len(points), np.inf)
         is_inside = np.zeros(len(points), bool)
@@ -177,9 +174,7 @@ class NearSpace:
         return np.where(is_inside, -np.abs(gaps), gaps), nearest
 
     def _gap_to(self, name: str, points: Float64) -> Float64:
-        """Signed distance (Q,) [m] of points (Q, 3) in a link's frame to its surface, near it to about a millimetre:
-        from nodes half of `NEAR_LATTICE` apart.
-        """
+        """Interpolated distance (Q,) [m] to a link's surface, good to about a millimetre nearby."""
         if name not in self._grids:
             self._grids[name] = self._grid_of(name)
         lower, values = self._grids[name]
@@ -187,7 +182,6 @@ class NearSpace:
         return np.asarray(map_coordinates(values, at.T, order=1, mode="nearest"))
 
     def _grid_of(self, name: str) -> tuple[Float64, Float64]:
-        """A corner (3,) [m] of nodes about a link, in its frame, and their distances to its surface."""
         step, own, reach = fixed.NEAR_LATTICE, self._links == name, self._margin + 2 * fixed.NEAR_LATTICE
         centers, radii = self._model.sphere_set.centers[own], self._radii[own, None] + reach
         lower = (centers - radii).min(axis=0)
@@ -201,7 +195,6 @@ class NearSpace:
         return lower, values.reshape(2 * num - 1)
 
     def _nearest_edge(self, q: Float64, centers: Float64, edges: Float64) -> tuple[float, Float64]:
-        """The least distance [m] of the arm to balls (K, 4) [m], at least 0, and the centre (3,) of that ball."""
         reach = self._margin + np.max(edges[:, 3], initial=0.0)
         around = self._radii.max() + reach
         moving = centers[self._moving]
@@ -213,18 +206,16 @@ class NearSpace:
 
 
 def _step_of(voxel: float) -> float:
-    """The lattice's step [m] for voxels [m]: some of them, one, or a part of one."""
+    """Lattice step [m]: a multiple or fraction of a voxel."""
     return float(voxel * np.ceil(fixed.NEAR_LATTICE / voxel - 1e-6) / np.ceil(voxel / fixed.NEAR_LATTICE - 1e-6))
 
 
 def _nearest_of(points: Float64, away: Float64) -> tuple[float, Float64]:
-    """The least of distances (Q,) [m] of points (Q, 3) and its point, infinite and NaN without one."""
     least = int(away.argmin()) if len(away) else None
     return (np.inf, np.full(3, np.nan)) if least is None else (float(away[least]), points[least])
 
 
 def _nearest_by(classes: UInt8, gaps: Float64, points: Float64) -> tuple[Float64, Float64]:
-    """The least of gaps (Q,) [m] of each `EvidenceClass` (C,), at least 0, and its point (C, 3)."""
     nearest, places = np.full(len(EvidenceClass), np.inf), np.full((len(EvidenceClass), 3), np.nan)
     for each in np.unique(classes):
         mine = np.flatnonzero(classes == each)

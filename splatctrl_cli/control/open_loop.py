@@ -1,4 +1,4 @@
-"""Open loop: what the controller would have commanded at every logged state, beside what was done there."""
+"""Open loop: the controller's command at every logged state, next to the logged one."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,10 +19,9 @@ FieldAt = Callable[[int], DistanceField]
 
 @dataclass(frozen=True, kw_only=True)
 class OpenLoopTask:
-    """What the controller is asked for at each state: the logged motion itself, or a goal pose (4, 4) of the frame,
-    or the twists of the log.
+    """Goal at each state: logged motion, a frame's pose (4, 4), or logged twists.
 
-    home (J,) [rad] is the posture leant to beside a goal pose; None is the middle of the limits.
+    home (J,) [rad]: attracts free motion with a pose (None: `middle`).
     """
 
     frame: str
@@ -33,10 +32,10 @@ class OpenLoopTask:
 
 @dataclass(frozen=True, kw_only=True)
 class OpenLoopTrace:
-    """T states: the step that the controller would have taken and the room that the logged velocity left.
+    """T states: the controller's step, and the room that the logged velocity left.
 
-    Both are None where the field has no distance, the step also where nobody was left to ask.
-    logged, commanded (T, J) [rad/s]; commanded is NaN there.
+    Both are None where the field has no distance, the step also after the commander's end. commanded (T, J) [rad/s]
+    is NaN there.
     """
 
     logged: Float64
@@ -61,11 +60,10 @@ def open_loop(
     scene_step_at: SceneStepAt | None = None,
     commander: Commander = OURS,
 ) -> OpenLoopTrace:
-    """Ask the commander at every logged state, each in the field known at its stamp; nothing is integrated.
+    """Ask the commander at every logged state, in the field known then; nothing is integrated.
 
-    Asked for the logged motion itself, the command is the logged velocity wherever no row shapes it: what differs is
-    the intervention. has_distance (T,): where it is False nobody is asked, nor after the commander's last step;
-    scene_step_at as in `closed_loop`.
+    For the logged motion, command and logged velocity differ only where a row shapes it: the intervention.
+    has_distance (T,): False skips a state. scene_step_at as in `closed_loop`.
     """
     field = field_at(int(motion.stamp_ns[0]))
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home)
@@ -100,8 +98,9 @@ def open_loop(
 
 
 def is_shaped(step: ControlStep | None, kind: RowKind | None = None) -> bool:
-    """True where a row (of a kind) shapes the command, or without a kind where the step was not plainly taken; what
-    shapes the command of a controller that is not ours is not known.
+    """True if a row (of a kind) shapes the command.
+
+    Without a kind also any fallback or scaling counts. False for external controllers, whose reasons are unknown.
     """
     if step is None or step.rung is Rung.OUTSIDE:
         return False

@@ -1,7 +1,6 @@
-"""A controller that is not ours, in a process of its own: a line of JSON goes in, a line comes back
-(docs/controllers.md).
+"""External controllers: processes that answer JSON lines (docs/controllers.md).
 
-A Python class is asked in the same way, by a process of ours that has it (`user_controller.serve`).
+`user_controller.serve` serves a Python class in the same way.
 """
 
 import json
@@ -25,11 +24,11 @@ from splatctrl_cli.control.user_controller import PROTOCOL
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64
 
-STEP_LIMIT = 10.0  # [s] for one answer: of a machine that has other things to do, too
-PATIENCE = 3.0  # times that limit, after which an answer is not waited for any more
-START_LIMIT = 120.0  # [s] for the first answer: a program may load much
+STEP_LIMIT = 10.0  # [s] for one answer, also on a busy machine
+PATIENCE = 3.0  # times that limit, after which waiting ends
+START_LIMIT = 120.0  # [s] for the first answer: loading may take long
 RUN_LIMIT = 3600.0  # [s] for all answers together
-MAX_SPEED = 10.0  # times a joint's velocity limit; faster is no command
+MAX_SPEED = 10.0  # times a joint's velocity limit; a faster command is a fault
 SERVE = "import sys; from splatctrl_cli.control.user_controller import serve; serve(sys.argv[1])"
 
 Document = dict[str, Any]
@@ -45,10 +44,10 @@ class Failure:
 
 
 class Program:
-    """A controller that speaks the lines of docs/controllers.md."""
+    """A controller process with the lines of docs/controllers.md."""
 
     def __init__(self, name: str, command: Sequence[str], start: Document, step_limit: float) -> None:
-        """Start it and tell it the `start`. Raises InputError for one that cannot be started or is none."""
+        """Start it with `start`. Raises InputError if it cannot start or is no controller."""
         self._step_limit, self._seconds, self._num = step_limit, 0.0, 0
         self.spent = 0.0  # [s] on the last step
         try:
@@ -76,8 +75,9 @@ class Program:
     def velocity(
         self, question: Document, rows: Callable[[], list[Document]], limits: Mapping[str, float]
     ) -> Float64:
-        """The answer (J,) [rad/s] to a question, and where it asks for them the rows. limits (J) [rad/s]: by
-        joint. Raises Misbehaved.
+        """Return the answer (J,) [rad/s], sending rows on request. Raises Misbehaved.
+
+        limits (J) [rad/s]: by joint.
         """
         self._num += 1
         self.spent, has_rows = 0.0, False
@@ -95,7 +95,6 @@ class Program:
         self._process.close()
 
     def _asked(self, line: bytes) -> Document:
-        """The answer to a line, within the limits."""
         if self._seconds > RUN_LIMIT:
             raise Misbehaved(Fault.OUT_OF_TIME, f"took {RUN_LIMIT:g} s for all its answers together")
         began = time.monotonic()
@@ -110,9 +109,9 @@ class Program:
 
 
 class OutsideController:
-    """The `Commander` that asks a user's controller, or two of the same kind, which must agree to the bit.
+    """The `Commander` of a user's controller, or of two copies that must agree to the bit.
 
-    num_answers, seconds, slowest: of the answers so far how many, how long [s] all of them and the slowest took.
+    num_answers, seconds, slowest: count of answers, total and longest time [s].
     """
 
     def __init__(
@@ -127,7 +126,7 @@ class OutsideController:
         step_limit: float = STEP_LIMIT,
         is_twice: bool = False,
     ) -> None:
-        """name: as people call it. frame, home: as of `QpIkController`. Raises InputError where it cannot start."""
+        """name: for messages; frame, home: as `QpIkController`. Raises InputError if it cannot start."""
         self.name, self.num_answers, self.seconds, self.slowest = name, 0, 0.0, 0.0
         self.failure: Failure | None = None
         self._model, self._frame = model, frame
@@ -192,7 +191,7 @@ def class_command(target: str) -> tuple[str, ...]:
 
 
 def _start(model: ArmModel, config: ControlConfig, frame: str, home: Float64) -> Document:
-    """The first line; see `ControllerStart`."""
+    """First line; see `ControllerStart`."""
     acceleration = JointLimits.of(model, config).acceleration
     return {
         "protocol": PROTOCOL,
@@ -209,7 +208,7 @@ def _start(model: ArmModel, config: ControlConfig, frame: str, home: Float64) ->
 
 
 def _question(model: ArmModel, frame: str, moment: Moment, view: View) -> Document:
-    """The line of a step; see `ControllerInput`."""
+    """Line of a step; see `ControllerInput`."""
     guide = moment.guide
     return {
         "stamp_ns": moment.stamp_ns,
@@ -226,7 +225,7 @@ def _question(model: ArmModel, frame: str, moment: Moment, view: View) -> Docume
 
 
 def _rows(controller: QpIkController, view: View) -> list[Document]:
-    """The rows of the moving spheres, and of the pairs that the program needs; see `ClearanceRow`."""
+    """Scene rows, and pairs in the program; see `ClearanceRow`."""
     rows, kinds = view.rows, controller.row_kinds
     G = np.concatenate([barrier.G for barrier in rows.barriers])
     h, distance = rows.h, rows.distance
@@ -265,12 +264,11 @@ def _document(line: bytes) -> Document:
 
 
 def _whole(digits: str) -> int | float:
-    """A whole number of JSON; infinite where it has more digits than any float."""
+    """A JSON integer; infinite if longer than any float."""
     return int(digits) if len(digits) < 300 else math.inf
 
 
 def _velocity(answer: Document, limits: Mapping[str, float]) -> Float64:
-    """The velocity (J,) of an answer, none of it absurd."""
     values = answer.get("velocity")
     if not isinstance(values, list) or len(values) != len(limits) or any(type(v) not in (int, float) for v in values):
         got = (

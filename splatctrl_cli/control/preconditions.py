@@ -1,4 +1,4 @@
-"""What must hold before a controller runs, and what no controller can change."""
+"""Conditions for running a controller, and violations that none can change."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ from splatctrl_cli.records import DistanceField, Float64
 
 @dataclass(frozen=True, kw_only=True)
 class StaticViolation:
-    """A sphere that no joint moves and that is closer to the scene than the margin."""
+    """A fixed sphere closer to the scene than the margin."""
 
     sphere: str
     clearance: float
 
 
 def check_model(model: ArmModel) -> None:
-    """Raise InputError for a robot without velocity limits, or without a sphere that moves."""
+    """Raise InputError for a robot without velocity limits or moving spheres."""
     has_limit = np.asarray(model.velocity_limit) > 0
     if not np.all(has_limit):
         joint = int(np.argmin(has_limit))
@@ -34,7 +34,7 @@ def check_model(model: ArmModel) -> None:
 
 
 def check_coverage(model: ArmModel, config: ControlConfig) -> None:
-    """Raise InputError where the rows should make up for uncovered surface and nobody measured how much there is."""
+    """Raise InputError if rows should compensate for uncovered surface that was not measured."""
     unknown = np.isnan(model.sphere_deficit) & np.asarray(model.moving_spheres)
     if config.coverage == "margin" and np.any(unknown):
         name = sphere_names(model.sphere_set)[int(np.argmax(unknown))]
@@ -45,7 +45,7 @@ def check_coverage(model: ArmModel, config: ControlConfig) -> None:
 
 
 def checked_posture(model: ArmModel, q: Float64, *, what: str = "joint positions") -> Float64:
-    """q as (J,) float64. Raises InputError where it has another size or is not finite."""
+    """Return q as (J,) float64. Raises InputError for another size or a non-finite value."""
     posture = np.asarray(q, dtype=np.float64)
     if posture.shape != (len(model.joint_names),):
         names = ", ".join(model.joint_names)
@@ -57,7 +57,7 @@ def checked_posture(model: ArmModel, q: Float64, *, what: str = "joint positions
 
 
 def check_within_limits(model: ArmModel, q: Float64, tolerance: float, what: str = "start") -> None:
-    """Raise InputError for a start or goal q (J,) outside the position limits by more than `tolerance` [rad]."""
+    """Raise InputError for q (J,) outside the position limits by more than `tolerance` [rad]."""
     outside = np.maximum(q - model.upper, model.lower - q)
     worst = int(np.argmax(outside))
     if outside[worst] > tolerance:
@@ -72,9 +72,9 @@ def check_within_limits(model: ArmModel, q: Float64, tolerance: float, what: str
 def check_free(
     model: ArmModel, field: DistanceField, q: Float64, distance_to: DistanceFunction | None = None
 ) -> None:
-    """Raise NotEvaluableError for a start q (J,) with a moving sphere in the scene, naming the deepest.
+    """Raise NotEvaluableError for a start q (J,) in collision, naming the deepest sphere.
 
-    distance_to: the scene's exact distance; by it the links' own surfaces decide (`part_clearances`), where known.
+    distance_to: exact distance, by which link surfaces decide (`part_clearances`).
     """
     moving, distance = sphere_clearance(model, field, q, np.asarray(model.moving_spheres))
     if distance_to is not None and (distance < 0).any():
@@ -89,7 +89,7 @@ def check_free(
 
 
 def check_goal(model: ArmModel, T_world_goal: Float64) -> None:
-    """Raise InputError for a goal that is no pose, or that lies outside the ball the robot can reach."""
+    """Raise InputError for a goal that is no pose, or beyond the robot's reach."""
     if np.shape(T_world_goal) != (4, 4) or not np.all(np.isfinite(T_world_goal)):
         raise InputError("goal: expected a finite pose x,y,z,qx,qy,qz,qw")
     distance = float(np.linalg.norm(T_world_goal[:3, 3] - model.base_position))
@@ -104,9 +104,7 @@ def check_goal(model: ArmModel, T_world_goal: Float64) -> None:
 def static_violations(
     model: ArmModel, field: DistanceField, q: Float64, margin: float | Float64
 ) -> tuple[StaticViolation, ...]:
-    """The spheres that no joint moves and that stand within the margin [m], one or (S,): a matter of mounting, not of
-    control.
-    """
+    """Return fixed spheres within the margin [m], one or (S,): mounting, not control."""
     if np.all(model.moving_spheres):
         return ()
     still, distance = sphere_clearance(model, field, q, ~np.asarray(model.moving_spheres))
@@ -121,7 +119,7 @@ def static_violations(
 def sphere_clearance(
     model: ArmModel, field: DistanceField, q: Float64, chosen: "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 ) -> tuple["np.ndarray[tuple[int], np.dtype[np.intp]]", Float64]:
-    """Indices (M,) of the chosen spheres and their surfaces' distances (M,) [m] at q (J,)."""
+    """Return indices (M,) of chosen spheres and their surfaces' distances (M,) [m] at q (J,)."""
     index = np.flatnonzero(chosen)
     distance = field.query(np.ascontiguousarray(model.sphere_centers(q)[index]))[0]
     return index, distance - model.sphere_set.radii[index]

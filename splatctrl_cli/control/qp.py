@@ -1,6 +1,4 @@
-"""Quadratic programs, solvers whose answer is used only when it is solved and its residuals check, and what is done
-otherwise.
-"""
+"""Quadratic programs, checked solvers, and the fallback ladder."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +18,10 @@ from splatctrl_cli.records import Float64
 
 @dataclass(frozen=True, kw_only=True)
 class QuadraticProgram:
-    """``min 1/2 z' H z + c' z`` subject to ``G z <= h``; H (V, V) symmetric, c (V,), G (M, V), h (M,)."""
+    """``min 1/2 z' H z + c' z`` subject to ``G z <= h``.
+
+    H (V, V) symmetric, c (V,), G (M, V), h (M,).
+    """
 
     H: Float64
     c: Float64
@@ -30,7 +31,7 @@ class QuadraticProgram:
 
 @dataclass(frozen=True, kw_only=True)
 class Residuals:
-    """How far (z, y) is from optimal: primal in the rows' own units, dual and gap relative to the terms' size."""
+    """KKT residuals: primal in the rows' units, dual and gap relative to the terms' size."""
 
     primal: float
     dual: float
@@ -43,7 +44,7 @@ class Residuals:
 
 @dataclass(frozen=True, kw_only=True)
 class QpSolution:
-    """z (V,), row multipliers (M,) >= 0, the solver's own status word, and residuals that we computed."""
+    """z (V,), row multipliers (M,) >= 0, the solver's status, and residuals that we computed."""
 
     z: Float64
     multipliers: Float64
@@ -54,13 +55,16 @@ class QpSolution:
 
 
 class QpSolver(Protocol):
-    """Solves a QuadraticProgram; `is_solved` only if the solver says exactly so, residuals always ours."""
+    """Solver of a QuadraticProgram; a non-finite program returns unsolved.
+
+    `is_solved` only if the solver reports exactly that.
+    """
 
     def solve(self, program: QuadraticProgram) -> QpSolution: ...
 
 
 def residuals(program: QuadraticProgram, z: Float64, multipliers: Float64) -> Residuals:
-    """The KKT residuals of a candidate; infinite where it is not finite."""
+    """Return a candidate's KKT residuals; infinite if it is not finite."""
     if not (np.all(np.isfinite(z)) and np.all(np.isfinite(multipliers))):
         return Residuals(primal=np.inf, dual=np.inf, gap=np.inf)
     Hz, Gy = program.H @ z, program.G.T @ multipliers
@@ -74,10 +78,10 @@ def residuals(program: QuadraticProgram, z: Float64, multipliers: Float64) -> Re
 
 
 class ClarabelSolver:
-    """Clarabel, an interior point method; one thread, so that the same program gives the same bits."""
+    """Clarabel, an interior point method; one thread, for identical bits."""
 
     def __init__(self, *, tolerance: float | None = None) -> None:
-        """tolerance: of feasibility, gap and the refinement of each linear solve (default: Clarabel's own, 1e-8)."""
+        """tolerance: of feasibility, gap and linear refinement (default: Clarabel's, 1e-8)."""
         self._settings = clarabel.DefaultSettings()
         self._settings.verbose = False
         self._settings.max_threads = 1
@@ -88,7 +92,6 @@ class ClarabelSolver:
             self._settings.iterative_refinement_max_iter = 30
 
     def solve(self, program: QuadraticProgram) -> QpSolution:
-        """Solve; a program whose numbers are not finite comes back unsolved."""
         num_rows = len(program.h)
         if not is_finite(program):
             return unsolved(len(program.c), len(program.h), "NotFinite")
@@ -113,7 +116,7 @@ class ClarabelSolver:
 
 
 class DaqpSolver:
-    """DAQP, a dual active-set method: exact to rounding on programs of this size, and several times as fast."""
+    """DAQP, a dual active-set method: exact to rounding at this size, several times faster."""
 
     PRIMAL_TOLERANCE = 1e-10  # [of the rows' own units]
     STATUS: Mapping[int, str] = {
@@ -127,7 +130,6 @@ class DaqpSolver:
     }
 
     def solve(self, program: QuadraticProgram) -> QpSolution:
-        """Solve; a program whose numbers are not finite comes back unsolved."""
         if not is_finite(program):
             return unsolved(len(program.c), len(program.h), "NotFinite")
         z, _, flag, info = daqp.solve(
@@ -156,7 +158,7 @@ def is_finite(program: QuadraticProgram) -> bool:
 
 
 def unsolved(num_variables: int, num_rows: int, status: str) -> QpSolution:
-    """A solution that says why there is none."""
+    """Return an unsolved solution with its reason."""
     return QpSolution(
         z=np.full(num_variables, np.nan),
         multipliers=np.full(num_rows, np.nan),
@@ -168,19 +170,21 @@ def unsolved(num_variables: int, num_rows: int, status: str) -> QpSolution:
 
 
 class Rung(StrEnum):
-    """The program that gave a step, from the best to the last resort."""
+    """The program that gave a step, from best to last resort."""
 
     SOLVED = "solved"
     RELAXED = "relaxed"
     MINIMUM_VIOLATION = "minimum-violation"
     HOLD = "hold"
-    OUTSIDE = "outside"  # given by a controller that is not ours
+    OUTSIDE = "outside"  # from an external controller
 
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """The ladder's answer: velocity (J,), slack (M,) of the barrier rows, multipliers of the box (2 J,) and of the
-    barrier rows (M,); solution is the last that was asked for, num_refused how many were not used.
+    """The ladder's answer.
+
+    velocity (J,); slack (M,) of barrier rows; multipliers of the box (2 J,) and barrier rows (M,); solution: the
+    last; num_refused: unused solutions.
     """
 
     velocity: Float64
@@ -193,7 +197,7 @@ class Choice:
 
 
 def is_usable(solution: QpSolution, max_residual: float) -> bool:
-    """True for a solution that is exactly solved and whose residuals, computed by us, check."""
+    """True for a solution reported solved whose residuals, computed by us, check."""
     return solution.is_solved and solution.residuals.worst <= max_residual
 
 
@@ -204,11 +208,10 @@ def descend(
     barriers: Sequence[Barrier],
     config: ControlConfig,
 ) -> Choice:
-    """Solved, or relaxed where a slack remains; else the least violation; else hold still.
+    """Return the solved or relaxed program, else least violation, else standstill.
 
-    First without slacks, which is far smaller: where that is solved and no multiplier exceeds its row's slack cost,
-    it is the answer. The programs with slacks have a feasible point by construction, so the lower rungs are for a
-    solver that fails.
+    First without slacks, far smaller: its solution stands if no multiplier exceeds its row's slack cost. Programs
+    with slacks are feasible by construction, so lower rungs are for failing solvers.
     """
     J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
     firm = solver.solve(assemble_hard(costs, *box, barriers))
@@ -242,7 +245,7 @@ def descend(
 
 
 def held(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: int) -> Choice:
-    """Hold still: no solution is usable."""
+    """Return a standstill: no solution is usable."""
     return Choice(
         velocity=np.zeros(num_joints),
         rung=Rung.HOLD,
@@ -257,10 +260,10 @@ def held(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: i
 def assemble_hard(
     costs: Sequence[Cost], lowest: Float64, highest: Float64, barriers: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """The program over v alone; rows: upper and lower box (2 J), barriers (M), none giving way. It may be infeasible.
+    """Return the program over v alone, which may be infeasible.
 
-    Where it has a solution and no barrier's multiplier exceeds its slack cost, that is the solution of `assemble`,
-    with all slacks zero: an L1 penalty above the multipliers is exact, and the slacks' signs take the rest.
+    Rows: upper, lower box (2 J), barriers (M). If no barrier's multiplier exceeds its slack cost, its solution is
+    that of `assemble`: an L1 penalty above the multipliers is exact.
     """
     H, c = summed(costs)
     G, h = box_rows(lowest, highest)
@@ -273,9 +276,10 @@ def assemble_hard(
 def assemble(
     costs: Sequence[Cost], lowest: Float64, highest: Float64, barriers: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """The program over ``z = (v, s)``; rows: upper and lower box (2 J), barriers (M), slack signs (M).
+    """Return the program over ``z = (v, s)``, always feasible.
 
-    The program always has a feasible point: the box is not empty and every barrier row has its own slack.
+    Rows: upper, lower box (2 J), barriers (M), slack signs (M). The box is not empty and every barrier row has its
+    own slack.
     """
     J, M = len(lowest), sum(len(barrier) for barrier in barriers)
     H, c = np.zeros((J + M, J + M)), np.zeros(J + M)

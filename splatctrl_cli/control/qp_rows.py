@@ -1,8 +1,8 @@
-"""Every row at a configuration, and which of them the program needs: the terms' rows, one after the other; and the
-program of III-E as printed, beside the reduced one that the controller solves otherwise.
+"""Rows of all terms at a configuration, those the program needs, and III-E as printed.
 
-``min over (v, x, e)  (u - x)' Q (u - x) + (x - J v)' R (x - J v) + e' S e`` with x the end-effector velocity, e one
-slack per external row, of either sign, and ``x - J v`` the paper's delta_x, which its first constraint defines.
+``min over (v, x, e) (u - x)' Q (u - x) + (x - J v)' R (x - J v) + e' S e`` with x the end-effector velocity, e one
+slack per external row, of either sign, and ``x - J v`` the paper's delta_x. The controller otherwise solves a reduced
+program.
 """
 
 from collections.abc import Sequence
@@ -24,11 +24,11 @@ from splatctrl_cli.records import Bool, DistanceField, Float64
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """The rows at one configuration (M, one barrier of each term), and which of them the QP needs.
+    """Rows at one configuration (M, one barrier per term), and those the QP needs.
 
-    The first barrier is that of the moving spheres, the second that of the pairs. margin (M,) [m]; is_fixed: no joint
-    velocity changes it; in_qp: not fixed, and some velocity of the box violates it. cuts: further rows of the QP
-    against what a solution would have met (`RowBuilder.cut`); their index is the place of the row they belong to.
+    First come the moving spheres, then the pairs. margin (M,) [m]; is_fixed: no joint velocity changes it; in_qp: not
+    fixed, and some velocity of the box violates it; cuts: further QP rows (`RowBuilder.cut`), indexed by their own
+    row.
     """
 
     barriers: tuple[Barrier, ...]
@@ -61,7 +61,7 @@ class Rows:
         return rows if self.cuts is None else (*rows, self.cuts)
 
     def spread(self, values: Float64) -> Float64:
-        """Values of the QP's rows as values (M,) of all rows, zero elsewhere; a row's is the largest of its cuts'."""
+        """Return QP rows' values as (M,), zero elsewhere; a row has its cuts' largest."""
         everywhere, num_rows = np.zeros(len(self.in_qp)), int(self.in_qp.sum())
         everywhere[self.in_qp] = values[:num_rows]
         if self.cuts is not None:
@@ -70,7 +70,7 @@ class Rows:
 
 
 class RowBuilder:
-    """Builds the rows of an arm in a distance field; names and kinds (M,) say what a row guards; scene: its rows."""
+    """Builds an arm's rows in a distance field; names and kinds (M,); scene: its rows."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class RowBuilder:
         acceleration: Float64 | None = None,
         further: Sequence[BarrierTerm] = (),
     ) -> None:
-        """acceleration (J,) [rad/s^2]: what joints can brake with; None: they stop at once."""
+        """acceleration (J,) [rad/s^2]: of braking; None: joints stop at once."""
         self._model, self._acceleration = model, acceleration
         self.scene = SceneRows(model, config, field, acceleration)
         self._others: tuple[BarrierTerm, ...] = (SelfRows(model, config, acceleration), *further)
@@ -94,36 +94,36 @@ class RowBuilder:
 
     @property
     def num_external(self) -> int:
-        """Rows against the scene; they come first."""
+        """Number of scene rows, which come first."""
         return len(self.scene.names)
 
     def with_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
-        """The same rows in another field; see `SceneRows.in_field`."""
+        """Return the rows in another field; see `SceneRows.in_field`."""
         other = copy(self)
         other.scene = self.scene.in_field(field, balls)
         return other
 
     def at(self, state: State) -> Rows:
-        """Every row at a state."""
+        """Return every row at a state."""
         barriers = tuple(term.rows(state) for term in self._terms)
         is_fixed = np.concatenate([is_immovable(b.G, self._model.velocity_limit) for b in barriers])
         binds = np.concatenate([can_bind(b.G, b.h, *state.box) for b in barriers])
         return Rows(barriers=barriers, margin=self._margin, is_fixed=is_fixed, in_qp=binds & ~is_fixed)
 
     def cut(self, rows: Rows, state: State, velocity: Float64, chosen: NDArray[np.integer]) -> Rows:
-        """The rows with one more for each of the `chosen` rows against the scene (`SceneRows.cut`)."""
+        """Return the rows with a cut per `chosen` scene row (`SceneRows.cut`)."""
         cut = self.scene.cut(state, velocity, chosen, rows.external.distance)
         return replace(rows, cuts=cut if rows.cuts is None else rows.cuts.joined(cut))
 
     def room(self, state: State, velocity: Float64) -> Float64:
-        """``h - G v`` (M,) [m/s] of every row at a state for a velocity (J,)."""
+        """Return ``h - G v`` (M,) [m/s] of every row for a velocity (J,)."""
         if self._acceleration is None:
             return np.concatenate([term.room(state, velocity) for term in self._terms])
         rows = [term.rows(state) for term in self._terms]
         return np.concatenate([b.h for b in rows]) - np.concatenate([b.G for b in rows]) @ velocity
 
     def distances(self, q: Float64, by_surface: Bool = NO_SPHERE) -> Float64:
-        """Every row's distance (M,) [m] at q, of spheres `by_surface` as `State` has it."""
+        """Return every row's distance (M,) [m] at q; by_surface as in `State`."""
         centers = self._model.sphere_centers(q)
         scene = self.scene.by_surfaces(q, self.scene.distances(centers), by_surface)
         return np.concatenate([scene, *(term.distances(centers) for term in self._others)])
@@ -135,11 +135,11 @@ PRINTED = "printed"
 def assemble_printed(
     state: State, weights: tuple[Float64, Float64], posture: Cost, external: Barrier, firm: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """The program over ``z = (v, x, e)``; rows: upper and lower box (2 J), external rows (M), firm rows.
+    """Return the program of III-E as printed, over ``z = (v, x, e)``.
 
-    As printed: an external row is ``grad d v >= -(d - epsilon) + e``, a self-collision row has no slack, nor has
-    a row of a further term. weights: the diagonals (6,) of Q and R; posture is the "home pose bias" of III-E, without
-    which seven joints on six dimensions are undetermined.
+    Rows: upper, lower box (2 J), external (M), firm. An external row is ``grad d v >= -(d - epsilon) + e``; rows of
+    self-collision and further terms have no slack. weights: diagonals (6,) of Q and R; posture: "home pose bias" of
+    III-E, without which seven joints on six dimensions are undetermined.
     """
     J, M = len(state.q), len(external)
     v, x, e = slice(0, J), slice(J, J + 6), slice(J + 6, J + 6 + M)
@@ -164,9 +164,9 @@ def assemble_printed(
 def solve_printed(
     solver: QpSolver, state: State, posture: Cost, barriers: Sequence[Barrier], config: ControlConfig
 ) -> Choice:
-    """The printed program's answer where it is solved and checks, else standstill: the paper has no second rung.
+    """Return the printed program's answer if solved and checked, else standstill.
 
-    slack is what a row gave way by, ``-e``; a row may also be asked for more than it needs, which costs.
+    The paper has no second rung. slack is ``-e``; a row may also demand more than it needs, at a cost.
     """
     external, *firm = barriers
     J, M, num_firm = len(state.q), len(external), sum(len(rows) for rows in firm)

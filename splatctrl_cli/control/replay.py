@@ -1,4 +1,4 @@
-"""Closed loop: the controller drives the arm from a logged start to a goal, in the scene as it was known."""
+"""Closed loop from a logged start to a goal, in the scene known then."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ FieldAt = Callable[[int], DistanceField]
 
 
 class Outcome(StrEnum):
-    """How a closed loop ended."""
+    """End of a closed loop."""
 
     GOAL_REACHED = "goal-reached"
     STALLED = "stalled"
@@ -40,7 +40,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Waypoint:
-    """A pose (4, 4) to reach, and the posture (J,) [rad] to lean to on the way there (None: the task's home)."""
+    """A pose (4, 4) to reach; posture (J,) [rad] to lean to (None: home)."""
 
     T_world_goal: Float64
     posture: Float64 | None = None
@@ -48,12 +48,11 @@ class Waypoint:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayTask:
-    """Where a closed loop starts, (J,) [rad] at a stamp [ns], and the pose (4, 4) its frame should reach.
+    """Start (J,) [rad] at a stamp [ns] and goal pose (4, 4) of a frame.
 
-    home (J,) [rad] is the posture the arm leans to where the task leaves it free; None is the middle of the limits.
-    via: poses to reach before the goal, one after the other. follow: the goal is the logged pose of each time, and
-    the run ends with the log. twists: the velocity to reach for instead of a goal, until end_ns. anchors: every
-    anchor_period [s] the arm is put back into the posture logged then.
+    home (J,) [rad]: attracts free motion (None: the model's `middle`). via: earlier goals. follow: the goal is each
+    time's logged pose, until the log ends. twists: velocity to reach instead, until end_ns. anchors: every
+    anchor_period [s] the arm returns to the logged posture.
     """
 
     start: Float64
@@ -70,7 +69,7 @@ class ReplayTask:
 
     @property
     def last_ns(self) -> int | None:
-        """The stamp that it lasts to, None where it ends at a goal."""
+        """Last stamp; None with a goal."""
         if self.twists is not None:
             return self.end_ns
         return None if self.follow is None else self.follow.last_ns
@@ -78,9 +77,9 @@ class ReplayTask:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneChange:
-    """A newer scene at `stamp_ns`: the least clearance [m] of the unmoved arm before and after.
+    """A newer scene: least clearance [m] of the unmoved arm before and after.
 
-    A recorded obstacle appears where the logged arm was not; an arm that went elsewhere may be in its place.
+    A recorded obstacle appears where the logged arm was not; an arm elsewhere may be in its place.
     """
 
     stamp_ns: int
@@ -89,17 +88,16 @@ class SceneChange:
 
     @property
     def is_hit(self) -> bool:
-        """True where the newer scene has something inside the arm that the older did not: no controller's doing."""
+        """True if only the newer scene penetrates."""
         return self.after < 0 <= self.before
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayTrace:
-    """T steps: stamp_ns (T,), position (T, J) [rad] at which each step was taken, and the steps themselves.
+    """T steps with stamp_ns (T,) and position (T, J) [rad] before each.
 
-    anchored: indices of the steps before which the arm was put back into the logged posture; num_reached: goals;
-    detours: indices of the steps after which a planned way out of a local minimum was taken; by_surface: names of the
-    spheres that counted by their link's surface in the end.
+    anchored: steps before which the arm returned to the log; num_reached: goals; detours: steps before a planned
+    detour; by_surface: spheres that finally counted by their link's surface.
     """
 
     stamp_ns: Stamps
@@ -115,7 +113,7 @@ class ReplayTrace:
 
 
 class StepRecord(Protocol):
-    """Where a closed loop leaves its T steps: stamps (T,), postures (T, J) and the steps."""
+    """Storage of T steps: stamps (T,), postures (T, J) and steps."""
 
     @property
     def stamp_ns(self) -> Stamps: ...
@@ -127,7 +125,7 @@ class StepRecord(Protocol):
     def steps(self) -> Sequence[ControlStep]: ...
 
     def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
-        """The next step."""
+        """Append a step."""
         ...
 
 
@@ -141,12 +139,10 @@ class InMemory:
 
     @property
     def stamp_ns(self) -> Stamps:
-        """(T,) [ns]."""
         return np.array(self._stamps, dtype=np.int64)
 
     @property
     def position(self) -> Float64:
-        """(T, J) [rad]."""
         return np.array(self._positions)
 
     def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
@@ -168,14 +164,12 @@ def closed_loop(
     distance_to: DistanceFunction | None = None,
     balls_at: Callable[[int], BallDistance | None] = lambda stamp_ns: None,
 ) -> ReplayTrace:
-    """Integrate the commander's velocities at `config.period` until the goal, a stall or `config.max_time`.
+    """Integrate the commander's velocities at `config.period` until goal, stall or `config.max_time`.
 
-    field_at gives the field known at a stamp [ns], the same object for the same scene; scene_step_at the two newest
-    scenes, for `config.distance_rate`. At a stall plan_detour is asked for a way out, `config.max_detours` times.
-    record: where the steps are kept, None for memory; commander: who gives the velocities; distance_to: the exact
-    distance at the start, for `check_free`; balls_at: the balls that the field of a stamp is of, None where links'
-    surfaces do not count. Raises InputError for a start outside the limits or a goal out of reach, NotEvaluableError
-    for a start in collision or outside the field.
+    field_at: field known at a stamp [ns], one object per scene; scene_step_at: for `config.distance_rate`;
+    plan_detour: way out of a stall, `config.max_detours` times; record: None for memory; distance_to: for
+    `check_free`; balls_at: balls of a stamp's field, None where links' surfaces do not count. Raises InputError for a
+    start outside the limits or an unreachable goal, NotEvaluableError for a start in collision or outside the field.
     """
     field = field_at(task.stamp_ns)
     q, controller = _ready(model, config, task, field, distance_to)
@@ -240,7 +234,6 @@ def _ready(
     field: DistanceField,
     distance_to: DistanceFunction | None,
 ) -> tuple[Float64, QpIkController]:
-    """The posture (J,) [rad] at the start and our controller. Raises as `closed_loop` does."""
     q = checked_posture(model, task.start, what="start")
     check_within_limits(model, q, config.limit_tolerance)
     for waypoint in (*task.via, Waypoint(T_world_goal=task.T_world_goal)):
@@ -251,7 +244,7 @@ def _ready(
 
 
 class _Course:
-    """Which goal holds at a step: one waypoint after the other, or the logged motion."""
+    """Goals by step: waypoints in order, or the logged motion."""
 
     def __init__(
         self, model: ArmModel, config: ControlConfig, task: ReplayTask, plan_detour: PlanDetour | None
@@ -261,14 +254,14 @@ class _Course:
         self.num_reached = 0
         self.detours: list[int] = []
         self._since = 0  # the step from which a stall counts: the last anchor, waypoint or detour
-        self._positions: list[Float64] = []  # of steps that may stall
+        self._positions: list[Float64] = []  # of the steps since then
         self._detour: Detour | None = None
         last_ns = task.last_ns
         left = config.max_time if last_ns is None else (last_ns - task.stamp_ns) * 1e-9 + config.period
         self.num_steps = max(round(left / config.period), 1)
 
     def is_anchor(self, index: int) -> bool:
-        """True at every anchor period but the first step, as long as the log lasts."""
+        """True at every anchor period but the first step, while the log lasts."""
         task = self._task
         if task.anchors is None or index == 0 or task.anchor_period <= 0:
             return False
@@ -280,13 +273,13 @@ class _Course:
         return True
 
     def anchor(self, stamp_ns: int) -> tuple[Float64, Float64]:
-        """The posture and velocity that were logged at a stamp."""
         assert self._task.anchors is not None
         return self._task.anchors.at(stamp_ns)
 
     def has_stalled(self, stamp_ns: int, index: int, q: Float64) -> bool:
-        """True where the arm stands still before its goal, and there is no planned way on to the next waypoint, which
-        begins here where there is one. With a log's end nothing stalls.
+        """True at a standstill before the goal without a planned detour; starts one if possible.
+
+        A run that ends with its log never stalls.
         """
         if self._task.last_ns is not None:
             return False
@@ -303,7 +296,6 @@ class _Course:
         return False
 
     def goal(self, stamp_ns: int, q: Float64) -> tuple[Float64, Guide | None]:
-        """The goal's pose at a stamp and posture (J,), and how it moves."""
         task = self._task
         if self._detour is not None:
             return self._detour.goal(self._model, task.frame)
@@ -318,7 +310,7 @@ class _Course:
         return waypoint.T_world_goal, Guide(twist=np.zeros(6), posture=waypoint.posture, velocity=still)
 
     def has_ended(self, stamp_ns: int, index: int, step: ControlStep) -> bool:
-        """True at the last goal; on the way there a goal that is reached gives way to the next; a twist has none."""
+        """True at the last goal; an earlier one advances to the next. Twists have none."""
         if self._detour is not None:
             self._detour.advance(self._config.period, step.pose_error)
             self._detour = None if self._detour.is_over else self._detour
@@ -335,8 +327,9 @@ class _Course:
 def divergence(
     model: ArmModel, frame: str, stamp_ns: Stamps, position: FloatRows, motion: LoggedMotion
 ) -> tuple[Float64, Float64, Float64]:
-    """How far T postures (T, J) are from those logged at the same stamps: joint norm [rad], and of the frame position
-    [m] and rotation [rad], each (T,); NaN after the log's end.
+    """Return distances of T postures (T, J) from those logged at their stamps.
+
+    Joint norm [rad], frame position [m] and rotation [rad], each (T,); NaN after the log's end.
     """
     joints, linear, angular = (np.full(len(stamp_ns), np.nan) for _ in range(3))
     for index in np.flatnonzero(stamp_ns <= motion.last_ns):
@@ -348,7 +341,7 @@ def divergence(
 
 
 def is_at_goal(pose_error: Float64, config: ControlConfig) -> bool:
-    """True where a pose error (6,) is within the goal's tolerances."""
+    """True if a pose error (6,) is within the goal's tolerances."""
     position, rotation = np.linalg.norm(pose_error[:3]), np.linalg.norm(pose_error[3:])
     return bool(position <= config.goal_position and rotation <= config.goal_rotation)
 
@@ -356,14 +349,14 @@ def is_at_goal(pose_error: Float64, config: ControlConfig) -> bool:
 def scene_change(
     model: ArmModel, stamp_ns: int, q: Float64, before: DistanceField, after: DistanceField
 ) -> SceneChange:
-    """What a newer scene, known at a stamp [ns], changes for the moving spheres of the arm at q (J,)."""
+    """Return how a newer scene changes the clearance at q (J,)."""
     moving = np.asarray(model.moving_spheres)
     least = [float(np.min(sphere_clearance(model, field, q, moving)[1])) for field in (before, after)]
     return SceneChange(stamp_ns=stamp_ns, before=least[0], after=least[1])
 
 
 def _has_stalled(positions: list[Float64], config: ControlConfig) -> bool:
-    """True where the joints moved slower than `stall_speed` on average over `stall_time` (a local minimum)."""
+    """True if joints averaged below `stall_speed` over `stall_time` (a local minimum)."""
     num_back = round(config.stall_time / config.period)
     if len(positions) <= num_back:
         return False

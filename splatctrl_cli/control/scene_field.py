@@ -1,4 +1,4 @@
-"""The scene as the controller takes it: people reach farther than things, and what approaches has a rate dd/dt."""
+"""The controller's scene: larger people, and approach rates dd/dt."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from splatctrl_cli.records import DistanceField, Float64
 
 @dataclass(frozen=True, kw_only=True)
 class SceneStep:
-    """The two newest scenes known at a time, and the seconds between them."""
+    """The two newest scenes known at a time, `seconds` apart."""
 
     newer: DistanceField
     older: DistanceField
@@ -24,10 +24,10 @@ SceneStepAt = Callable[[int], SceneStep | None]
 
 
 def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> float | Float64:
-    """dd/dt (Q,) [m/s] at points (Q, 3) [m] that stand still: what the distance lost per second from the older to the
-    newer scene, at most `limit`; 0 where the scene went away, so that a row is only ever tightened.
+    """Return dd/dt (Q,) [m/s] at fixed points (Q, 3) [m], from older to newer scene.
 
-    The rate is that of the past interval, held until the next scene; where a distance is missing it is 0.
+    Clipped to [-limit, 0], so a row is only ever tightened; missing distances give 0. The past rate holds until the
+    next scene.
     """
     if step is None:
         return 0.0
@@ -38,7 +38,7 @@ def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> floa
 def rate_of(
     config: ControlConfig, model: ArmModel, scene_step_at: SceneStepAt | None, stamp_ns: int, q: Float64
 ) -> float | Float64:
-    """dd/dt of the moving spheres at a posture (J,) and stamp, as the configuration wants it."""
+    """Return the configured dd/dt of the moving spheres at a posture (J,) and stamp."""
     step = None if scene_step_at is None or config.distance_rate == "none" else scene_step_at(stamp_ns)
     if step is None:
         return 0.0
@@ -47,10 +47,10 @@ def rate_of(
 
 
 class PeopleGrown:
-    """min(scene, people - extra): a field in which people reach `extra` [m] farther than they do.
+    """min(scene, people - extra): a field in which people extend `extra` [m] farther.
 
-    Where it is at least epsilon, the scene is at least epsilon away and people are at least epsilon + extra. Distance
-    and gradient are those of the smaller one.
+    At epsilon or more, the scene is at least epsilon away, and people epsilon + extra. Distance and gradient are the
+    smaller one's.
     """
 
     def __init__(self, scene: DistanceField, people: DistanceField, extra: float) -> None:
@@ -67,8 +67,9 @@ class PeopleGrown:
 
 
 def guarded(scene: DistanceField, people: DistanceField | None, config: ControlConfig) -> DistanceField:
-    """What a controller keeps `config.margin` from: the scene, in which people count as much nearer as
-    `config.human_margin` is above the margin.
+    """Return the field from which a controller keeps `config.margin`.
+
+    People count as nearer by `config.human_margin` less the margin.
     """
     extra = config.human_margin - config.margin
     return scene if people is None or extra <= 0 else PeopleGrown(scene, people, extra)

@@ -1,4 +1,4 @@
-"""One step of the QP-IK controller of III-E: query the field, build the rows, solve, look at the field again."""
+"""The step of the QP-IK controller (III-E): query field, build rows, solve, recheck."""
 
 from collections.abc import Collection, Sequence
 from copy import copy
@@ -22,7 +22,7 @@ from splatctrl_cli.records import Bool, DistanceField, Float64
 
 @dataclass(frozen=True, kw_only=True)
 class RowSlack:
-    """A barrier row that gave way by `slack` [m/s]."""
+    """A barrier row relaxed by `slack` [m/s]."""
 
     name: str
     slack: float
@@ -30,7 +30,7 @@ class RowSlack:
 
 @dataclass(frozen=True, kw_only=True)
 class Intervention:
-    """A row that shapes the command: its name, what it guards, and its multiplier (cost per unit of the row)."""
+    """A row that shapes the command; multiplier: cost per unit of the row."""
 
     name: str
     kind: RowKind
@@ -39,8 +39,9 @@ class Intervention:
 
 @dataclass(frozen=True, kw_only=True)
 class VelocityMargin:
-    """How much room a joint velocity leaves: the least ``h - G v`` of the barrier rows [m/s], and the least distance
-    to the box of the limits [rad/s], each with its row's name; negative where the velocity breaks the row.
+    """Room that a joint velocity leaves; negative where it breaks the named row.
+
+    barrier: least ``h - G v`` [m/s]; limit: least distance to the limits' box [rad/s].
     """
 
     barrier: float
@@ -51,15 +52,13 @@ class VelocityMargin:
 
 @dataclass(frozen=True, kw_only=True)
 class ControlStep:
-    """What the controller decided at one configuration, and how sure it may be of it.
+    """The controller's decision at one configuration.
 
-    velocity (J,) [rad/s], already scaled by `scale` (1 unless the next distance broke a row's promise);
-    pose_error (6,) [m, rad]; clearance [m] of the nearest moving sphere by the controller's own field;
-    self_clearance [m] (inf without pairs); interventions are the rows that shape the solution, `intervening` their
-    names; violated_fixed the violated rows that no joint velocity changes here, and fixed_distance [m] the least
-    distance of theirs (inf without any); num_rows went into the QP; residual
-    is the worst KKT residual of the last solution and status the solver's word for it; num_refused solutions did not
-    check; by_surface names the spheres that count by their link's surface, from this step on.
+    velocity (J,) [rad/s], already scaled by `scale` (1 unless the next distance broke a row's promise); pose_error
+    (6,) [m, rad]; clearance [m] of the nearest moving sphere by the controller's own field; self_clearance [m] (inf
+    without pairs); violated_fixed: violated rows that no joint velocity changes, fixed_distance [m]: their least (inf
+    without any); num_rows: in the QP; residual: worst KKT residual of the last solution; num_refused: failed
+    solutions; by_surface: spheres that now count by their link's surface.
     """
 
     velocity: Float64
@@ -86,8 +85,9 @@ class ControlStep:
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """What a controller is told at a step: the stamp [ns], and the rest as `QpIkController.step` takes it; by_surface
-    is that of the step before.
+    """A controller's input: the stamp [ns] and `QpIkController.step`'s arguments.
+
+    by_surface: of the step before.
     """
 
     stamp_ns: int
@@ -101,7 +101,7 @@ class Moment:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """What is known at a moment before anyone decides: the pose error (6,) [m, rad], the state and its rows."""
+    """State before a decision: pose error (6,) [m, rad], state and rows."""
 
     error: Float64
     state: State
@@ -109,7 +109,7 @@ class View:
 
 
 class QpIkController:
-    """Drives a frame of an arm to a goal pose under the barrier rows of a distance field (paper, III-E)."""
+    """Drives a frame to a goal pose under a distance field's barrier rows (III-E)."""
 
     def __init__(
         self,
@@ -122,8 +122,7 @@ class QpIkController:
         solver: QpSolver | None = None,
         terms: Sequence[CostTerm | BarrierTerm] = (),
     ) -> None:
-        """home (J,) [rad] is leant to where the task leaves the arm free (default: the middle of the limits); terms
-        are added to those of the paper.
+        """home (J,) [rad] attracts free motion (default: `middle`); terms add to the paper's.
 
         Raises InputError for a robot that no controller can run with.
         """
@@ -142,7 +141,7 @@ class QpIkController:
         self._reach = ReachGoal.of(config)
 
     def with_field(self, field: DistanceField, balls: BallDistance | None = None) -> "QpIkController":
-        """The same controller on another field (a newer scene); see `SceneRows.in_field`."""
+        """Return the controller on a newer field; see `SceneRows.in_field`."""
         other = copy(self)
         other._builder = self._builder.with_field(field, balls)
         return other
@@ -157,13 +156,12 @@ class QpIkController:
         last_velocity: Float64 | None = None,
         by_surface: Collection[str] = (),
     ) -> ControlStep:
-        """The joint velocity at q (J,) [rad] towards a goal pose (4, 4) of the controlled frame.
+        """Return the joint velocity at q (J,) [rad] towards a goal pose (4, 4).
 
-        distance_rate is dd/dt [m/s] of the moving spheres' distances, (M,) or one number, for a field that changes
-        with time; guide says how the goal moves, None that it stands still; last_velocity (J,) [rad/s] is the one
-        held until now, from which accelerations and smoothness count (None: they do not); by_surface names spheres
-        that count by their link's surface. Before the row of another gives way, that one does, too, if its surface is
-        farther away. Raises InputError for a q that is not finite, NotEvaluableError where the field has no distance.
+        distance_rate: dd/dt [m/s] of the moving spheres' distances, (M,) or one number. guide: the goal's motion
+        (None: at rest). last_velocity (J,) [rad/s]: for acceleration and smoothness (None: neither counts).
+        by_surface: spheres that count by their link's surface; one whose row would relax joins them if its surface is
+        farther. Raises InputError for a q that is not finite, NotEvaluableError where the field has no distance.
         """
         config = self._config
         rest = self._limits.rest(last_velocity)
@@ -183,7 +181,7 @@ class QpIkController:
         return replace(self._reported(error, rows, choice, rest, scale), by_surface=by_surface)
 
     def view(self, moment: Moment) -> View:
-        """What a step at a moment would go by. Raises as `step`."""
+        """Return a step's input at a moment. Raises as `step`."""
         return self._viewed(
             moment.q,
             moment.T_world_goal,
@@ -218,8 +216,9 @@ class QpIkController:
         return View(error=error, state=state, rows=self._builder.at(state))
 
     def given(self, view: View, velocity: Float64 | None, status: str = "") -> ControlStep:
-        """A velocity (J,) [rad/s] of somebody else as a step, whose slack is by how much it breaks the rows; None
-        where there is none: the arm comes to rest. status: what there is to say of it.
+        """Return an external velocity (J,) [rad/s] as a step; slack is its row violation.
+
+        None: the arm stops, with the reason in `status`.
         """
         rest, rows = self._limits.rest(view.state.last_velocity), view.rows
         J, M = len(rest), int(rows.in_qp.sum())
@@ -235,17 +234,18 @@ class QpIkController:
 
     @property
     def row_names(self) -> tuple[str, ...]:
-        """Of every row (M,)."""
+        """Names of the rows (M,)."""
         return self._row_names
 
     @property
     def row_kinds(self) -> tuple[RowKind, ...]:
-        """Of every row (M,)."""
+        """Kinds of the rows (M,)."""
         return self._builder.kinds
 
     def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
-        """The room that any joint velocity (J,) [rad/s] leaves at q (J,), this controller's or not; no acceleration
-        counts. Raises as `step`.
+        """Return the room that any joint velocity (J,) [rad/s] leaves at q (J,).
+
+        Acceleration does not count. Raises as `step`.
         """
         q = checked_posture(self._model, q)
         lowest, highest = self._limits.box(q)
@@ -261,7 +261,6 @@ class QpIkController:
         )
 
     def _reference(self, error: Float64, guide: Guide | None) -> Float64:
-        """The velocity (6,) to reach for, on top of the goal's own motion."""
         config = self._config
         reference = reference_velocity(
             error, gain=config.pose_gain, max_linear=config.max_linear_speed, max_angular=config.max_angular_speed
@@ -269,10 +268,10 @@ class QpIkController:
         return reference if guide is None else reference + guide.twist
 
     def _descended(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
-        """The ladder's answer, the rows that it answers to, and whether the distances after it are as promised.
+        """Return rows, the ladder's choice, and True if the later distances keep the promise.
 
-        Where it would bring a sphere to something else than what its row is against (a corner, a second splat), that
-        becomes a row too, and the ladder is asked again: cutting planes, `config.max_cuts` rounds at most.
+        A sphere that would meet another surface than its row's (a corner, a second splat) adds a row. Then the ladder
+        runs again: cutting planes, at most `config.max_cuts` rounds.
         """
         num_external, max_cuts = self._builder.num_external, self._config.max_cuts
         for num_cuts in range(max_cuts + 1):
@@ -290,19 +289,19 @@ class QpIkController:
         return rows, choice, False
 
     def _sticking_out(self, state: State, rows: Rows, choice: Choice) -> Bool:
-        """The spheres (M,) whose rows gave way, though the surfaces of their links are farther away."""
+        """True for spheres (M,) with relaxed rows whose links' surfaces are farther away."""
         distance, scene = rows.external.distance, self._builder.scene
         has_given_way = rows.spread(choice.slack)[: len(distance)] > self._config.slack_tolerance
         raised = scene.by_surfaces(state.q, distance, has_given_way & ~state.by_surface)
         return np.asarray(raised > distance)
 
     def _broken(self, choice: Choice, rows: Rows, later: Float64) -> Bool:
-        """The rows (M,) whose distance after a period, `later` (M,), is worse than they promise.
+        """True for rows (M,) whose `later` distance, a period on, breaks their promise.
 
         A row promises ``d(q + dt v) >= d - dt (h + s)``; a sphere on its way back out need only not lose ground.
-        Beyond the margin the promise may be missed by `promise_tolerance`, within it, where that would add up from
-        step to step, by a hundredth of it. Rows within their margins may lose ground to one another where all of
-        them together lack less of their margins than before: between several surfaces there may be no other way out.
+        Beyond the margin `promise_tolerance` applies; within it a hundredth, because misses add up. Rows within their
+        margins may lose ground if the total shortfall shrinks: between several surfaces there may be no other way
+        out.
         """
         config = self._config
         promised = rows.distance - config.period * (rows.h + rows.spread(choice.slack))
@@ -316,9 +315,7 @@ class QpIkController:
         return np.asarray(broken)
 
     def _kept_scale(self, state: State, choice: Choice, rows: Rows, rest: Float64) -> float:
-        """The largest of STEP_SCALES whose next distances are no worse than the rows promised, else 0: how much of a
-        velocity that breaks a promise there is, the remainder being `rest` (J,).
-        """
+        """Return the largest of STEP_SCALES that keeps the promises, else 0."""
         if choice.rung is Rung.HOLD:
             return 0.0
         for scale in STEP_SCALES:
@@ -329,7 +326,6 @@ class QpIkController:
         return 0.0
 
     def _reported(self, error: Float64, rows: Rows, choice: Choice, rest: Float64, scale: float) -> ControlStep:
-        """The step, with its rows by name."""
         slack = rows.spread(choice.slack)
         violated_fixed = rows.is_fixed & (rows.distance < rows.margin)
         return ControlStep(
@@ -354,7 +350,6 @@ class QpIkController:
         )
 
     def _interventions(self, choice: Choice, rows: Rows) -> tuple[Intervention, ...]:
-        """The limits and barrier rows whose multiplier is not zero."""
         multipliers = np.concatenate([choice.box_multipliers, rows.spread(choice.row_multipliers)])
         names, num_limits = (*self._limit_names, *self._row_names), len(self._limit_names)
         return tuple(
@@ -371,20 +366,20 @@ class QpIkController:
 
 
 class Commander(Protocol):
-    """Who commands the arm; `controller` is ours in the scene of the moment, to ask or to go by."""
+    """Source of commands; `controller` is ours in the current scene."""
 
     @property
     def is_over(self) -> bool:
-        """True once there is nobody left to ask: the last step was to rest."""
+        """True after the last step, to rest."""
         ...
 
     def step(self, controller: QpIkController, moment: Moment) -> ControlStep:
-        """The step at a moment."""
+        """Return the step at a moment."""
         ...
 
 
 class Ours:
-    """The `Commander` that leaves it to our own controller."""
+    """The `Commander` that uses our own controller."""
 
     is_over = False
 
@@ -403,5 +398,4 @@ OURS = Ours()
 
 
 def _blend(velocity: Float64, rest: Float64, scale: float) -> Float64:
-    """`scale` of a velocity (J,), the remainder at rest (J,), exact at either end."""
     return velocity if scale == 1.0 else rest + scale * (velocity - rest)

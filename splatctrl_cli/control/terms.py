@@ -1,7 +1,7 @@
-"""The terms of the QP of III-E: each adds a cost or rows over the joint velocities, and the solver only adds them up.
+"""Terms of the QP of III-E over joint velocities; the solver adds them.
 
-A term of one's own is one class: a cost has ``rows(state) -> (H, c)``, a constraint is a `BarrierTerm`, with rows
-``G v - s <= h``. `QpIkController` takes them beside those of the paper.
+A further term for `QpIkController` is one class: a cost with ``rows(state) -> (H, c)``, or a `BarrierTerm` with rows
+``G v - s <= h``.
 """
 
 from abc import ABC, abstractmethod
@@ -22,15 +22,16 @@ from splatctrl_cli.records import Bool, Float64
 Cost = tuple[Float64, Float64]
 """H (J, J) and c (J,) of a cost ``1/2 v' H v + c' v`` over joint velocities v (J,)."""
 
-NO_SPHERE: Bool = np.zeros(1, dtype=np.bool_)  # of the moving ones
+NO_SPHERE: Bool = np.zeros(1, dtype=np.bool_)  # among the moving spheres
 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """What a term sees of a step: the configuration q (J,) [rad], the box of velocities (J,), (J,) [rad/s] that the
-    limits allow, the velocity (6,) [m/s, rad/s] that `frame` should reach, how its goal moves (None: it stands
-    still), the last velocity (J,) [rad/s] (None: not known), dd/dt [m/s] of the moving spheres' distances, (M,) or
-    one number, and which (M,) of them count by their link's surface.
+    """A step's state, as terms see it.
+
+    q (J,) [rad]; box: allowed velocities (J,), (J,) [rad/s]; reference (6,) [m/s, rad/s]: for `frame` to reach;
+    guide: the goal's motion (None: at rest); last_velocity (J,) [rad/s] (None: unknown); distance_rate: dd/dt [m/s]
+    of the moving spheres, (M,) or one number; by_surface (M,): spheres that count by their link's surface.
     """
 
     model: ArmModel
@@ -50,27 +51,30 @@ class State:
 
     @cached_property
     def spheres(self) -> tuple[Float64, Float64]:
-        """Centres (S, 3) [m] of all spheres and their Jacobians (S, 3, J)."""
+        """Centres (S, 3) [m], Jacobians (S, 3, J)."""
         return self.model.spheres_at(self.q)
 
 
 class CostTerm(Protocol):
-    """A term that draws the velocity somewhere."""
+    """A cost over joint velocities."""
 
     def rows(self, state: State) -> Cost:
-        """H and c."""
+        """Return H and c."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReachGoal:
-    """The first two terms of III-E, ``(u - J v)' W (u - J v)``, u the reference; weight (6,) is the diagonal of W."""
+    """First two terms of III-E, ``(u - J v)' W (u - J v)``: u the reference.
+
+    weight (6,): diagonal of W.
+    """
 
     weight: Float64
 
     @classmethod
     def of(cls, config: ControlConfig) -> "ReachGoal":
-        """With what is left of the configured Q and R."""
+        """Return the term of the configured Q and R."""
         Q, R = configured_weights(config)
         return cls(weight=eliminated_weight(Q, R))
 
@@ -80,8 +84,9 @@ class ReachGoal:
 
 @dataclass(frozen=True, kw_only=True)
 class LeanHome:
-    """The home bias of III-E, which also makes the QP of a redundant arm strictly convex: towards home (J,) [rad], or
-    the posture of the goal's guide on top of that posture's own motion.
+    """Home bias of III-E, which makes a redundant arm's QP strictly convex.
+
+    It leads to home (J,) [rad], or to the guide's posture, added to that posture's motion.
     """
 
     home: Float64
@@ -96,7 +101,7 @@ class LeanHome:
 
 @dataclass(frozen=True, kw_only=True)
 class ChangeLittle:
-    """The smoothness: strays little from the last velocity, where that is known."""
+    """Smoothness: a cost of change from the last velocity, if known."""
 
     weight: float
 
@@ -107,19 +112,19 @@ class ChangeLittle:
 
 
 def standard_costs(config: ControlConfig, home: Float64) -> tuple[CostTerm, ...]:
-    """The optional costs of III-E, beside the goal's."""
+    """Return the optional costs of III-E."""
     lean = LeanHome(home=home, gain=config.posture_gain, weight=config.posture_weight)
     return (lean, ChangeLittle(weight=config.smoothness_weight)) if config.smoothness_weight > 0 else (lean,)
 
 
 def configured_weights(config: ControlConfig) -> tuple[Float64, Float64]:
-    """The diagonals (6,) of Q and R."""
+    """Return the diagonals (6,) of Q and R."""
     Q = np.repeat([config.weight_linear, config.weight_angular], 3)
     return Q, config.weight_kinematics * Q
 
 
 def eliminated_weight(weight_task: Float64, weight_kinematics: Float64) -> Float64:
-    """The weight (6,) that is left when the end-effector velocity and its slack are eliminated from III-E.
+    """Return III-E's weight (6,) after elimination of end-effector velocity and slack.
 
     ``min over d of (e - d)' Q (e - d) + d' R d`` is ``e' W e`` with ``W = (Q^-1 + R^-1)^-1``; Q, R diagonal (6,).
     """
@@ -127,21 +132,21 @@ def eliminated_weight(weight_task: Float64, weight_kinematics: Float64) -> Float
 
 
 def reach_cost(jacobian: Float64, velocity: Float64, weight: Float64) -> Cost:
-    """The cost ``(u - J v)' W (u - J v)`` of missing the end-effector velocity u.
+    """Return the cost ``(u - J v)' W (u - J v)`` of missing velocity u.
 
-    jacobian (6, J); velocity u (6,) [m/s, rad/s], world; weight (6,), the diagonal of W.
+    jacobian (6, J); u (6,) [m/s, rad/s], world; weight (6,): diagonal of W.
     """
     weighted = jacobian.T * weight
     return 2.0 * weighted @ jacobian, -2.0 * weighted @ velocity
 
 
 def stray_cost(velocity: Float64, weight: float) -> Cost:
-    """The cost ``weight |v - velocity|^2`` of straying from a joint velocity (J,) [rad/s]."""
+    """Return the cost ``weight |v - velocity|^2`` of leaving a joint velocity (J,) [rad/s]."""
     return 2.0 * weight * np.eye(len(velocity)), -2.0 * weight * velocity
 
 
 def summed(costs: Sequence[Cost]) -> Cost:
-    """All costs as one."""
+    """Return all costs as one."""
     H, c = np.zeros_like(costs[0][0]), np.zeros_like(costs[0][1])
     for cost_H, cost_c in costs:
         H += cost_H
@@ -150,7 +155,7 @@ def summed(costs: Sequence[Cost]) -> Cost:
 
 
 class RowKind(StrEnum):
-    """What a row of the program guards."""
+    """Object that a row guards."""
 
     LIMIT = "limit"
     SCENE = "scene"
@@ -159,10 +164,10 @@ class RowKind(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Barrier:
-    """M barrier rows ``G v - s <= h`` with ``G = -dd/dq`` (M, J) and ``h = alpha (d - epsilon) + dd/dt`` (M,).
+    """M barrier rows ``G v - s <= h``, with ``G = -dd/dq`` (M, J).
 
-    distance d (M,) [m]; index (M,) is each row's place in its catalogue of names (sphere, or sphere pair).
-    The cost of slack is ``slack_cost * s + slack_weight * s^2`` per row [s in m/s].
+    ``h = alpha (d - epsilon) + dd/dt`` (M,); distance d (M,) [m]; index (M,): place among names (spheres, or pairs).
+    Slack costs ``slack_cost * s + slack_weight * s^2`` per row [s in m/s].
     """
 
     index: NDArray[np.integer]
@@ -176,11 +181,11 @@ class Barrier:
         return len(self.h)
 
     def select(self, rows: NDArray[np.bool_]) -> "Barrier":
-        """The rows where `rows` (M,) is true, in order."""
+        """Return the rows of a mask (M,)."""
         return replace(self, index=self.index[rows], G=self.G[rows], h=self.h[rows], distance=self.distance[rows])
 
     def joined(self, other: "Barrier") -> "Barrier":
-        """These rows and then those of `other`, at the same cost of slack."""
+        """Return these rows, then the other's, at this cost of slack."""
         return replace(
             self,
             index=np.concatenate([self.index, other.index]),
@@ -191,10 +196,9 @@ class Barrier:
 
 
 class BarrierTerm(ABC):
-    """A term that bounds the velocity by M rows; `names` say what each guards.
+    """A term of M rows that bound the velocity; `names` describes them.
 
-    One that is not against a distance has `rows` alone: its distance is then infinite, so that no step is measured by
-    it again.
+    Without distances it has `rows` alone: the infinite distance exempts it from step checks.
     """
 
     kind = RowKind.LIMIT
@@ -202,18 +206,18 @@ class BarrierTerm(ABC):
 
     @property
     def margin(self) -> Float64:
-        """(M,) [m] that the rows keep."""
+        """Margins of the rows (M,) [m]."""
         return np.zeros(len(self.names))
 
     @abstractmethod
     def rows(self, state: State) -> Barrier:
-        """Every row, in the order of the names."""
+        """Return every row, in the order of the names."""
 
     def room(self, state: State, velocity: Float64) -> Float64:
-        """``h - G v`` (M,) [m/s] of a velocity (J,)."""
+        """Return ``h - G v`` (M,) [m/s] of a velocity (J,)."""
         rows = self.rows(state)
         return np.asarray(rows.h - rows.G @ velocity)
 
     def distances(self, centers: Float64) -> Float64:
-        """Every row's distance (M,) [m] with spheres at centers (S, 3), NaN where it is not known."""
+        """Return distances (M,) [m] for sphere centers (S, 3), NaN if unknown."""
         return np.full(len(self.names), np.inf)

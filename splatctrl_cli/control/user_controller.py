@@ -1,6 +1,6 @@
-"""A controller that is a Python class: what it is told, and the process that asks it (docs/controllers.md).
+"""Python controllers: their input, and the process that serves them (docs/controllers.md).
 
-The class runs in a process of its own and speaks the same lines as a program in any other language.
+It speaks the same lines as a program in any language.
 """
 
 import json
@@ -23,10 +23,11 @@ PROTOCOL = 1
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerStart:
-    """What a controller is told once: the names (J,) of the joints in the order of all that follows, position limits
-    lower and upper (J,) [rad], velocity_limit (J,) [rad/s], acceleration_limit (J,) [rad/s^2] (None: no limit), the
-    frame that it drives, the posture home (J,) [rad] to lean to, the period [s] that a velocity is held for, and the
-    margin [m] to keep from the scene.
+    """A controller's initial input.
+
+    joints (J,): names, in the order of all vectors; lower, upper, home to lean to (J,) [rad]; velocity_limit (J,)
+    [rad/s]; acceleration_limit (J,) [rad/s^2] (None: no limit); frame to drive; period [s] of a velocity; margin [m]
+    to the scene.
     """
 
     joints: tuple[str, ...]
@@ -41,7 +42,7 @@ class ControllerStart:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> "ControllerStart":
-        """Of the first line."""
+        """Parse the first line."""
         arrays = ("lower", "upper", "velocity_limit", "acceleration_limit", "home")
         return cls(
             joints=tuple(document["joints"]),
@@ -54,10 +55,9 @@ class ControllerStart:
 
 @dataclass(frozen=True, kw_only=True)
 class ClearanceRow:
-    """A velocity v (J,) [rad/s] keeps this row where ``G @ v <= h``; G (J,) [m/rad], h [m/s].
+    """A row that a velocity v (J,) [rad/s] keeps if ``G @ v <= h``; G (J,) [m/rad], h [m/s].
 
-    name: the moving sphere (kind "scene") or the pair of the arm's spheres (kind "self"); its distance [m] and the
-    margin [m] to keep.
+    name: moving sphere (kind "scene") or pair of spheres (kind "self"); distance, margin [m].
     """
 
     name: str
@@ -70,12 +70,11 @@ class ClearanceRow:
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerInput:
-    """What a controller is told at a step, in world: the stamp [ns], position q (J,) [rad] and velocity dq (J,)
-    [rad/s] of the joints, the goal's pose (4, 4), the frame's pose (4, 4), the error (6,) [m, rad] that is left (the
-    twist that carries the frame to the goal in a second, linear part first), and the frame's jacobian (6, J).
+    """A controller's input at a step, in world.
 
-    Of a goal that moves its goal_twist (6,) [m/s, rad/s]; the posture to lean to, goal_posture (J,) [rad], and its
-    velocity, goal_velocity (J,) [rad/s]. All three are None of a pose alone.
+    q (J,) [rad]; dq (J,) [rad/s]; goal, pose (4, 4) of goal and frame; error (6,) [m, rad]: twist from frame to goal
+    in a second, linear first; jacobian (6, J) of the frame. A moving goal has goal_twist (6,) [m/s, rad/s],
+    goal_posture (J,) [rad] to lean to, and goal_velocity (J,) [rad/s] of that posture; else all None.
     """
 
     stamp_ns: int
@@ -91,22 +90,20 @@ class ControllerInput:
     ask_rows: Callable[[], Sequence[ClearanceRow]] = field(repr=False)
 
     def rows(self) -> Sequence[ClearanceRow]:
-        """The clearance rows of our own controller here: one for each moving sphere, and one for each pair of spheres
-        of the arm that some allowed velocity could bring too near.
-        """
+        """Return our controller's rows: moving spheres, and pairs that an allowed velocity could violate."""
         return self.ask_rows()
 
 
 class Controller(Protocol):
-    """A class of a user's own: made with a `ControllerStart`."""
+    """A user's class, constructed with a `ControllerStart`."""
 
     def step(self, now: ControllerInput) -> Sequence[float] | Float64:
-        """The joint velocities (J,) [rad/s] to hold for a period."""
+        """Return the joint velocities (J,) [rad/s] for a period."""
         ...
 
 
 def serve(target: str) -> None:
-    """Answer the lines on stdin by the class ``module:Class`` until they end; what it prints goes to stderr."""
+    """Answer lines on stdin with the class ``module:Class``; its prints go to stderr."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     questions = os.fdopen(os.dup(0), encoding="utf-8")
     os.dup2(2, 1)
@@ -140,7 +137,7 @@ def serve(target: str) -> None:
 
 
 def class_named(target: str) -> Callable[[ControllerStart], Controller]:
-    """The class ``module:Class``, the current folder being on the path. Exits with a sentence where there is none."""
+    """Return the class ``module:Class``, from the current folder too. Exits with a sentence if missing."""
     module_name, _, name = target.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:

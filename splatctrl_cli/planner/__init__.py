@@ -1,1 +1,1 @@
-"""Paths of straight edges in joint space, proved free: the sampling-based planner that IV compares with."""
+"""Straight edges in joint space, proved free: the sampling-based planner compared in IV."""

@@ -1,8 +1,7 @@
-"""BiRRT: two trees, from the start and from the goals, that grow towards samples and towards each other.
+"""BiRRT: trees from start and goals grow towards samples and each other.
 
-RRT-Connect (Kuffner and LaValle, ICRA 2000) on batches: an iteration draws K samples and proves the K edges towards
-them together. Every edge is proved free by conservative advancement, those of shortcuts too. J joints, G goals, W
-waypoints.
+RRT-Connect (Kuffner and LaValle, ICRA 2000) on batches of K samples and edges. Conservative advancement proves every
+edge free, also of shortcuts. J joints, G goals, W waypoints.
 """
 
 import time
@@ -20,7 +19,7 @@ from splatctrl_cli.records import Float64, Index
 
 
 class PlanOutcome(StrEnum):
-    """How a search ended."""
+    """End of a search."""
 
     SOLVED = "solved"
     OUT_OF_ITERATIONS = "out-of-iterations"
@@ -29,10 +28,9 @@ class PlanOutcome(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What a search found: waypoints (W, J) [rad] from the start to goal number `goal`, none unless it is solved.
+    """A search's result: waypoints (W, J) [rad] to goal number `goal`, none unless solved.
 
-    found (V, J) is the path before it was shortened. num_checks postures were asked, on num_edges edges, over
-    num_iterations; search_time and shortcut_time [s] are wall clock.
+    found (V, J): path before shortening; num_checks: postures; search_time, shortcut_time [s]: wall clock.
     """
 
     outcome: PlanOutcome
@@ -53,7 +51,7 @@ class Plan:
 
 @dataclass
 class _Tree:
-    """Nodes q (size, J) with the index of their parent, -1 for a root; grows in place."""
+    """Nodes q (size, J) and parent indices, -1 for a root."""
 
     roots: Float64
     q: Float64 = field(init=False)
@@ -67,7 +65,6 @@ class _Tree:
         self.add(self.roots, np.full(len(self.roots), -1))
 
     def add(self, q: Float64, parent: Index) -> Index:
-        """The indices of new nodes (K, J) under their parents (K,)."""
         while self.size + len(q) > len(self.q):
             self.q, self.squares = np.concatenate([self.q, self.q]), np.concatenate([self.squares, self.squares])
             self.parent = np.concatenate([self.parent, self.parent])
@@ -78,11 +75,9 @@ class _Tree:
         return new
 
     def nearest(self, q: Float64) -> Index:
-        """The node (K,) nearest to each of q (K, J) in joint space."""
         return np.asarray(np.argmin(self.squares[: self.size] - 2.0 * (q @ self.q[: self.size].T), axis=1))
 
     def branch(self, node: int) -> tuple[Float64, int]:
-        """The nodes (V, J) from a root to `node`, and the root's index."""
         rows = [node]
         while self.parent[rows[-1]] >= 0:
             rows.append(int(self.parent[rows[-1]]))
@@ -91,8 +86,6 @@ class _Tree:
 
 @dataclass
 class _Search:
-    """The state of one search: both trees, the random stream, the counts, the clock."""
-
     clearance: Clearance
     config: PlannerConfig
     trees: tuple[_Tree, _Tree]
@@ -103,7 +96,7 @@ class _Search:
     num_iterations: int = 0
 
     def free_shares(self, start: Float64, end: Float64, *, only_whole: bool) -> Float64:
-        """(E,) of `check_edges`, counted."""
+        """`check_edges` (E,), counted."""
         config = self.config
         check = check_edges(
             self.clearance,
@@ -118,9 +111,9 @@ class _Search:
         return check.free_share
 
     def grown(self, tree: _Tree, targets: Float64) -> Index:
-        """New nodes of `tree` from its nearest ones towards targets (K, J), at most `reach` long, where all is free.
+        """Grow `tree` towards targets (K, J) by at most `reach`, where all is free.
 
-        Not as far as it is free: nodes at the brink of contact would be nearest to most samples, and lead nowhere.
+        Nodes of partial growth, near contact, would be nearest to most samples but lead nowhere.
         """
         near = tree.nearest(targets)
         way = targets - tree.q[near]
@@ -130,9 +123,7 @@ class _Search:
         return tree.add(tree.q[near[is_free]] + way[is_free], near[is_free])
 
     def met(self, tree: _Tree, other: _Tree, new: Index) -> tuple[int, int] | None:
-        """Grow `other` towards the new nodes of `tree`, as far as it is free; where one is reached, it and the node
-        it was reached from.
-        """
+        """Grow `other` towards new nodes as far as free; return the pair that meets."""
         near = other.nearest(tree.q[new])
         way = tree.q[new] - other.q[near]
         share = self.free_shares(other.q[near], tree.q[new], only_whole=False)
@@ -145,7 +136,6 @@ class _Search:
         return None
 
     def run(self) -> tuple[PlanOutcome, Float64, int]:
-        """The outcome, the path (V, J) and the goal's index."""
         first, second = self.trees
         model = self.clearance.model
         direct = self.free_shares(
@@ -172,11 +162,11 @@ class _Search:
 
 
 def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig, *, seed: int = 0) -> Plan:
-    """A path from start (J,) to one of goals (G, J) or (J,) [rad]; the same seed gives the same path.
+    """Plan a path from start (J,) to one of goals (G, J) or (J,) [rad].
 
-    The iterations and the time of `config` bound the search; running out of either is an outcome, not an error, and
-    only running out of time depends on the machine. Raises InputError for a start or goal outside the limits and
-    NotEvaluableError for one in collision, naming the sphere and how deep it is.
+    The same seed gives the same path. Running out of iterations or time is an outcome, not an error; only time
+    depends on the machine. Raises InputError for a start or goal outside the limits, NotEvaluableError for one in
+    collision, naming sphere and depth.
     """
     began = time.perf_counter()
     roots = checked_postures(clearance, start, goals, config)
@@ -203,7 +193,7 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
 
 
 def checked_postures(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig) -> Float64:
-    """Start and goals (1 + G, J), once they are within the limits and free. Raises as `plan` says."""
+    """Return start and goals (1 + G, J) within limits and free. Raises as `plan`."""
     model = clearance.model
     rows = [checked_posture(model, start, what="start")]
     several = np.atleast_2d(np.asarray(goals, dtype=np.float64))
@@ -230,10 +220,9 @@ def checked_postures(clearance: Clearance, start: Float64, goals: Float64, confi
 def shortened(
     clearance: Clearance, waypoints: Float64, config: PlannerConfig, random: np.random.Generator
 ) -> tuple[Float64, int, int]:
-    """A path (W', J) of proved edges with the same ends and no longer; how many edges and postures were asked.
+    """Return a path (W', J) of proved edges, no longer; counts of edges, postures.
 
-    First the shortest way over the waypoints, then rounds of shortcuts between random points of the path, of which
-    the one that saves most is taken, and the shortest way again.
+    First the shortest way over waypoints, then rounds of random shortcuts, each with the most saving one.
     """
     path, num_edges, num_checks = _over_waypoints(clearance, waypoints, config)
     for _ in range(config.shortcut_rounds):
@@ -246,12 +235,11 @@ def shortened(
         check = check_edges(clearance, start, end, contact=config.contact)
         num_edges, num_checks = num_edges + len(cuts), num_checks + check.num_checks
         if np.any(check.is_free):
-            path = _cut(path, cuts[int(np.argmax(check.is_free))])  # they are sorted by what they save
+            path = _cut(path, cuts[int(np.argmax(check.is_free))])  # sorted by saved length
     return path, num_edges, num_checks
 
 
 def _over_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) -> tuple[Float64, int, int]:
-    """The shortest way from the first to the last waypoint over edges between waypoints, old ones and proved ones."""
     W = len(path)
     a, b = np.triu_indices(W, k=2)
     length = np.linalg.norm(path[:, None] - path[None], axis=2)
@@ -273,7 +261,6 @@ def _over_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) 
 
 
 def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float64:
-    """(K, 2) places along the path, in waypoints from its start, on different edges; the most saving first."""
     places = np.sort(_places(path, random.random((num, 2))), axis=1)
     places = places[np.floor(places[:, 0]) < np.floor(places[:, 1])]
     along = _lengths(path)
@@ -284,7 +271,6 @@ def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float6
 
 
 def _cut(path: Float64, cut: Float64) -> Float64:
-    """The path with a straight edge between two places."""
     first, last = int(np.floor(cut[0])), int(np.ceil(cut[1]))
     ends = _points(path, cut)
     rows = np.concatenate([path[: first + 1], ends, path[last:]])
@@ -295,17 +281,14 @@ def _cut(path: Float64, cut: Float64) -> Float64:
 
 
 def _lengths(path: Float64) -> Float64:
-    """(W,) joint length from the start to each waypoint."""
     return np.asarray(np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
 
 
 def _places(path: Float64, share: Float64) -> Float64:
-    """Shares of the length as places in waypoints."""
     along = _lengths(path)
     return np.asarray(np.interp(share * along[-1], along, np.arange(len(path))))
 
 
 def _points(path: Float64, places: Float64) -> Float64:
-    """(K, J) the path at places (K,) in waypoints."""
     before = np.minimum(places.astype(np.int64), len(path) - 2)
     return np.asarray(path[before] + (places - before)[:, None] * (path[before + 1] - path[before]))

@@ -1,6 +1,6 @@
-"""The clearance of many postures at once, how fast a motion can use it up, and which edges of a path are free.
+"""Clearance of many postures, its loss over motions, and proofs of free edges.
 
-B postures, J joints; R rows: the moving spheres against the scene, then the pairs of spheres that could collide.
+B postures, J joints; R rows: moving spheres, then pairs of spheres.
 """
 
 from dataclasses import dataclass, replace
@@ -19,32 +19,29 @@ from splatctrl_cli.records import Bool, DistanceField, Float64
 
 @dataclass(frozen=True, kw_only=True)
 class OnlyDistance:
-    """The distance of a field (of splats, or baked), as a scene to plan in."""
+    """A field (splats, or baked) as a scene for planning."""
 
     field: DistanceField
 
     def distance(self, points: Float64) -> Float64:
-        """points (Q, 3) [m], world -> distance (Q,) [m]."""
         return self.field.query(points)[0]
 
 
 class HasDistance(Protocol):
-    """A scene that gives the distance without its gradient; `Solids` is one."""
+    """A scene with distance but no gradient, such as `Solids`."""
 
     def distance(self, points: Float64) -> Float64:
-        """points (Q, 3) [m], world -> signed distance (Q,) [m]."""
+        """Return signed distance (Q,) [m] at points (Q, 3) [m], world."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Clearance:
-    """Signed distances of an arm's spheres to a scene and to each other, less margins.
+    """Signed distances of an arm's spheres to a scene and each other, less margins.
 
-    taken (R,) [m] radii and margins that come off the distances between centres; moving (M,) the spheres that a joint
-    moves; pairs (P, 2) of all spheres; levers (R, J): no
-    row loses more than `levers @ |dq|` [m] on the way of dq, given that the scene's distance is 1-Lipschitz (exact
-    distances are; for another field `lipschitz` scales its rows). names (R,) of the rows. compiled: the same for the
-    kernel that checks edges among `Solids`, None for an arm without a chain.
+    taken (R,) [m]: radii and margins to subtract; moving (M,) spheres; pairs (P, 2) of all spheres; levers (R, J): a
+    motion dq costs a row at most ``levers @ |dq|`` [m], if the scene's distance is 1-Lipschitz (exact ones are; else
+    `lipschitz` scales its rows). compiled: kernel for edges among `Solids`, None without a chain.
     """
 
     model: ArmModel
@@ -66,10 +63,10 @@ class Clearance:
         self_margin: float = 0.0,
         lipschitz: float = 1.0,
     ) -> "Clearance":
-        """The clearance of an arm in a scene; margins [m] are taken off the distances, to the scene (one number, or
-        (S,) of every sphere) and to itself, there less the model's allowance.
+        """Return an arm's clearance in a scene.
 
-        Raises InputError where no sphere moves.
+        margin [m] to the scene (one number, or (S,) per sphere); self_margin [m] less the model's allowance. Raises
+        InputError if no sphere moves.
         """
         moving = np.flatnonzero(model.moving_spheres)
         if not len(moving):
@@ -95,13 +92,13 @@ class Clearance:
         return room.in_scene(scene)
 
     def in_scene(self, scene: HasDistance) -> "Clearance":
-        """The same arm and margins in another scene."""
+        """Return the same arm and margins in another scene."""
         if self.compiled is None or not isinstance(scene, Solids):
             return replace(self, scene=scene)
         return replace(self, scene=scene, compiled=self.compiled.among(*scene.rows()))
 
     def rows(self, q: Float64) -> Float64:
-        """Every row's distance less its margin (B, R) [m] at postures q (B, J).
+        """Return distances less margins (B, R) [m] at q (B, J).
 
         Raises NotEvaluableError where the scene has no distance.
         """
@@ -125,23 +122,21 @@ class Clearance:
         return rows
 
     def at(self, q: Float64) -> Float64:
-        """The least row (B,) [m] at postures q (B, J)."""
+        """Return the least row (B,) [m] at q (B, J)."""
         return np.asarray(np.min(self.rows(q), axis=1))
 
     def speeds(self, motion: Float64) -> Float64:
-        """How much (E, R) [m] a row can lose at most over motions dq (E, J)."""
+        """Return the largest loss (E, R) [m] over motions dq (E, J)."""
         return np.asarray(np.abs(motion) @ self.levers.T)
 
     def worst(self, q: Float64) -> tuple[str, float]:
-        """Name and distance less margin [m] of the least row at q (J,)."""
+        """Return the least row's name and value [m] at q (J,)."""
         row = self.rows(q[None])[0]
         return self.names[int(np.argmin(row))], float(np.min(row))
 
 
 def _apart(centers: Float64, pairs: NDArray[np.integer]) -> Float64:
-    """(B, P) how far the centres (B, S, 3) of pairs are apart, from ``|a|^2 + |b|^2 - 2 a b``: good to 1e-8 m where
-    the centres coincide, 1e-14 m at a centimetre.
-    """
+    """Distances of pairs by ``|a|^2 + |b|^2 - 2 a b``, good to 1e-8 m."""
     B, S = centers.shape[:2]
     squares = np.einsum("bsk,bsk->bs", centers, centers)
     apart = centers @ np.swapaxes(-2.0 * centers, 1, 2)
@@ -152,19 +147,20 @@ def _apart(centers: Float64, pairs: NDArray[np.integer]) -> Float64:
 
 
 def _between(levers: Float64, pairs: NDArray[np.integer]) -> Float64:
-    """(P, J): how fast two spheres can near each other; a joint that moves both moves neither in the other's eyes."""
+    """A joint that moves both spheres moves neither against the other."""
     a, b = levers[pairs[:, 0]], levers[pairs[:, 1]]
     moves_both: Bool = (a > 0) & (b > 0)
     return np.where(moves_both, 0.0, np.maximum(a, b))
 
 
-ROUNDING = 1e-9  # [m] taken off every clearance: far above the rounding of the distances
+ROUNDING = 1e-9  # [m] subtracted from every clearance: far above rounding
 
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeCheck:
-    """What was proved of E edges: each is free from its start to `free_share` (E,) of its length (0 if not even the
-    start was proved), num_checks postures were asked for all of them.
+    """Proofs of E edges: each is free to `free_share` (E,) of its length.
+
+    0 if not even the start was proved. num_checks: postures checked.
     """
 
     free_share: Float64
@@ -172,7 +168,7 @@ class EdgeCheck:
 
     @property
     def is_free(self) -> Bool:
-        """(E,) True where the whole edge is proved free."""
+        """True (E,) for wholly free edges."""
         return self.free_share >= 1.0
 
 
@@ -187,10 +183,9 @@ def check_edges(
 ) -> EdgeCheck:
     """Prove edges start (E, J) to end (E, J) free.
 
-    A posture with less than `contact` [m] to go counts as in collision: it bounds the number of checks, and makes the
-    check refuse edges that graze, never accept one that does not hold. Less than `give_up`
-    [rad] before a collision is left unproved. Where `only_whole`, an edge is dropped at its first collision, and its
-    free_share is 0.
+    Less than `contact` [m] counts as collision: this bounds the checks and rejects grazing edges, never accepting a
+    false one. Less than `give_up` [rad] before a collision stays unproved. With `only_whole`, an edge's first
+    collision sets its free_share to 0.
     """
     if clearance.compiled is None or not isinstance(clearance.scene, Solids):
         return check_sampled_edges(clearance, start, end, contact=contact, give_up=give_up, only_whole=only_whole)
@@ -209,7 +204,7 @@ def check_edges(
 def check_sampled_edges(
     clearance: Clearance, start: Float64, end: Float64, *, contact: float, give_up: float, only_whole: bool
 ) -> EdgeCheck:
-    """`check_edges` by the clearance's own postures, of any scene: what the kernel is held to."""
+    """Prove edges in any scene, by the clearance's postures; the kernel's oracle."""
     motion = end - start
     speeds = np.maximum(clearance.speeds(motion), STILL_ROW)
     length = np.linalg.norm(motion, axis=1)
@@ -228,7 +223,7 @@ def check_sampled_edges(
         low, high = np.concatenate([low, middle + covered]), np.concatenate([middle - covered, high])
         high = np.minimum(high, free[edge])
         is_open = low < high
-        is_last = (high >= free[edge]) & (free[edge] < 1.0)  # what is left before a collision
+        is_last = (high >= free[edge]) & (free[edge] < 1.0)  # remains before a collision
         is_short = is_open & is_last & ((high - low) * length[edge] < max(give_up, SHORTEST_EDGE))
         np.minimum.at(free, edge[is_short], 0.0 if only_whole else low[is_short])
         keep = is_open & ~is_short & (low < free[edge])

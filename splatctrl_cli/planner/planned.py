@@ -1,4 +1,4 @@
-"""A path planned for a replay's task: from its start to a pose, in the scene known at that time; and its times.
+"""Timed paths for a replay's task, from start to goal in the scene known then.
 
 G goal postures, K guesses, J joints.
 """
@@ -24,7 +24,7 @@ from splatctrl_cli.records import Float64
 
 
 def resampled(waypoints: Float64, spacing: float) -> Float64:
-    """Postures (K, J) on the path, at most `spacing` [rad] apart, every waypoint among them."""
+    """Return postures (K, J) at most `spacing` [rad] apart, with every waypoint."""
     rows = [waypoints[:1]]
     for a, b in pairwise(waypoints):
         num = max(int(np.ceil(np.linalg.norm(b - a) / spacing)), 1)
@@ -34,9 +34,9 @@ def resampled(waypoints: Float64, spacing: float) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class TimedPath:
-    """A path (W, J) with a clock: trapezoids of speed, at rest at every waypoint, so the straight edges are kept.
+    """A timed path (W, J), at rest at each waypoint to keep straight edges.
 
-    start_time (W,) [s] at each waypoint; top_speed, acceleration (W - 1,) of the share of each edge, per s and s^2.
+    start_time (W,) [s]; top_speed, acceleration (W - 1,): trapezoids of the share of each edge, per s and s^2.
     """
 
     waypoints: Float64
@@ -50,7 +50,7 @@ class TimedPath:
         return float(self.start_time[-1])
 
     def at(self, time: NDArray[np.floating] | float) -> tuple[Float64, Float64]:
-        """Position and velocity (K, J) at times (K,) [s]; at rest before the start and after the end."""
+        """Return position and velocity (K, J) at times (K,) [s]; at rest outside the path."""
         clock = np.clip(np.atleast_1d(np.asarray(time, dtype=np.float64)), 0.0, self.duration)
         edge = np.clip(np.searchsorted(self.start_time, clock, side="right") - 1, 0, len(self.top_speed) - 1)
         speed, gain = self.top_speed[edge], self.acceleration[edge]
@@ -67,8 +67,9 @@ class TimedPath:
 def effector_rates(
     model: ArmModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
 ) -> Float64:
-    """(W - 1,) shares of each edge per second at which a frame keeps to speeds [m/s] and [rad/s], at samples
-    `FRAME_SPACING` apart; infinite where an edge does not move it.
+    """Return edge shares per second (W - 1,) within a frame's speeds [m/s], [rad/s].
+
+    Sampled `FRAME_SPACING` apart; infinite where an edge does not move it.
     """
     rates = np.full(len(waypoints) - 1, np.inf)
     for edge, ends in enumerate(pairwise(waypoints)):
@@ -83,10 +84,10 @@ def effector_rates(
 def timed(
     waypoints: Float64, velocity_limit: Float64, max_acceleration: float, *, max_rate: Float64 | None = None
 ) -> TimedPath:
-    """The fastest trapezoids within velocity_limit (J,) [rad/s] and max_acceleration [rad/s^2], and where it is given
-    within max_rate (W - 1,), the share of each edge per second.
+    """Return the fastest trapezoids within velocity_limit (J,) [rad/s] and max_acceleration [rad/s^2].
 
-    Raises InputError for fewer than two waypoints or limits that are not above zero.
+    max_rate (W - 1,): limits edge shares per second. Raises InputError for fewer than two waypoints or limits not
+    above zero.
     """
     if len(waypoints) < 2:
         raise InputError(f"path: expected at least 2 waypoints, got {len(waypoints)}")
@@ -114,10 +115,10 @@ NO_POSTURE, START_BLOCKED, GOAL_BLOCKED = "no-goal-posture", "start-in-collision
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedPath:
-    """A path with a clock, None where outcome says why there is none.
+    """A timed path; None with its reason in outcome.
 
-    margin, self_margin [m]: those it was planned with, less than asked for where the start or the goal stands nearer.
-    num_proved of its num_edges edges are proved free. seconds [s]: of planning, goal postures included.
+    margin, self_margin [m]: reduced where start or goal is nearer. num_proved of num_edges edges are proved free.
+    seconds [s]: of planning.
     """
 
     outcome: str
@@ -139,15 +140,14 @@ def planned_path(
     *,
     approach: float = 0.0,
 ) -> PlannedPath:
-    """A path from the task's start to its goal pose, at most as fast as the controller may drive its frame.
+    """Plan a path from start to goal pose, within the controller's frame speeds.
 
-    scene gives a lower bound of a 1-Lipschitz distance: then every edge is proved. The postures at the goal are
-    sought from the task's home, the start, and random ones. approach [m]: the last that a hand comes straight along
-    the z axis of its frame, as far as that is free.
+    scene: lower bound of a 1-Lipschitz distance, so every edge is proved. Goal postures start from home, start and
+    random guesses. approach [m]: straight end along the frame's z axis, as far as free.
     """
     began = time.perf_counter()
     start, frame = task.start, task.frame
-    extra = scene_margin(model, control) - control.margin  # what the spheres leave uncovered, where that is kept too
+    extra = scene_margin(model, control) - control.margin  # the spheres' deficit, if configured
     room = Clearance.of(model, scene, margin=extra)
     random = np.random.default_rng(planner.seed)
     drawn = random.uniform(model.lower, model.upper, (fixed.GOAL_GUESSES * planner.goal_postures, len(start)))
@@ -183,7 +183,6 @@ def planned_path(
 def _found(
     room: Clearance, task: ReplayTask, goals: Float64, approach: float, planner: PlannerConfig, control: ControlConfig
 ) -> tuple[PlanOutcome, Float64]:
-    """How the search for a path to one of goals (G, J) ended, and its waypoints (W, J), none where there is none."""
     last = [approach_to(room, task.frame, goal, approach, planner, control) for goal in goals]
     before = np.array([way[0] for way in last])
     found = path_to_nearest(room, np.clip(task.start, room.model.lower, room.model.upper), before, planner)
@@ -194,9 +193,9 @@ def _found(
 
 
 def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: PlannerConfig) -> Plan:
-    """A path to the goal (G, J) nearest to the start, where `NEAREST_ITERATIONS` find one; else to any of them.
+    """Return a path to the nearest goal (G, J) within `NEAREST_ITERATIONS`, else to any.
 
-    Two trees meet first at a goal with much free space about it, not at one that is near.
+    Two trees meet first at a goal with much free space around, not at a near one.
     """
     nearest = goals[np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")]
     few = replace(planner, max_iterations=min(fixed.NEAREST_ITERATIONS, planner.max_iterations))
@@ -207,8 +206,9 @@ def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: Pl
 def approach_to(
     room: Clearance, frame: str, goal: Float64, length: float, planner: PlannerConfig, control: ControlConfig
 ) -> Float64:
-    """(W, J) postures to a goal (J,) straight along the z axis of its frame, from at most `length` [m] before it: as
-    far as postures lead there and the edges between them are free.
+    """Return postures (W, J) straight along the z axis of a goal's (J,) frame.
+
+    They start up to `length` [m] before it, as far as postures and free edges lead there.
     """
     model, way = room.model, [goal]
     T_world_goal = model.frame_pose(goal, frame)
@@ -226,15 +226,13 @@ def approach_to(
 
 
 def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlConfig) -> tuple[float, float, Float64]:
-    """The margins to the scene and of the pairs that the start and a goal (G, J) keep, and the goals that keep them;
-    where a margin is not above 0, the goals are none if none of them is free.
-    """
+    """Margins that start and goal keep, and goals that keep them, if any."""
     rows = room.rows(np.vstack([start, goals])) - fixed.START_ROOM
     num = len(room.moving)
     scene, own = rows[:, :num].min(axis=1), rows[:, num:].min(axis=1, initial=np.inf)
     margin, self_margin = min(control.margin, float(scene[0])), min(control.self_margin, float(own[0]))
     short = np.maximum(margin - scene[1:], self_margin - own[1:])
-    if np.min(short) > 0:  # no goal keeps what the start keeps: as much as the best one does
+    if np.min(short) > 0:  # no goal keeps the start's margins: use those of the best goal
         best = int(np.argmin(short))
         margin, self_margin = min(margin, float(scene[1 + best])), min(self_margin, float(own[1 + best]))
     keeps = (scene[1:] >= margin) & (own[1:] >= self_margin)
@@ -251,7 +249,7 @@ def planned_detours(
     *,
     home: Float64 | None = None,
 ) -> PlanDetour:
-    """Ways out of local minima by `planned_path`, in the scene that `scene_at` gives at the stamp of the stall."""
+    """Return a planner of detours by `planned_path`, in the scene of the stall's stamp."""
 
     def detour(stamp_ns: int, q: Float64, T_world_goal: Float64) -> Detour | None:
         task = ReplayTask(start=q, T_world_goal=T_world_goal, frame=frame, stamp_ns=stamp_ns, home=home)
@@ -264,9 +262,9 @@ def planned_detours(
 def goal_postures(
     model: ArmModel, frame: str, T_world_goal: Float64, guesses: Float64, config: ControlConfig, *, at_most: int
 ) -> Float64:
-    """(G, J) postures within the limits that bring `frame` to a pose (4, 4), distinct, in the order of the guesses.
+    """Return distinct postures (G, J) within limits that bring `frame` to a pose.
 
-    They keep to a tenth of the goal's tolerances; G is at most `at_most`, and 0 where no guess (K, J) leads there.
+    They meet a tenth of the goal's tolerances, in guess order; G is at most `at_most`, 0 if no guess (K, J) succeeds.
     """
     found: list[Float64] = []
     for guess in guesses:
@@ -281,7 +279,7 @@ def goal_postures(
 def _solved(
     model: ArmModel, frame: str, T_world_goal: Float64, guess: Float64, config: ControlConfig
 ) -> Float64 | None:
-    """Levenberg's method, every step cut off at the limits; None where it comes to no end."""
+    """Levenberg's method with steps clipped at the limits; None without convergence."""
     scale = 1.0 / np.repeat([fixed.GOAL_SHARE * config.goal_position, fixed.GOAL_SHARE * config.goal_rotation], 3)
     q, damping = np.clip(guess, model.lower, model.upper), fixed.GOAL_DAMPING
     error = scale * pose_error(model.frame_pose(q, frame), T_world_goal)

@@ -1,7 +1,6 @@
-"""A scene of exact solids: spheres, boxes, cylinders and capsules, asked for many points at once.
+"""A scene of exact solids: spheres, boxes, cylinders and capsules.
 
-Q points, P solids of one kind; a cylinder and a capsule lie along the z axis of their own frame, whose origin is in
-their middle. Everything in world, [m], float64.
+Q points, P solids of one kind; rods lie along their own z axis, centred. World, [m], float64.
 """
 
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ STEP = 1e-6  # [m] of the differences that give a gradient
 
 @dataclass(frozen=True, kw_only=True)
 class Ball:
-    """A ball at center (3,) of a radius."""
+    """A ball at center (3,)."""
 
     center: Float64
     radius: float
@@ -26,7 +25,7 @@ class Ball:
 
 @dataclass(frozen=True, kw_only=True)
 class Cuboid:
-    """A box of full size (3,) along its own axes, placed by T_world_shape (4, 4)."""
+    """A box of full size (3,) along its axes, placed by T_world_shape (4, 4)."""
 
     size: Float64
     T_world_shape: Float64
@@ -34,7 +33,7 @@ class Cuboid:
 
 @dataclass(frozen=True, kw_only=True)
 class Rod:
-    """A cylinder, or a capsule (`is_round`: caps of its radius are put on both ends), of a radius and a length."""
+    """A cylinder; `is_round`: a capsule, with caps of its radius on both ends."""
 
     radius: float
     length: float
@@ -47,10 +46,9 @@ Solid = Ball | Cuboid | Rod
 
 @dataclass(frozen=True, kw_only=True)
 class Solids:
-    """A `DistanceField` of solids: the signed distance to the nearest, negative inside; 1-Lipschitz.
+    """A `DistanceField` of solids: signed distance, negative inside, 1-Lipschitz.
 
-    Inside several solids at once it is the depth in the deepest, which is at most the way out.
-    Raises InputError for a solid with a size that is not above zero.
+    Inside several solids: the depth in the deepest, at most the way out. Raises InputError for a size not above zero.
     """
 
     solids: Sequence[Solid]
@@ -73,12 +71,12 @@ class Solids:
         object.__setattr__(self, "_rods", (*_into([s.T_world_shape for s in rods]), shape.reshape(-1, 3).T))
 
     def rows(self) -> tuple[Float64, Float64, Float64]:
-        """Balls (., 4), boxes (., 15) and rods (., 15), as `kernels.joint_edges.EdgeRoom` takes them."""
+        """Return balls (., 4), boxes (., 15), rods (., 15) for `kernels.joint_edges.EdgeRoom`."""
         centers, radii = self._balls
         return np.column_stack([centers, radii]), _placed_rows(*self._boxes), _placed_rows(*self._rods)
 
     def distance(self, points: Float64) -> Float64:
-        """points (Q, 3) -> signed distance (Q,) to the nearest solid, inf without any."""
+        """Return signed distances (Q,) at points (Q, 3), inf without solids."""
         least = np.full(len(points), np.inf)
         if len(self._balls[0]):
             least = np.minimum(least, np.min(_to_balls(points, *self._balls), axis=0))
@@ -89,19 +87,18 @@ class Solids:
         return least
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) -> distance (Q,) and its gradient (Q, 3), by central differences."""
+        """Return distance (Q,) and central-difference gradient (Q, 3)."""
         steps = STEP * np.eye(3)
         gradient = [(self.distance(points + step) - self.distance(points - step)) / (2 * STEP) for step in steps]
         return self.distance(points), np.stack(gradient, axis=1)
 
 
 def _to_balls(points: Float64, centers: Float64, radii: Float64) -> Float64:
-    """(P, Q)."""
     return np.asarray(np.linalg.norm(points - centers[:, None], axis=2) - radii[:, None])
 
 
 def _to_boxes(points: Float64, turn: Float64, shift: Float64, half: Float64) -> Float64:
-    """(P, Q): the distance outside, less the way to the nearest face inside."""
+    """(P, Q): distance outside, minus the way to the nearest face inside."""
     out = np.abs(_local(points, turn, shift)) - half[:, :, None]
     inside = np.minimum(np.max(out, axis=0), 0.0)
     np.maximum(out, 0.0, out=out)
@@ -118,24 +115,21 @@ def _to_rods(points: Float64, turn: Float64, shift: Float64, shape: Float64) -> 
 
 
 def _local(points: Float64, turn: Float64, shift: Float64) -> Float64:
-    """(3, P, Q): points in the frames of P solids."""
     return np.asarray((turn @ points.T).reshape(3, -1, len(points)) + shift[:, :, None])
 
 
 def _into(placements: Sequence[Float64]) -> tuple[Float64, Float64]:
-    """Rotation rows (3 P, 3) and shifts (3, P) of the maps from world into P frames, axis by axis."""
     maps = np.array([invert_transform(T) for T in placements]).reshape(-1, 4, 4)
     return np.ascontiguousarray(np.swapaxes(maps[:, :3, :3], 0, 1)).reshape(-1, 3), maps[:, :3, 3].T
 
 
 def _placed_rows(turn: Float64, shift: Float64, shape: Float64) -> Float64:
-    """(P, 15): rotation (9) and shift (3) from world, and three numbers of the shape."""
     rotations = np.swapaxes(turn.reshape(3, -1, 3), 0, 1).reshape(-1, 9)
     return np.ascontiguousarray(np.column_stack([rotations, shift.T, shape.T]))
 
 
 def _core(rod: Rod) -> tuple[float, float, float]:
-    """Radius and half length of a cylinder, and how far the rod's surface lies outside it."""
+    """Cylinder radius, half length, distance of the surface outside it."""
     return (0.0, rod.length / 2, rod.radius) if rod.is_round else (rod.radius, rod.length / 2, 0.0)
 
 

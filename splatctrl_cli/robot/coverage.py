@@ -1,12 +1,12 @@
-"""How much of a robot's collision surface its spheres leave uncovered: proven bounds, not samples.
+"""Coverage of a robot's collision surface by its spheres: proven bounds, not samples.
 
-phi(p) = min_i |p - c_i| - r_i is the signed distance to a union of balls where it matters: positive exactly outside
-it, and then the distance to it. Each term is convex, so over a triangle it is largest at a corner, and
+phi(p) = min_i |p - c_i| - r_i is positive exactly outside a union of balls, and is then the distance to it. Each term
+is convex, so over a triangle it is largest at a corner:
 
     max over the triangle of phi  <=  min_i max_k |v_k - c_i| - r_i,
 
-which is exact where one ball is nearest to all of it. Triangles are halved until this bound and the largest phi found
-at a corner agree to a tolerance. Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
+exact where one ball is nearest to all of it. Triangles are halved until this bound and the largest corner phi agree
+to a tolerance. Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
 """
 
 import pickle
@@ -29,9 +29,9 @@ PAIRS_PER_CHUNK = 1_000_000  # of corners and spheres
 
 @dataclass(frozen=True, kw_only=True)
 class Deficit:
-    """The largest distance of a surface point outside all spheres: found <= truth <= proven [m].
+    """Largest distance of a surface point outside all spheres: found <= truth <= proven [m].
 
-    Negative where all of the surface is inside (by at least ``-proven``). place (3,): where `found` was found.
+    Negative where all of the surface is inside (by at least ``-proven``). place (3,): of `found`.
     """
 
     proven: float
@@ -41,11 +41,11 @@ class Deficit:
 
 @dataclass(frozen=True, kw_only=True)
 class LinkCoverage:
-    """How the spheres of one link (and of what is fixed to it) cover its collision surface.
+    """Coverage of one link's collision surface by its spheres and those fixed to it.
 
-    area [m2]; uncovered_area [m2] and the bounds that hold for certain; deficit is None where there is no sphere;
-    protrusion [m]: no sphere sticks out of the body farther (a bound, exact where the body is convex), worst_sphere
-    its index in the sphere set; is_closed: the collision surface has an inside, else it was taken for its hull.
+    area [m2]; uncovered_area [m2], proven bounds; deficit: None without spheres; protrusion [m]: bound on how far
+    spheres leave the body, exact for a convex one; worst_sphere: its index in the sphere set; is_closed: else the
+    hull replaced the surface.
     """
 
     link: str
@@ -60,18 +60,18 @@ class LinkCoverage:
 
     @property
     def is_covered(self) -> bool:
-        """Whether every point of the surface is proven to lie in a sphere."""
+        """True if proven to lie in spheres."""
         return self.deficit is not None and self.deficit.proven <= 0
 
     @property
     def uncovered_share(self) -> float:
-        """Share of the surface outside all spheres."""
+        """Surface share outside all spheres."""
         return self.uncovered_area / self.area
 
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageReport:
-    """Coverage by link; stray_spheres counts spheres on links without collision geometry, which nothing measures."""
+    """Coverage by link; stray_spheres: spheres on links without collision geometry, unmeasured."""
 
     links: tuple[LinkCoverage, ...]
     num_spheres: int
@@ -79,7 +79,7 @@ class CoverageReport:
 
     @property
     def bare_links(self) -> tuple[str, ...]:
-        """Links with collision geometry and no sphere: nothing is covered there."""
+        """Uncovered links: geometry but no sphere."""
         return tuple(link.link for link in self.links if link.deficit is None)
 
     @property
@@ -89,32 +89,32 @@ class CoverageReport:
 
     @property
     def worst(self) -> LinkCoverage | None:
-        """The link with the largest proven deficit; None where a link is bare, for then no distance bounds it."""
+        """Largest proven deficit; None: bare links."""
         return None if self.bare_links else max(self.links, key=_proven)
 
     @property
     def max_deficit(self) -> float | None:
-        """The largest distance [m] of a surface point outside all spheres, proven; None where a link is bare."""
+        """Proven deficit [m]; None: bare links."""
         return None if self.worst is None else max(0.0, _proven(self.worst))
 
     @property
     def uncovered_share(self) -> float:
-        """Share of the collision surface of all links outside all spheres."""
+        """Surface share outside all spheres."""
         return sum(link.uncovered_area for link in self.links) / sum(link.area for link in self.links)
 
     @property
     def max_protrusion(self) -> float:
-        """How far [m] any sphere sticks out of its body, at most."""
+        """Largest protrusion [m] of any sphere."""
         return max(link.protrusion for link in self.links)
 
 
 def coverage_of_solids(
     urdf: UrdfFile, solids: Mapping[str, Sequence[Solid]], spheres: SphereSet, *, resolution: float = COVERED_EDGE
 ) -> CoverageReport:
-    """How `spheres` (links by the URDF's names) cover the collision surface of each link of `urdf`, its `solids`.
+    """Measure how spheres cover the `solids` of each link of `urdf`.
 
-    A link's surface may lie in spheres of any link that fixed joints join to it. A process measures the same robot
-    once. Raises InputError for a sphere on a link that is not there.
+    Spheres of any link joined by fixed joints count. Results are cached. Raises InputError for a sphere on an unknown
+    link.
     """
     bodies = urdf.rigid_bodies()
     unknown = [link for link in spheres.links if link not in bodies]
@@ -127,7 +127,7 @@ def coverage_of_solids(
 
 @lru_cache(maxsize=32)
 def _measured(packed: bytes) -> CoverageReport:
-    """The coverage of rigid bodies, solids and spheres to a resolution, which only bytes make hashable."""
+    """`coverage_of_solids` of pickled arguments, hashable as bytes."""
     bodies, solids, spheres, resolution = pickle.loads(packed)
     leaders = {link: leader for link, (leader, _) in bodies.items()}
     measured = {leaders[link] for link in solids}
@@ -150,10 +150,9 @@ def _measured(packed: bytes) -> CoverageReport:
 
 
 def deficit_by_sphere(urdf: UrdfFile, spheres: SphereSet, report: CoverageReport) -> Float64:
-    """How far outside all spheres (S,) [m] a surface point of each sphere's rigid body may be (proven).
+    """Return the proven deficit (S,) [m] of each sphere's rigid body; 0 without geometry.
 
-    The spheres of links that fixed joints join cover each other's surface, so the worst link of the body counts for
-    all of its spheres. 0 for a body without collision geometry.
+    Spheres of fixed links cover each other's surface, so the body's worst link counts.
     """
     leaders = {link: leader for link, (leader, _) in urdf.rigid_bodies().items()}
     worst: dict[str, float] = {}
@@ -166,9 +165,9 @@ def deficit_by_sphere(urdf: UrdfFile, spheres: SphereSet, report: CoverageReport
 def largest_deficit(
     triangles: Float64, centers: Float64, radii: Float64, *, tolerance: float = DEFICIT_GAP, floor: float = 0.0
 ) -> Deficit:
-    """The largest phi on `triangles`, between bounds that agree to `tolerance` [m].
+    """Return the largest phi on `triangles`, between bounds that agree to `tolerance` [m].
 
-    Below `floor` no bound is sought: a triangle certainly below it is done with.
+    Triangles below `floor` are not refined.
     """
     best, place, proven = -np.inf, np.zeros(3), -np.inf
     pending = triangles
@@ -187,10 +186,10 @@ def largest_deficit(
 def uncovered_area(
     triangles: Float64, centers: Float64, radii: Float64, *, resolution: float = COVERED_EDGE
 ) -> tuple[float, float, float]:
-    """Area [m2] with phi > 0: the best guess, and the bounds that hold for certain.
+    """Return the area [m2] with phi > 0: best guess and proven bounds.
 
-    Triangles are halved until they are certainly in one sphere, certainly outside all, or no longer than
-    `resolution` [m]; the last are counted by their middle.
+    Triangles are halved until in one sphere, outside all, or no longer than `resolution` [m]; then their middle
+    decides.
     """
     outside = unsure = guess = 0.0
     pending = triangles
@@ -210,12 +209,12 @@ def uncovered_area(
 
 
 def areas(triangles: Float64) -> Float64:
-    """Area (F,) [m2]."""
+    """Return triangle areas (F,) [m2]."""
     return np.asarray(0.5 * np.linalg.norm(face_normals(triangles), axis=1))
 
 
 def refined(triangles: Float64, longest: float) -> tuple[Float64, Float64]:
-    """The same surface in triangles with no edge longer than `longest` [m], and those triangles' areas."""
+    """Return the surface in triangles with edges up to `longest` [m], and their areas."""
     parts = []
     pending = triangles
     while len(pending):
@@ -263,7 +262,7 @@ def _of_link(
 
 
 def _of_part(part: Solid, centers: Float64, radii: Float64) -> Deficit:
-    """The deficit of one solid, its slack added; a ball that lies in one sphere is covered exactly."""
+    """A solid's deficit, its slack added; a ball within one sphere is covered exactly."""
     found = largest_deficit(part.surface.corners, centers, radii - part.slack)
     proven = found.proven
     if part.ball is not None:
@@ -281,7 +280,6 @@ def _chunks(triangles: Float64, num_spheres: int) -> Iterator[slice]:
 
 
 def _bounds(triangles: Float64, centers: Float64, radii: Float64) -> tuple[Float64, Float64]:
-    """The bound on phi over each triangle (F,), and phi at its corners (F, 3)."""
     upper, at_corners = np.empty(len(triangles)), np.empty((len(triangles), 3))
     for part in _chunks(triangles, len(radii)):
         gap = (cdist(triangles[part].reshape(-1, 3), centers) - radii).reshape(-1, 3, len(radii))
@@ -295,13 +293,11 @@ def _phi(points: Float64, centers: Float64, radii: Float64) -> Float64:
 
 
 def _longest_edges(triangles: Float64) -> tuple[Float64, "np.ndarray[tuple[int], np.dtype[np.int64]]"]:
-    """Length (F,) of the longest edge, and the corner (F,) at which it starts."""
     length = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2)
     return length.max(axis=1), length.argmax(axis=1)
 
 
 def _halves(triangles: Float64) -> Float64:
-    """Each triangle cut in two at the middle of its longest edge: (2F, 3, 3)."""
     rows = np.arange(len(triangles))
     first = _longest_edges(triangles)[1] if len(triangles) else rows
     a, b, c = (triangles[rows, (first + k) % 3] for k in range(3))

@@ -1,4 +1,4 @@
-"""Contact that is meant: what a robot carries and what it touches on purpose, from a TOML file (`--declare`)."""
+"""Declared contact: carried objects and intended touches, from a TOML file (`--declare`)."""
 
 import tomllib
 from collections.abc import Collection, Iterator, Mapping
@@ -17,7 +17,7 @@ REMEDY = "see splatctrl help declare for the keys of a declaration"
 
 @dataclass(frozen=True, kw_only=True)
 class Carried:
-    """A box in the frame of `link` [m] that belongs to the robot from `start` to `end` [s after the first state]."""
+    """A carried box in the frame of `link` [m], `start` to `end` [s after the first state]."""
 
     link: str
     box: Box
@@ -25,15 +25,15 @@ class Carried:
     end: float
 
     def is_active(self, time_s: float) -> bool:
-        """Whether the robot carries it then."""
+        """True while carried."""
         return self.start <= time_s <= self.end
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExpectedContact:
-    """A contact of `link` within a box of the world [m], from `start` to `end` [s after the first state], and why.
+    """An intended contact of `link` within a world box [m], `start` to `end` [s after the first state].
 
-    is_learned: of what the recording shows the robot to hold, not of a file.
+    is_learned: from an observed grasp, not a file.
     """
 
     link: str
@@ -44,16 +44,16 @@ class ExpectedContact:
     is_learned: bool = False
 
     def covers(self, link: str, point_world: NDArray[np.floating], time_s: float) -> bool:
-        """Whether a contact of a link at a point (3,) [m] and time was declared."""
+        """True for a link's contact at point (3,) [m] and time."""
         return link == self.link and self.start <= time_s <= self.end and bool(self.box.contains(point_world))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Declarations:
-    """What a file declares, entry by entry in its order; empty without one.
+    """Declared entries in file order.
 
-    num_uses counts by (table, index) how often an entry changed a label or excused a contact: an entry that nothing
-    used is stale, or names the wrong link, box or time.
+    num_uses counts by (table, index) how often an entry changed a label or excused a contact: an unused one is stale
+    or wrong.
     """
 
     carried: tuple[Carried, ...] = ()
@@ -61,11 +61,11 @@ class Declarations:
     num_uses: dict[tuple[str, int], int] = field(default_factory=dict)
 
     def carried_at(self, time_s: float) -> list[tuple[str, Box]]:
-        """Link and box in its frame of what the robot carries at a time."""
+        """Return links and boxes carried at a time, in their frames."""
         return [(entry.link, entry.box) for entry in self.carried if entry.is_active(time_s)]
 
     def is_carried(self, link: str, points_link: NDArray[np.floating], time_s: float) -> Bool:
-        """Points (N, 3) [m] in the frame of a link -> (N,) whether they lie in something it carries; counts uses."""
+        """True (N,) for points (N, 3) [m], link frame, in a carried box; counts uses."""
         inside = np.zeros(len(points_link), bool)
         for index, entry in enumerate(self.carried):
             if entry.link == link and entry.is_active(time_s):
@@ -75,7 +75,7 @@ class Declarations:
         return inside
 
     def expects(self, link: str, point_world: NDArray[np.floating], time_s: float) -> ExpectedContact | None:
-        """The first entry that covers a contact at a point (3,) [m]; counts its use."""
+        """Return the first entry for a contact at a point (3,) [m]; counts its use."""
         for index, entry in enumerate(self.expected_contact):
             if entry.covers(link, point_world, time_s):
                 self.used("expected_contact", index, 1)
@@ -88,7 +88,7 @@ class Declarations:
             self.num_uses[table, index] = self.num_uses.get((table, index), 0) + count
 
     def carried_uses(self) -> list[dict[str, Any]]:
-        """What is carried, with how many points needed each entry, for JSON."""
+        """Return carried entries with their number of points, for JSON."""
         return [
             {
                 **{"link": entry.link, "start": entry.start, "end": entry.end},
@@ -99,14 +99,14 @@ class Declarations:
         ]
 
     def unused(self) -> list[tuple[str, int]]:
-        """(table, index) of the entries that nothing used."""
+        """Return (table, index) of unused entries."""
         counts = {"carried": len(self.carried), "expected_contact": len(self.expected_contact)}
         entries = [(table, index) for table, count in counts.items() for index in range(count)]
         return [entry for entry in entries if not self.num_uses.get(entry)]
 
 
 def carried_words(entry: Mapping[str, Any]) -> str:
-    """One of `Declarations.carried_uses` in words, a warning where nothing used it."""
+    """Return an entry of `Declarations.carried_uses` in words; warn if unused."""
     used = (
         f"{entry['num_uses']} points"
         if entry["num_uses"]
@@ -116,10 +116,10 @@ def carried_words(entry: Mapping[str, Any]) -> str:
 
 
 def read_declarations(path: Path, links: Collection[str] | None = None) -> Declarations:
-    """The declarations of a TOML file; `links`: of the robot, None where it is not known.
+    """Read declarations from TOML; `links`: of the robot, None if unknown.
 
-    Raises InputError for a file that cannot be read, unknown tables or keys, a link the robot does not have, a box
-    that is unknown, or a time that ends before it starts.
+    Raises InputError for an unreadable file, unknown tables, keys or links, an invalid box, or an end before the
+    start.
     """
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))

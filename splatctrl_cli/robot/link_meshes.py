@@ -1,4 +1,4 @@
-"""The collision geometry of a robot's links as closed triangle surfaces: meshes, boxes, cylinders and spheres."""
+"""Collision geometry of a robot's links as closed triangle surfaces."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -18,18 +18,17 @@ from splatctrl_cli.records import Float64, Index
 from splatctrl_cli.robot.mesh_distance import MeshDistance
 from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
 
-MESH_LENGTHS = (0.001, 10.0)  # [m] of a link's mesh: beyond them its unit is another
-LINK_LENGTHS = (0.01, 3.0)  # [m] that a link has in its own unit
+MESH_LENGTHS = (0.001, 10.0)  # [m] of a link's mesh: outside, it has another unit
+LINK_LENGTHS = (0.01, 3.0)  # [m] of a link in the right unit
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Solid:
-    """One piece of a link's collision geometry, in the frame of `link` [m].
+    """A piece of a link's collision geometry, in the frame of `link` [m].
 
-    surface: its triangles; the true surface is nowhere farther than `slack` from them. body: a closed mesh that tells
-    inside from outside: the surface itself, or its convex hull where the surface is open (is_closed False), or None
-    where an open surface is flat. ball: centre (3,) and radius, where the solid is a ball.
+    slack: the true surface's largest distance from the triangles. body: closed mesh for inside tests: the surface,
+    else its convex hull, None if flat. ball: centre (3,) and radius of a ball.
     """
 
     link: str
@@ -40,15 +39,15 @@ class Solid:
 
     @property
     def is_closed(self) -> bool:
-        """Whether the surface itself has an inside."""
+        """True if the surface is closed."""
         return self.surface.is_closed
 
 
 def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple[Solid, ...]]:
-    """The solids of each link of a URDF that has collision geometry, by link, in the file's order.
+    """Read each link's solids, in the file's order.
 
-    folders: where ``package://`` paths are looked for, before the folders above the URDF. Raises InputError for a
-    mesh that is missing or unreadable, for shapes of another kind, and where no link has collision geometry.
+    folders: for ``package://``, before those above the URDF. Raises InputError for an unreadable mesh, other shapes,
+    or no collision geometry.
     """
     if urdf.other_shapes:
         link, tag = urdf.other_shapes[0]
@@ -73,10 +72,10 @@ def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple
 
 
 def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path:
-    """The file of a mesh. ``package://NAME/REST`` is NAME/REST, or REST in a folder called NAME, in one of `folders`
-    or in a folder above the URDF; a path without scheme is relative to the URDF.
+    """Return a mesh's file.
 
-    Raises InputError where no such file is found, saying where it was looked for.
+    ``package://NAME/REST`` is NAME/REST, or REST in a folder called NAME, in one of `folders` or above the URDF; a
+    path without scheme is relative to the URDF. Raises InputError if not found.
     """
     name = mesh.filename
     above = [Path(urdf).resolve().parent, *Path(urdf).resolve().parent.parents]
@@ -105,10 +104,10 @@ def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path
 
 
 class SolidDistance:
-    """A bound on the signed distance to the union of solids: the least of the signed distances to each.
+    """A bound on the signed distance (Q,) [m] of points (Q, 3), link frame, to solids.
 
-    Outside it is the distance; inside it is negative and no deeper than the truth, so that the ball of that radius
-    lies inside. To an open, flat surface it is the plain distance.
+    The least to each: outside exact; inside no deeper than the truth, so the ball of that radius lies inside.
+    Unsigned for an open, flat surface.
     """
 
     def __init__(self, solids: Sequence[Solid]) -> None:
@@ -117,7 +116,6 @@ class SolidDistance:
         self._balls = [solid.ball for solid in solids if solid.ball is not None]
 
     def __call__(self, points: Float64) -> Float64:
-        """points (Q, 3) [m], in the link's frame -> signed distance (Q,) [m] to balls and to triangles."""
         to_meshes = [mesh.signed(points) for mesh in self._meshes]
         to_balls = [np.linalg.norm(points - center, axis=1) - radius for center, radius in self._balls]
         return np.asarray(np.min([*to_meshes, *to_balls], axis=0))
@@ -138,7 +136,7 @@ def _primitive(shape: Shape) -> Solid:
 
 
 def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
-    """The mesh in the link's frame. Raises InputError for one whose length says that it is in another unit."""
+    """Return the mesh in the link's frame. Raises InputError for an implausible length (another unit)."""
     vertices = transform_points(shape.T_link_mesh, mesh.vertices * np.array(shape.scale))
     length = float(np.ptp(vertices, axis=0).max())
     if not MESH_LENGTHS[0] <= length <= MESH_LENGTHS[1]:
@@ -151,7 +149,6 @@ def placed(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
 
 
 def _unit_words(shape: MeshShape, length: float) -> str:
-    """The units in which a mesh of `length` [m], as scaled, would be as long as links are; else what to correct."""
     raw, signs = length / float(np.abs(shape.scale).max()), np.sign(shape.scale)
     words = [
         f'{name}: scale="{" ".join(f"{unit * sign:g}" for sign in signs)}"'
@@ -162,7 +159,7 @@ def _unit_words(shape: MeshShape, length: float) -> str:
 
 
 def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
-    """The mesh in the link's frame; an open one is taken apart into the pieces that are closed and the rest."""
+    """Return the mesh's solids, link frame; an open mesh as closed pieces and rest."""
     whole = placed(shape, mesh)
     pieces = [whole] if whole.is_closed else _taken_apart(whole)
     return [
@@ -172,7 +169,6 @@ def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
 
 
 def _taken_apart(mesh: TriangleMesh) -> list[TriangleMesh]:
-    """The connected pieces of a mesh that are closed, each its own, and all the open ones as one."""
     size = len(mesh.vertices)
     ends = mesh.faces[:, [0, 1, 2]].ravel(), mesh.faces[:, [1, 2, 0]].ravel()
     _, label = connected_components(coo_matrix((np.ones(len(ends[0])), ends), shape=(size, size)), directed=False)
@@ -190,14 +186,13 @@ def _taken_apart(mesh: TriangleMesh) -> list[TriangleMesh]:
 
 
 def _is_closed(faces: Index) -> bool:
-    """Whether every edge has one face on either side, which run through it in opposite directions."""
+    """True if each edge joins two faces, in opposite directions."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     forth = np.unique(edges, axis=0)
     return len(forth) == len(edges) and np.array_equal(forth, np.unique(edges[:, ::-1], axis=0))
 
 
 def _hull(vertices: Float64) -> TriangleMesh | None:
-    """The convex hull, its faces seen counter-clockwise from outside; None where the vertices lie in a plane."""
     try:
         hull = ConvexHull(vertices)
     except QhullError:
@@ -217,7 +212,6 @@ def _box(size: Float64) -> tuple[Float64, Index]:
 
 
 def _prism(radius: float, length: float) -> tuple[Float64, Index]:
-    """A prism of CYLINDER_SIDES sides inside a cylinder along z, edges on its surface."""
     angle = 2 * np.pi * np.arange(CYLINDER_SIDES) / CYLINDER_SIDES
     ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(CYLINDER_SIDES)], axis=1)
     up = np.array([0.0, 0.0, length / 2])
@@ -238,7 +232,7 @@ def _prism(radius: float, length: float) -> tuple[Float64, Index]:
 
 @cache
 def _unit_ball() -> tuple[Float64, Index, float]:
-    """A polyhedron with its corners on a sphere of radius 1, and how far the sphere is from it at most."""
+    """A polyhedron inside the unit sphere, and its largest distance from it."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
     corners = axes[np.array(faces)]

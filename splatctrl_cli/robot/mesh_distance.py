@@ -1,4 +1,4 @@
-"""The exact distance to a triangle mesh, in float64."""
+"""Exact distance to a triangle mesh, in float64."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ NEXT, OPPOSITE = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 class MeshDistance:
-    """Exact distance from points to a mesh."""
+    """Exact distances [m] of points (Q, 3) [m] to a mesh."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
         corners, faces = mesh.corners, mesh.faces
@@ -30,7 +30,7 @@ class MeshDistance:
         np.add.at(self._of_edge, self._edge.reshape(-1), np.repeat(self._of_face, 3, axis=0))
 
     def closest(self, points: Float64) -> tuple[Float64, Float64, Bool]:
-        """points (Q, 3) [m] -> distance (Q,) [m], the nearest surface point (Q, 3), is_inside (Q,).
+        """Return distance (Q,), nearest surface point (Q, 3) and is_inside (Q,).
 
         Inside by the angle-weighted normal of the nearest face, edge or vertex (Baerentzen, Aanaes, Signed distance
         computation using the angle weighted pseudonormal, 2005), exact for a closed mesh; all False for an open one.
@@ -43,16 +43,15 @@ class MeshDistance:
         return distance, surface, is_inside
 
     def distance(self, points: Float64, within: float = np.inf) -> Float64:
-        """points (Q, 3) [m] -> distance (Q,) [m], infinite where it is more than `within` [m]."""
+        """Return distances (Q,), infinite beyond `within`."""
         return self._tree.closest(points, within)[0]
 
     def signed(self, points: Float64) -> Float64:
-        """points (Q, 3) [m] -> distance (Q,) [m], negative inside a closed mesh."""
+        """Return distances (Q,), negative inside a closed mesh."""
         distance, _, is_inside = self.closest(points)
         return np.where(is_inside, -distance, distance)
 
     def _normals(self, face: Index, shares: Float64) -> Float64:
-        """Outward directions (Q, 3), not normalised, where a point of a face has these barycentric coordinates."""
         normal = np.asarray(self._of_face[face])
         num_zero = np.count_nonzero(shares == 0, axis=1)
         for k in range(3):

@@ -1,6 +1,6 @@
-"""A robot arm as a controller sees it: forward kinematics and Jacobians of its collision spheres and frames.
+"""A robot arm: forward kinematics and Jacobians of its collision spheres and frames.
 
-Only the kinematics of the URDF is built (Pinocchio), so meshes need not be there. S spheres, J joints, T postures.
+Pinocchio reads kinematics alone, so meshes may be missing. S spheres, J joints, T postures.
 """
 
 from bisect import bisect_right
@@ -32,15 +32,12 @@ from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 
 class RobotModel:
-    """Kinematics, limits and collision spheres of one arm; everything in the world frame, SI units, float64.
+    """Kinematics, limits and collision spheres of one arm; world frame, SI units, float64.
 
-    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; frame_names: what
-    `frame_pose` knows; chain: bodies and spheres as the kernels walk them; urdf: the file it came from; left_out:
-    links of the sphere file that the URDF does not have; bare_links: links with a body in the URDF and no sphere;
-    coverage: how the spheres cover the collision surface, None where it was not measured, and then coverage_unknown
-    says why; sphere_deficit (S,) [m]: how far outside the spheres a surface point of the sphere's rigid body may be,
-    NaN where that is not known; held: fingers that a log does not move, and where they are taken to be; self_model:
-    what was learned of its surface, None where nothing was.
+    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; left_out: links of the
+    sphere file missing from the URDF; bare_links: URDF links with a body but no sphere; coverage: None if not
+    measured, see coverage_unknown; sphere_deficit (S,) [m]: how far a surface point of the sphere's rigid body may
+    lie outside all spheres, NaN if unknown; held: locked fingers and their values.
     """
 
     def __init__(
@@ -70,7 +67,7 @@ class RobotModel:
         self.sphere_deficit: Float64 = np.full(len(spheres.radii), np.nan)
         self._surface: RobotSurface | None = None
         self.self_model: SelfModel | None = None
-        self._surfaces: dict[int, RobotSurface] = {}  # by how many of `changes` were before
+        self._surfaces: dict[int, RobotSurface] = {}  # by the number of earlier `changes`
         self._packages = packages
         self.held = dict(held or {})
         self._chosen_pairs: Index | None = None
@@ -100,12 +97,10 @@ class RobotModel:
         locked: Mapping[str, float] | None = None,
         packages: Sequence[Path] = (),
     ) -> "RobotModel":
-        """The robot of a URDF with the spheres of a file or a set, else with those that the URDF itself has.
+        """Build the robot of a URDF, with given spheres or the URDF's own.
 
-        T_world_base (4, 4) places the URDF's root link (default: at the world's origin); locked holds joints still
-        at a value [rad or m], e.g. fingers that no log moves, and with each the joints that mimic it; packages: where
-        ``package://`` paths of `surface` are looked for, before the folders above the URDF. Raises InputError, naming
-        file and remedy.
+        T_world_base (4, 4) places the root link (default: world origin). locked fixes joints at values [rad or m],
+        with their mimics. packages: folders for ``package://``, before those above the URDF. Raises InputError.
         """
         file = urdf if isinstance(urdf, UrdfFile) else read_urdf(urdf)
         try:
@@ -122,8 +117,9 @@ class RobotModel:
         return cls(file, model, sphere_set, T, left_out, are_links_renamed=is_renamed, packages=packages)
 
     def moved_by(self, names: Sequence[str]) -> "RobotModel":
-        """The same robot for a log of these joints: fingers that it does not move are locked in the middle of their
-        limits, and what mimics them with them. Their names and values are in `held`.
+        """Return the robot for a log of these joints.
+
+        Fingers that it does not move, and their mimics, are locked in the middle of their limits (`held`).
         """
         fingers = [name for name in self.urdf.fingers(names) if name in self.joint_names]
         if not fingers:
@@ -143,9 +139,7 @@ class RobotModel:
         )
 
     def carrying(self, boxes: Sequence[tuple[str, Box]]) -> "RobotModel":
-        """The same robot with what it carries: boxes in the frames of links, covered by spheres of their own, which
-        its surface has, too.
-        """
+        """Return the robot with carried boxes in link frames, in its spheres and its surface."""
         robot = RobotModel(
             self.urdf,
             self._model,
@@ -160,7 +154,7 @@ class RobotModel:
         return robot
 
     def with_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
-        """The same robot with its spheres' coverage measured; `unknown` says why there is no report."""
+        """Return the robot with measured coverage; `unknown` explains a missing one."""
         deficit = np.full(len(self.sphere_set.radii), np.nan)
         if coverage is not None:
             deficit = deficit_by_sphere(self.urdf, self.sphere_set, coverage)
@@ -168,22 +162,22 @@ class RobotModel:
 
     @property
     def surface(self) -> RobotSurface:
-        """The collision geometry, read when first asked for; spheres for links without any that can be read."""
+        """The visual geometry or its replacements, read on first use."""
         if self._surface is None:
             self._surface = RobotSurface.of(self.urdf, self.sphere_set, self._packages)
         return self._surface
 
     def with_self_model(self, found: SelfModel) -> "RobotModel":
-        """The same robot with the parts that a self-model has always; `surface_at` has what it holds for a time."""
+        """Return the robot with a self-model's permanent parts; `surface_at` adds temporary ones."""
         return self._changed(_surface=self.surface.joined(found.pieces()), self_model=found, _surfaces={})
 
     @property
     def changes(self) -> list[int]:
-        """Stamps [ns], in order, at which the robot's surface changes."""
+        """Stamps [ns], in order, of surface changes."""
         return [] if self.self_model is None else self.self_model.changes()
 
     def surface_at(self, stamp_ns: int) -> RobotSurface:
-        """`surface`, with what the robot holds at a stamp [ns]."""
+        """Return `surface` plus the temporary parts at a stamp [ns]."""
         if self.self_model is None or not self.changes:
             return self.surface
         number = bisect_right(self.changes, stamp_ns)
@@ -192,26 +186,26 @@ class RobotModel:
         return self._surfaces[number]
 
     def at(self, stamp_ns: int) -> "RobotModel":
-        """The robot with the surface of a stamp [ns] for all times."""
+        """Return the robot with its surface of a stamp [ns] for all times."""
         return self._changed(_surface=self.surface_at(stamp_ns), self_model=None) if self.changes else self
 
     def extents(self) -> dict[str, list[float]]:
-        """Where `surface` has each link, in one posture: `RobotSurface.extents`."""
+        """Return `RobotSurface.extents` of each link in one bent posture."""
         q = np.asarray(0.3 * (1 + np.arange(len(self.joint_names)) % 3), np.float64)  # bent, so that each axis shows
         surface = self.surface
         return surface.extents(surface.poses({link: self.frame_pose(q, link) for link in surface.links}))
 
     def with_self_pairs(self, pairs: Index) -> "RobotModel":
-        """The same robot, whose `self_pairs` are these (P, 2)."""
+        """Return the robot with these `self_pairs` (P, 2)."""
         return self._changed(_chosen_pairs=np.asarray(pairs, dtype=np.int64).reshape(-1, 2), _allowance=None)
 
     def with_self_allowance(self, allowance: Float64) -> "RobotModel":
-        """The same robot with a `self_allowance` (P,) [m] of its pairs."""
+        """Return the robot with this `self_allowance` (P,) [m]."""
         return self._changed(_allowance=allowance)
 
     @property
     def self_allowance(self) -> Float64:
-        """By how much (P,) [m] each of `self_pairs` falls short of the margin asked for (robot.self_margins)."""
+        """Each pair's margin shortfall (P,) [m]."""
         return np.zeros(len(self.self_pairs())) if self._allowance is None else self._allowance
 
     def _changed(self, **attributes: object) -> "RobotModel":
@@ -221,7 +215,7 @@ class RobotModel:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What a person should know before trusting a clearance of these spheres; a sentence each."""
+        """Warnings about these spheres, in sentences."""
         sentences = []
         if self.bare_links:
             sentences.append(
@@ -240,7 +234,7 @@ class RobotModel:
 
     @property
     def held_words(self) -> str:
-        """Where the fingers are that a log does not move."""
+        """Locked fingers and their values."""
         values = ", ".join(f"{name} = {value:g}" for name, value in self.held.items())
         return f"fingers that the log does not move are locked in their middle: {values}; --lock holds them elsewhere"
 
@@ -251,42 +245,42 @@ class RobotModel:
 
     @property
     def reach_box(self) -> Box:
-        """The box [m] around the base that the reach fills."""
+        """Box [m] around the base's reach."""
         reach = self.reach()
         return Box(lower=self.base_position - reach, upper=self.base_position + reach)
 
     @property
     def base_position(self) -> Float64:
-        """Origin of the root link (3,) [m], world."""
+        """Root link's origin (3,) [m], world."""
         return np.array(self.T_world_base[:3, 3])
 
     @property
     def middle(self) -> Float64:
-        """The posture (J,) in the middle of the limits, 0 for a joint without limits."""
+        """Mid-limit posture (J,); 0 if unlimited."""
         limited = np.isfinite(self.lower) & np.isfinite(self.upper)
         return np.where(limited, (np.where(limited, self.lower, 0) + np.where(limited, self.upper, 0)) / 2, 0.0)
 
     def sphere_centers(self, q: Float64) -> Float64:
-        """Sphere centres (S, 3) [m], world, at joint positions q (J,)."""
+        """Return centres (S, 3) at q (J,)."""
         return np.asarray(self.chain.centers(self._checked(q)[None])[0])
 
     def sphere_centers_batch(self, q: Float64, *, threads: int = 1) -> Float64:
-        """Sphere centres (T, S, 3) [m], world, at joint positions q (T, J)."""
+        """Return centres (T, S, 3) at q (T, J)."""
         postures = np.asarray(q, dtype=np.float64)
         if postures.ndim != 2 or postures.shape[1] != self.num_joints:
             raise InputError(f"joint positions: expected shape (T, {self.num_joints}), got {postures.shape}")
         return self.chain.centers(postures, threads=threads)
 
     def sphere_jacobians(self, q: Float64) -> Float64:
-        """d centre / d q (S, 3, J), world, at q (J,)."""
+        """Return d centre / d q (S, 3, J) at q (J,)."""
         return self.chain.jacobians(self._checked(q))[1]
 
     def spheres_at(self, q: Float64) -> tuple[Float64, Float64]:
-        """`sphere_centers` (S, 3) and `sphere_jacobians` (S, 3, J) at q (J,), in one walk."""
+        """Return centres (S, 3) and Jacobians (S, 3, J) at q (J,)."""
         return self.chain.jacobians(self._checked(q))
 
     def frame_pose(self, q: Float64, frame: str) -> Float64:
-        """T_world_frame (4, 4) of a link at q (J,). Raises InputError for a frame that is not there."""
+        """Return T_world_frame (4, 4) of a link. Raises InputError if unknown."""
         return np.vstack([self._framed(q, frame)[0], [0.0, 0.0, 0.0, 1.0]])
 
     def surface_gaps(
@@ -296,9 +290,9 @@ class RobotModel:
         radii: NDArray[np.floating],
         links: Collection[str] | None = None,
     ) -> dict[str, Float64]:
-        """The signed gap (T,) [m] of each link that has triangles from the nearest of balls (N, 3), (N,) [m], world.
+        """Return the signed gap (T,) [m] of each meshed link to the nearest ball.
 
-        It is that of all the link's geometry and of what it carries, at joint positions (T, J). links: these alone.
+        Balls (N, 3), (N,) [m], world; positions (T, J). It covers all of the link's geometry and what it carries.
         """
         surface = self.surface
         return {
@@ -309,14 +303,15 @@ class RobotModel:
 
     @property
     def link_distances(self) -> dict[str, Callable[[Float64, Bool | None], Float64]]:
-        """By link with triangles, its signed distance (Q,) [m] as a function. It takes points (Q, 3) in the link's
-        frame, and a mask (Q,) of those that are known to be outside, or None.
+        """Signed distance functions of meshed links.
+
+        Each maps points (Q, 3), link frame, and a mask (Q,) of known outside points, or None, to distances (Q,) [m].
         """
         links = {self.surface.links[number] for number in self.surface.trees}
         return {link: partial(self.surface.distance_to, link) for link in sorted(links)}
 
     def frame_jacobian(self, q: Float64, frame: str) -> Float64:
-        """Jacobian (6, J) of a link's origin, world axes: linear velocity rows [m] first, then angular."""
+        """Return a link origin's Jacobian (6, J), world axes: linear rows [m], then angular."""
         return self._framed(q, frame)[1]
 
     def _framed(self, q: Float64, frame: str) -> tuple[Float64, Float64]:
@@ -325,19 +320,18 @@ class RobotModel:
         return self.chain.frame(self._checked(q), there.parentJoint, in_body)
 
     def lever_arms(self) -> Float64:
-        """(S, J) upper bounds, over every posture, of how far a centre moves per radian (or metre) of a joint."""
+        """Return bounds (S, J) on a centre's travel per radian (or metre) in any posture."""
         return lever_arms(self.chain, self.lower, self.upper)
 
     def reach(self) -> float:
-        """Radius [m] of a ball about the base that holds every sphere in every posture (sum of link lengths)."""
+        """Return the radius [m] about the base that no sphere leaves (sum of link lengths)."""
         return float(np.max(self._lever_arms() + self.sphere_set.radii))
 
     def self_pairs(self, posture: Float64 | None = None, touching: float = 0.0) -> Index:
-        """Pairs (P, 2) of spheres that could collide with each other.
+        """Return pairs (P, 2) of spheres that could collide.
 
-        Left out: pairs on the same or on adjacent bodies (links joined by fixed joints are one), and pairs whose
-        gap at `posture` (J,) (default: the middle of the limits) is at most `touching` [m]. Pairs that were chosen
-        (`with_self_pairs`) stand for the default.
+        Excluded: pairs on one or adjacent bodies (fixed joints merge bodies), and pairs within `touching` [m] at
+        `posture` (J,) (default: `middle`). `with_self_pairs` replaces the default.
         """
         if self._chosen_pairs is not None and posture is None:
             return self._chosen_pairs
@@ -351,10 +345,9 @@ class RobotModel:
         return np.stack([a[keep], b[keep]], axis=1).astype(np.int64)
 
     def joint_columns(self, log_joint_names: Sequence[str]) -> tuple[Index, Float64, Float64]:
-        """Index, factor and offset (J,) of each joint in a log's positions: ``position[order] * factor + offset``.
+        """Return each joint's index, factor, offset (J,) in a log: ``position[order] * factor + offset``.
 
-        A joint that the log lacks follows the one that it mimics. Raises InputError naming the joints that the log
-        lacks, and what it has.
+        An unlogged joint follows the one that it mimics. Raises InputError for missing joints.
         """
         log = {name: (column, 1.0, 0.0) for column, name in enumerate(log_joint_names)}
         for joint in self.urdf.joints:
@@ -372,7 +365,7 @@ class RobotModel:
         return np.array(order, dtype=np.int64), np.array(factor), np.array(offset)
 
     def positions_of(self, log_joint_names: Sequence[str], position: Float64) -> Float64:
-        """Positions (..., J) of a log's joints, in the model's order."""
+        """Return a log's positions (..., J) in model order."""
         order, factor, offset = self.joint_columns(log_joint_names)
         return np.asarray(position[..., order] * factor + offset)
 
@@ -416,7 +409,7 @@ class RobotModel:
         return np.array([f.parentJoint for f in frames], dtype=np.int64), np.array(offsets, dtype=np.float64)
 
     def _moved(self) -> Bool:
-        """Structural: a sphere on the base, or centred on the only axes that carry it, never moves."""
+        """Spheres on the base, or centred on their only axes, never move."""
         postures = [self.middle + np.sin(np.arange(1, self.num_joints + 1) * (k + 1)) for k in range(3)]
         gain = [np.abs(self.sphere_jacobians(q)).max(axis=(1, 2)) for q in postures]
         return np.asarray(np.max(gain, axis=0) > 1e-9)
@@ -439,7 +432,7 @@ class RobotModel:
 
 
 def _without(model: pinocchio.Model, locked: dict[str, float], path: Path) -> pinocchio.Model:
-    """`model` with the joints of `locked` fixed at their values."""
+    """Fix the joints of `locked` at their values."""
     names = [str(name) for name in model.names]
     for name, joint in zip(names[1:], list(model.joints)[1:], strict=True):
         if joint.nv != 1:

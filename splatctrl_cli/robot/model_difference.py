@@ -1,4 +1,4 @@
-"""Whether two URDFs are of one robot: the same joints, limits and places of the links."""
+"""Comparison of two URDFs: joints, limits and places of links."""
 
 import numpy as np
 import pinocchio
@@ -6,16 +6,15 @@ import pinocchio
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.urdf import MOVABLE, UrdfFile
 
-POSITION, ROTATION, LIMIT = 1e-4, 1e-3, 1e-4  # [m], [rad], [rad or m and 1/s] that rounding of text may be
+POSITION, ROTATION, LIMIT = 1e-4, 1e-3, 1e-4  # [m], [rad], [rad or m and 1/s]: rounding of text
 _POSTURES = 3
 
 
 def model_difference(one: UrdfFile, other: UrdfFile) -> str:
-    """How `other` differs from `one` as a mechanism, in words; empty where it does not.
+    """Return how `other` differs mechanically from `one`, in words; empty if not.
 
-    Compared are the names of the joints that move, their limits, and the places of the links that both have, from
-    the first of these, at three postures. Meshes and shapes are not: a set of spheres may stand for them. Raises
-    ValueError for a URDF that cannot be built.
+    Compared: names and limits of movable joints, and places of common links at three postures. Not shapes, for
+    spheres may replace them. Raises ValueError for an unbuildable URDF.
     """
     joints = [{joint.name for joint in file.joints if joint.kind in MOVABLE} for file in (one, other)]
     if joints[0] != joints[1]:
@@ -44,7 +43,7 @@ def model_difference(one: UrdfFile, other: UrdfFile) -> str:
 
 
 def _limits(model: pinocchio.Model, name: str) -> Float64:
-    """Lower, upper, fastest of a joint; of one that turns without end its speed alone."""
+    """Lower, upper, fastest; the last alone for an endless joint."""
     joint = model.joints[model.getJointId(name)]
     speed = model.velocityLimit[joint.idx_v : joint.idx_v + 1]
     if joint.nq == 2:
@@ -54,7 +53,6 @@ def _limits(model: pinocchio.Model, name: str) -> Float64:
 
 
 def _places(model: pinocchio.Model, links: list[str], number: int) -> list[Float64]:
-    """Pose (4, 4) of each link from the first, with the joints, by name, at angles that differ with the number."""
     q = pinocchio.neutral(model)
     for place, name in enumerate(sorted(str(name) for name in model.names[1:])):
         joint, angle = model.joints[model.getJointId(name)], 0.3 * number * (1 + place % 3)

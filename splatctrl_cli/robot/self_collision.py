@@ -1,6 +1,4 @@
-"""Which pairs of links a self-collision check has to look at, and why it may leave out the others, as those that an
-SRDF (MoveIt's semantic description) takes out.
-"""
+"""Pairs of links to check for self-collision, and reasons to omit others (SRDF: MoveIt's)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,17 +17,16 @@ from splatctrl_cli.robot.urdf import UrdfFile
 
 @dataclass(frozen=True, kw_only=True)
 class DisabledPair:
-    """Two links whose collisions are not looked for, and the SRDF's reason ("Adjacent", "Never", ...)."""
+    """Two links exempt from collision, and the SRDF's reason ("Adjacent", "Never", ...)."""
 
     links: tuple[str, str]
     reason: str
 
 
 def read_srdf(path: Path, urdf: UrdfFile) -> tuple[tuple[DisabledPair, ...], tuple[DisabledPair, ...]]:
-    """The pairs of ``disable_collisions``: those between links of `urdf`, and those that name a link it lacks.
+    """Return the ``disable_collisions`` pairs within `urdf`, and those with an unknown link.
 
-    Raises InputError for a file that is missing or no SRDF, a pair without links, no pair at all, and where no pair
-    is between links of the URDF.
+    Raises InputError for no SRDF, a pair without links, or no pair within the URDF.
     """
     try:
         root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
@@ -61,10 +58,9 @@ CHUNK = 200  # postures at a time
 
 @dataclass(frozen=True, kw_only=True)
 class LinkPair:
-    """Two links with spheres: why they are left out (None: kept) and, where sampled, how their gap varied.
+    """Two links with spheres, and the gap between these over sampled postures.
 
-    gap [m]: smallest distance between their spheres, its least and largest value over the postures (nan: none
-    sampled); hit_share: share of the postures in which they touch.
+    left_out: reason, None if kept. least_gap, largest_gap [m] (nan: not sampled); hit_share: of postures in contact.
     """
 
     links: tuple[str, str]
@@ -77,7 +73,7 @@ class LinkPair:
 
 @dataclass(frozen=True, kw_only=True)
 class SelfCollisionPairs:
-    """pairs (P, 2) of spheres to check; every pair of links with spheres, kept or not; the postures sampled."""
+    """Pairs (P, 2) of spheres to check, and all pairs of links with spheres."""
 
     pairs: Index
     link_pairs: tuple[LinkPair, ...]
@@ -85,7 +81,7 @@ class SelfCollisionPairs:
 
     @property
     def left_out(self) -> tuple[LinkPair, ...]:
-        """The pairs of links that are not checked."""
+        """Unchecked pairs of links."""
         return tuple(pair for pair in self.link_pairs if pair.left_out is not None)
 
 
@@ -97,12 +93,11 @@ def self_collision_pairs(
     seed: int = 0,
     drop_never: bool = False,
 ) -> SelfCollisionPairs:
-    """Pairs of spheres that may collide, by what is known of their links.
+    """Return pairs of spheres that may collide.
 
-    Left out are links of one rigid body, links that one joint joins, and what `disabled` (an SRDF) names. Without
-    `disabled`, `num_postures` postures even within the limits (a joint without limits: a whole turn) decide about the
-    rest: pairs that touch in all of them are left out, for no posture parts them; with `drop_never` also those that
-    never come nearer than NEVER_MARGIN, which is a guess from a sample and not a proof.
+    Omitted: links of one rigid body or joined by one joint, and `disabled` (an SRDF). Without `disabled`,
+    `num_postures` uniform postures decide: pairs always in contact are omitted, for no posture parts them. With
+    `drop_never` also those never nearer than NEVER_MARGIN: a guess from a sample, not a proof.
     """
     links = tuple(dict.fromkeys(model.sphere_set.links))
     owner = np.array([links.index(link) for link in model.sphere_set.links], dtype=np.int64)
@@ -136,7 +131,7 @@ def self_collision_pairs(
 
 
 def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Index:
-    """The model's `self_pairs` (P, 2) less those of links that `disabled` (an SRDF) names."""
+    """Return `self_pairs` (P, 2) without links that `disabled` (an SRDF) names."""
     off = {frozenset(pair.links) for pair in disabled}
     links, pairs = model.sphere_set.links, model.self_pairs()
     keep = [frozenset((links[a], links[b])) not in off for a, b in pairs]
@@ -144,7 +139,7 @@ def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Ind
 
 
 def fixtures(model: RobotModel) -> set[str]:
-    """Links that stand still and carry no joint that moves: a table, a post, a cover of the base."""
+    """Return links that stand still and carry no moving joint: table, post, base cover."""
     bodies = model.urdf.rigid_bodies(model.joint_names)
     moving = [joint for joint in model.urdf.joints if joint.name in model.joint_names]
     led = {joint.child for joint in moving}
@@ -152,8 +147,9 @@ def fixtures(model: RobotModel) -> set[str]:
 
 
 def joined_links(model: RobotModel, links: Sequence[str]) -> dict[frozenset[str], str]:
-    """Pairs of links that no posture tells anything about, and why: of one rigid body, or of two with one joint, but
-    for fixtures.
+    """Return inseparable pairs of links, and why: one rigid body, or one joint.
+
+    Fixtures are excepted from the latter.
     """
     standing = fixtures(model)
     bodies = model.urdf.rigid_bodies(model.joint_names)
@@ -181,14 +177,13 @@ def _sampled_reason(gaps: Float64, drop_never: bool) -> str | None:
 
 
 def random_postures(model: RobotModel, num_postures: int, seed: int) -> Float64:
-    """Postures (T, J) even within the limits; a joint without limits turns once."""
+    """Return uniform postures (T, J) within the limits; an unlimited joint turns once."""
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     lower, upper = np.where(limited, model.lower, -np.pi), np.where(limited, model.upper, np.pi)
     return np.random.default_rng(seed).uniform(lower, upper, (num_postures, model.num_joints))
 
 
 def _gaps(model: RobotModel, owner: Index, pairs: Index, num_postures: int, seed: int) -> Float64:
-    """Smallest gap (T, P) between the spheres of each pair of links in each posture."""
     postures = random_postures(model, num_postures, seed)
     radii = model.sphere_set.radii
     members = [np.flatnonzero(owner == link) for link in range(int(owner.max(initial=-1)) + 1)]

@@ -1,4 +1,4 @@
-"""Learns a self-model: depth fused in each link's frame over clearly different configurations.
+"""Self-models learned from depth fused in each link's frame over clearly different configurations.
 
 Projective signed distances (Curless and Levoy, A volumetric method for building complex models from range images,
 1996). L links, V views, K configurations of a link, N cells, F triangles.
@@ -30,25 +30,26 @@ from splatctrl_cli.robot.self_intervals import (
 from splatctrl_cli.robot.self_model import LearnedLink, SelfModel, surface_digest
 from splatctrl_cli.robot.surface import RobotSurface
 
-REACH = 0.06  # [m] outside of a link's visual surface, in which its parts are looked for
-MOST_REACH = 0.24  # [m], to which it grows with parts that go as far
-STEP = 0.02  # [m] by which some corner of a link's box moves between clearly different configurations
-SAME = 0.01  # [m] within which cameras of one moment see a link in one configuration
-PATH_SHARE = 0.5  # of how far a link went between two moments, that parts them where it came back
-AWAY = 0.04  # [m] from where a cell was, beyond which what is still there is another thing
-MOST_ASKED = 8  # configurations whose places are looked at in the others
-MOST_LOST = 0.5  # of a piece, which more cells that belong elsewhere make no part
+REACH = 0.06  # [m] outside a link's visual surface: search distance for its parts
+MOST_REACH = 0.24  # [m]: its limit when parts extend as far
+STEP = 0.02  # [m] of some corner of a link's box between clearly different configurations
+SAME = 0.01  # [m] within which views of one moment share a configuration
+PATH_SHARE = 0.5  # of a link's way between two moments, which separates them even if it returned
+AWAY = 0.04  # [m] from a cell's old place, beyond which a surface there is another object
+MOST_ASKED = 8  # configurations with places to check in the others
+MOST_LOST = 0.5  # of a piece's cells that may belong elsewhere
 MOST_SETS = 40  # frame sets
-WIDE = 320  # pixels of an image across, to which it is thinned
-MEDIAN_SIGMA = 1.4826  # standard deviation of a normal distribution by its median size
-FAR_OFF = 0.03  # [m] from the rendered robot, beyond which a pixel shows something else
+WIDE = 320  # pixels across a thinned image
+MEDIAN_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute value
+FAR_OFF = 0.03  # [m] from the rendered robot, beyond which a pixel shows another surface
 UNEXPLAINED, EXPLAINED = -1, -2
 BLOCK = 3  # cells along an edge
 
 
 def choose_moments(surface: RobotSurface, T_world_link: Float64, most: int = MOST_SETS) -> list[int]:
-    """Numbers of at most `most` of M moments, in order, between which the links moved farthest (farthest-point
-    sampling), by where they are and the way in between. T_world_link: (M, L, 4, 4).
+    """Return up to `most` of M moments, in order, with the links farthest apart.
+
+    Farthest-point sampling by places and ways in between. T_world_link: (M, L, 4, 4).
     """
     corners = _boxes(surface)[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
     placed = _moved(T_world_link, corners).reshape(len(T_world_link), -1, 3)
@@ -73,13 +74,12 @@ def learn(
     name: str = "recording",
     reach: float = REACH,
 ) -> SelfModel:
-    """The self-model that V frames of a robot show, with the links of its surface at T_world_link (V, L, 4, 4).
+    """Return the self-model that V frames show, in order of time.
 
-    links: all of the robot's. reach [m]: how far outside a link's visual surface its parts are looked for; it grows
-    to `MOST_REACH` with parts that go as far. A cell of a link's grid is robot in a run of the link's configurations
-    where it is a surface in `NUM_CONFIGURATIONS` of them, no more than `FREE_SHARE` of those that see it see through
-    it, it leaves its place in the world with the link, and it moves against each nearer link. Frames are in order of
-    time. Raises InputError where no link can be learned.
+    T_world_link (V, L, 4, 4): the surface's links; links: all of the robot's. reach [m]: search distance outside a
+    link's visual surface, grown to `MOST_REACH` with its parts. A grid cell is robot in a run of configurations if
+    `NUM_CONFIGURATIONS` show it as a surface and at most `FREE_SHARE` see through it. It must also leave its place in
+    the world with the link, and move against each nearer link. Raises InputError where no link can be learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
@@ -114,8 +114,9 @@ def learn(
 
 @dataclass(frozen=True, kw_only=True)
 class _View:
-    """An image: depth (H, W) float32 [m]; links (h, w) int16, the link that explains each `stride`-th pixel,
-    `UNEXPLAINED` or `EXPLAINED` by some; points_world (M, 3) [m] of what no link explains.
+    """An image, thinned by `stride`.
+
+    links (h, w) int16: explaining link, `UNEXPLAINED`, or `EXPLAINED` by some; points_world (M, 3): unexplained.
     """
 
     stamp_ns: int
@@ -131,8 +132,9 @@ class _View:
 def _views(
     surface: RobotSurface, frames: Sequence[RgbdFrame], T_world_link: Float64, boxes: Float64, reach: float
 ) -> list[_View]:
-    """Frames beside the rendered robot, whose surface explains a pixel as far as the recording's noise. boxes (V, L,
-    2, 3) [m], world: of the links; what is within `reach` of them and not explained is kept.
+    """Compare frames with the rendered robot, which explains pixels within the recording's noise.
+
+    Unexplained points within `reach` of the boxes (V, L, 2, 3) stay.
     """
     thinned, ratios, views = [], [np.zeros(1)], []
     for frame, T in zip(frames, T_world_link, strict=True):
@@ -165,7 +167,7 @@ def _views(
 def _grow_link(
     surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
 ) -> list[LearnedLink]:
-    """`_learn_link`, with twice the reach as long as its parts go as far as the reach."""
+    """`_learn_link`, with the reach doubled while parts extend that far."""
     found = _learn_link(surface, number, box, used, reach)
     if 2 * reach <= MOST_REACH and any(part.outside_most > reach - VOXEL for part in found):
         return _grow_link(surface, number, box, used, 2 * reach)
@@ -175,9 +177,6 @@ def _grow_link(
 def _learn_link(
     surface: RobotSurface, number: int, box: Float64, used: Sequence[tuple[_View, int]], reach: float
 ) -> list[LearnedLink]:
-    """A link with its box (2, 3) by the views that see it, each with its configuration, once for each interval in
-    which it has parts; empty where it is seen in too few.
-    """
     points = [transform_points(invert_transform(v.T_world_link[number]), v.points_world) for v, _ in used]
     points = [part[_is_in(box, part, reach)] for part in points]
     at = np.array([k for _, k in used])
@@ -236,7 +235,6 @@ def _learn_link(
 
 
 def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: int) -> Fused:
-    """Where depth puts the surface beside each of cells (N, 3) [m] in a link's frame, in each configuration."""
     total, weight = (np.zeros((num, len(cells)), np.float32) for _ in range(2))
     seen, free = (np.zeros((num, len(cells)), bool) for _ in range(2))
     for view, k in used:
@@ -256,10 +254,10 @@ def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: i
 def _stays_in_world(
     cells: Float64, seen: Bool, shown: Sequence[tuple[_View, int]], poses: Float64
 ) -> tuple[Bool, Bool]:
-    """Cells (N,) that stay in the world: once the link has taken a cell `AWAY`, views show a surface where it was at
-    least as often as they see through that place. And cells (N,) that go so far: beside a joint's axis none does.
-    seen (K, N): in which configurations a cell is a surface; shown: each view with its configuration; T_world_link
-    (K, 4, 4).
+    """True for cells (N,) that stay in the world, and for cells that move enough.
+
+    A cell stays if views show a surface at its old place, `AWAY` from the new one, at least as often as they see
+    through it. Near a joint's axis none moves that far.
     """
     places, votes = _moved(poses, cells), np.zeros(len(cells), np.int64)
     for view, k in shown:
@@ -274,9 +272,6 @@ def _stays_in_world(
 
 
 def _landing(view: _View, points: Float64, numbers: Index) -> tuple[Index, Index, Index, Float64]:
-    """Of points (N, 3) [m], camera frame, with their numbers (N,), those before a pixel with depth: number, pixel
-    (v, u), and how far [m] the point lies before its depth.
-    """
     ahead = np.flatnonzero(points[:, 2] > TRUNCATION)
     u, v = np.floor(project(view.lens, points[ahead]) + 0.5).astype(int).T
     lands = (u >= 0) & (v >= 0) & (u < view.lens.width) & (v < view.lens.height)
@@ -289,7 +284,7 @@ def _landing(view: _View, points: Float64, numbers: Index) -> tuple[Index, Index
 def _is_on_other_link(
     surface: RobotSurface, number: int, cells: Float64, seen: Bool, gap: Float64, poses: Float64, reach: float
 ) -> Bool:
-    """Cells (N,) that lie nearer to a link against which they do not move by `STEP`; T_world_link (K, L, 4, 4)."""
+    """True for cells nearer to a link against which they move less than `STEP`."""
     found = np.zeros(len(cells), bool)
     for other in range(len(surface.links)):
         places = _moved(np.linalg.inv(poses[:, other]) @ poses[:, number], cells)
@@ -301,21 +296,16 @@ def _is_on_other_link(
 
 
 def _moved(T: Float64, points: Float64) -> Float64:
-    """Points ([L,] N, 3) in each of K frames (K, [L,] N, 3), moved by T (K, [L,] 4, 4)."""
     return np.asarray(np.einsum("...ij,...nj->...ni", T[..., :3, :3], points) + T[..., None, :3, 3])
 
 
 def _span(values: Float64, seen: Bool) -> Float64:
-    """Diagonal (N,) of the box about the values (K, N, D) that are seen (K, N)."""
     is_seen = seen[..., None]
     span = np.where(is_seen, values, -np.inf).max(axis=0) - np.where(is_seen, values, np.inf).min(axis=0)
     return np.asarray(np.linalg.norm(span, axis=-1))
 
 
 def _candidates(points: Float64, configurations: Index) -> tuple[Float64, Bool]:
-    """Centre (3,) [m] of the first cell and mask (X, Y, Z) of the cells around points (M, 3) [m] that are there in
-    enough configurations (M,).
-    """
     edge = BLOCK * VOXEL
     block = np.floor(points / edge).astype(np.int64)
     both = np.unique(np.column_stack([block, configurations]), axis=0)
@@ -331,7 +321,6 @@ def _candidates(points: Float64, configurations: Index) -> tuple[Float64, Bool]:
 
 
 def _without_scene(distance: Float32, stays: Bool) -> Float32:
-    """The grid without pieces most of which stays in the world, and without those of fewer than `LEAST_CELLS`."""
     pieces, num = ndimage.label(distance < 0, TOUCHING)
     sizes = np.bincount(pieces.ravel(), minlength=num + 1)
     is_out = (sizes < LEAST_CELLS) | (np.bincount(pieces.ravel(), stays.ravel(), num + 1) > MOST_LOST * sizes)
@@ -340,7 +329,6 @@ def _without_scene(distance: Float32, stays: Bool) -> Float32:
 
 
 def _triangles(distance: Float32, origin: Float64) -> Float64:
-    """Closed surface (F, 3, 3) [m] around the cells below 0, anticlockwise from outside."""
     if not (distance < 0).any():
         return np.zeros((0, 3, 3))
     vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="ascent")
@@ -348,29 +336,22 @@ def _triangles(distance: Float32, origin: Float64) -> Float64:
 
 
 def _own_distance(surface: RobotSurface, number: int, points: Float64, within: float) -> Float64:
-    """Signed distance (N,) [m] of points (N, 3) in a link's frame to its visual surface alone; infinite beyond
-    `within` [m].
-    """
     others = [link for k, link in enumerate(surface.links) if k != number]
     still = np.tile(np.eye(4), (len(surface.links), 1, 1))
     return surface.distance(still, points, without=others, within=within)
 
 
 def _boxes(surface: RobotSurface) -> Float64:
-    """Lower and upper corner (L, 2, 3) [m] of each link's box, in its frame."""
     extents = surface.extents(np.tile(np.eye(4), (len(surface.links), 1, 1)))
     return np.array([extents[link][:6] for link in surface.links]).reshape(-1, 2, 3)
 
 
 def _is_in(box: Float64, points: Float64, reach: float) -> Bool:
-    """Points (N, 3) [m] within `reach` of a box (2, 3)."""
     return np.asarray(np.all((points >= box[0] - reach) & (points <= box[1] + reach), axis=1))
 
 
 def _configurations(placed: Float64) -> Index:
-    """Which of a link's configurations each view has (V,), -1: none; corners (V, 8, 3) [m], in order of time. Each is
-    clearly different from the one before.
-    """
+    """A link's configuration by view (V,), -1: none."""
     newest, num = np.full((8, 3), np.inf), 0
     found = np.full(len(placed), -1)
     for number, corners in enumerate(placed):

@@ -1,6 +1,6 @@
-"""The intervals of a recording in which cells of a link's grid are robot: all of it, or while the link holds a thing.
+"""Intervals in which cells of a link's grid are robot: always, or during a grasp.
 
-K configurations of a link in order of time, N cells.
+K configurations in order of time, N cells.
 """
 
 from collections.abc import Sequence
@@ -17,24 +17,24 @@ from splatctrl_cli.robot.self_model import ALWAYS
 VOXEL = 0.004  # [m]
 TRUNCATION = 3 * VOXEL  # [m] before and behind a measured surface
 LEAST_CELLS = 24  # of a part, 1.5 cm^3
-NUM_CONFIGURATIONS = 5  # that a cell has to be a surface in
-TOUCHING = np.ones((3, 3, 3))  # cells that are one piece: thin things lie aslant
-FEWER_CONFIGURATIONS = 3  # the same of a cell beside such cells
-FREE_BESIDE = 0.5  # of the configurations that see such a cell, as `FREE_SHARE`
-SURE_SHARE = 0.25  # of a piece of cells, that has enough of them
-FREE_SHARE = 0.3  # of the configurations that see a cell; where more see through it, it is no robot
-FREE_WEIGHT = (1 - FREE_SHARE) / FREE_SHARE  # votes of a configuration that sees through a cell
-AROUND = 7  # cells across, whose votes choose an interval
-GONE = 0.5  # share of a part's cells that a configuration before or after it sees through, more than see a surface
+NUM_CONFIGURATIONS = 5  # in which a cell must be a surface
+TOUCHING = np.ones((3, 3, 3))  # neighbours in one piece: thin structures lie aslant
+FEWER_CONFIGURATIONS = 3  # likewise, of a cell next to such cells
+FREE_BESIDE = 0.5  # `FREE_SHARE` of such a cell
+SURE_SHARE = 0.25  # of a piece's cells: enough configurations show them
+FREE_SHARE = 0.3  # of the configurations that see a cell; above it, the cell is not robot
+FREE_WEIGHT = (1 - FREE_SHARE) / FREE_SHARE  # votes against a cell of a configuration that sees through it
+AROUND = 7  # cells across: their votes choose an interval
+GONE = 0.5  # of a part's cells: free less surface, in some configuration before or after it
 MOST_INTERVALS = 6  # of a link
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fused:
-    """Depth beside cells (N,) of a link's grid in each of its configurations (K, N), in order of time.
+    """Depth at a link's cells in each configuration (K, N), in order of time.
 
-    total, weight float32: sum [m] and weight of the distances before the measured surface, positive outside; seen:
-    whether one sees a surface there; free: whether it sees through the cell.
+    total, weight float32: sum [m] and weight of distances before the surface, positive outside; seen: a surface is
+    there; free: a ray passes.
     """
 
     total: Float32
@@ -43,16 +43,16 @@ class Fused:
     free: Bool
 
     def within(self, run: slice) -> tuple[Float64, Bool, Bool]:
-        """Mean distance (N,) [m], NaN where none; where a surface is seen and none through it, and where free (R, N),
-        by a run of R configurations.
-        """
+        """Return a run's mean distance (N,) [m] or NaN, seen but not free (R, N), free (R, N)."""
         total, weight = self.total[run].sum(axis=0), self.weight[run].sum(axis=0)
         mean = np.where(weight > 0.5, total / np.maximum(weight, 1e-9), np.nan).astype(np.float64)
         return mean, self.seen[run] & ~self.free[run], self.free[run]
 
     def is_robot(self, gap: Float64, run: slice, least: int, most_free: float) -> Bool:
-        """Cells (N,) inside of a surface that `least` configurations of a run show and a share of at most `most_free`
-        sees through, beside the link's own, which is `gap` (N,) [m] away.
+        """True for cells (N,) inside a surface that is robot.
+
+        `least` configurations show it, at most a share `most_free` sees through; gap (N,) [m]: from the link's own
+        surface.
         """
         mean, seen, free = self.within(run)
         num, num_free = seen.sum(axis=0), free.sum(axis=0)
@@ -60,14 +60,14 @@ class Fused:
         return np.asarray(is_robot & (np.maximum(np.nan_to_num(mean, nan=TRUNCATION), VOXEL - gap) < 0))
 
     def votes(self, run: slice) -> Float32:
-        """(N,): in how many configurations of a run a cell is a surface, less `FREE_WEIGHT` for each that is free."""
+        """Return votes (N,) of a run: surface configurations less `FREE_WEIGHT` per free one."""
         num, num_free = (self.seen[run] & ~self.free[run]).sum(axis=0), self.free[run].sum(axis=0)
         return np.asarray(num - FREE_WEIGHT * num_free, np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Interval:
-    """Configurations from `first` to `last` in which a link has something, and its bounds [ns]."""
+    """Configurations `first` to `last` of a link's part, with bounds [ns]."""
 
     first: int
     last: int
@@ -76,7 +76,6 @@ class Interval:
 
 
 def _runs(fused: Fused) -> tuple[Index, Index]:
-    """First and last configuration (N,) of the run in which each cell has most `Fused.votes`, by one scan."""
     num, N = fused.seen.shape
     best, sums = np.zeros(N, np.float32), np.zeros(N, np.float32)
     begun, first, last = (np.zeros(N, np.int64) for _ in range(3))
@@ -90,12 +89,11 @@ def _runs(fused: Fused) -> tuple[Index, Index]:
 
 
 def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> list[Interval]:
-    """All of a recording, and each interval that the runs of enough cells beside each other have in common.
+    """Return the whole recording, and intervals shared by the runs of enough connected cells.
 
-    A run begins after the last configuration before it that sees through the cell; without one nothing bounds it. It
-    ends likewise. Where a part begins or ends, some configuration sees through `GONE` of it: the edges of a thing
-    that stays are free in a few views, too. mask (X, Y, Z): of the cells; gap (N,) [m] from the link's own surface;
-    stamps (K,) [ns].
+    Configurations that see through a cell before or after its run bound it. At a part's begin or end, some
+    configuration sees through `GONE` of it: edges of static objects are free in a few views, too. mask (X, Y, Z): of
+    the cells; gap (N,) [m] from the link's own surface; stamps (K,) [ns].
     """
     num, rows = len(stamps), np.arange(len(stamps))[:, None]
     first, last = _runs(fused)
@@ -129,7 +127,6 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
 
 
 def _interval(before: int, first: int, last: int, after: int, stamps: Stamps) -> Interval:
-    """The configurations from first to last, bounded in the middle to those before and after, where there are any."""
     return Interval(
         first=first,
         last=last,
@@ -139,9 +136,10 @@ def _interval(before: int, first: int, last: int, after: int, stamps: Stamps) ->
 
 
 def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:
-    """The number (N,) of the interval in which each cell is robot, -1 for none: that with most votes of the robot's
-    cells around it. In all of the recording, the first one, it is also robot beside such cells where fewer
-    configurations show it: in some, rays pass beside what is as thin as a pixel.
+    """Return the interval (N,) in which each cell is robot, -1 for none.
+
+    Votes of robot cells around it decide. In the whole recording, the first, cells next to robot need fewer
+    configurations: some rays pass structures as thin as a pixel.
     """
     runs = [slice(interval.first, interval.last + 1) for interval in intervals]
     is_robot = np.array([fused.is_robot(gap, run, NUM_CONFIGURATIONS, FREE_SHARE) for run in runs])
@@ -156,7 +154,7 @@ def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence
 
 
 def spread_cells(mask: Bool, values: NDArray[Any], rest: float) -> Float32:
-    """Values (N,) of the cells of a mask (X, Y, Z), in a grid (X, Y, Z) with the rest."""
+    """Return a grid (X, Y, Z) of values (N,) in the mask and `rest` elsewhere."""
     grid = np.full(mask.shape, np.float32(rest))
     grid[mask] = values
     return grid

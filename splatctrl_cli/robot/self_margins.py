@@ -1,7 +1,7 @@
-"""How far the collision surfaces of a robot's links are from each other: told from the spheres where these are far
-enough apart, else exact between triangles (coal); and the margin that each pair of links can keep between its
-spheres: what is asked for, or less where the spheres stick out of the links so far, or the links are that near each
-other, that no controller could keep it. T postures, J joints, S spheres, K pairs.
+"""Distances between a robot's link surfaces, and the margins that their spheres can keep.
+
+Spheres decide where far enough apart, else triangles, exactly (coal). A pair keeps less than the configured margin
+where no controller could keep it. T postures, J joints, S spheres, K pairs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,11 +31,11 @@ from splatctrl_cli.robot.self_collision import DisabledPair, fixtures, joined_li
 LinkNames = tuple[str, str]
 Depth = Callable[[Float64], Float64]
 
-FLAT = 1e-9  # of a solid's size, by which a vertex may stick out of a face's plane: rounding
+FLAT = 1e-9  # of a solid's size: rounding of a vertex's height above a face's plane
 
 
 class LinkSurface:
-    """The collision surface of one link, in its frame: the triangles of all its solids."""
+    """Collision surface of one link, in its frame: the triangles of all its solids."""
 
     def __init__(self, solids: Sequence[Solid]) -> None:
         parts = [solid.surface for solid in solids]
@@ -54,7 +54,7 @@ class LinkSurface:
         self._depths: list[Depth] = []
 
     def depth(self, points: Float64) -> float:
-        """How deep [m] points (Q, 3), in the link's frame, lie in it at most; 0 outside, or in an open surface."""
+        """Return the largest depth [m] of points (Q, 3); 0 outside or in open surfaces."""
         is_near = np.zeros(len(points), dtype=np.bool_)
         for lower, upper in self._boxes:
             is_near |= np.all((points >= lower) & (points <= upper), axis=1)
@@ -65,8 +65,9 @@ class LinkSurface:
 
 
 def depth_in(solid: Solid) -> Depth:
-    """How deep (Q,) [m] points (Q, 3) lie in a closed solid, negative outside: in a convex one the least depth below
-    the planes of its faces, which is the distance to its surface and takes a tenth of the time.
+    """Return a function for depths (Q,) [m] in a closed solid, negative outside.
+
+    In a convex one the least depth below the face planes is the surface distance, in a tenth of the time.
     """
     corners = solid.surface.corners
     normals = face_normals(corners)
@@ -80,11 +81,10 @@ def depth_in(solid: Solid) -> Depth:
 
 
 def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
-    """The distance [m] of two surfaces, that of b at T_a_b (4, 4); negative where the links overlap.
+    """Return the gap [m] of two surfaces, b at T_a_b; negative where they overlap.
 
-    Exact between triangles; where they stand for something round, a lower bound by how far they are off it. One link
-    inside the other overlaps it, too, although the surfaces do not meet. The depth is that of the deepest vertex, and
-    at least LEAST_OVERLAP.
+    Exact between triangles, a lower bound for round shapes. A link inside the other overlaps it, although the
+    surfaces do not meet. The depth is the deepest vertex's, at least LEAST_OVERLAP.
     """
     here, there = coal.Transform3s(), coal.Transform3s(T_a_b[:3, :3], T_a_b[:3, 3])
     request, result = coal.DistanceRequest(), coal.DistanceResult()
@@ -97,11 +97,10 @@ def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
 
 
 class SelfSurfaces:
-    """Pairs of links that may collide, judged by their surfaces; pairs of spheres where a body has no surface.
+    """Pairs of links that may collide, judged by surfaces; without surfaces, by spheres.
 
-    pairs: links on bodies that are neither one nor joined by a joint, not named by an SRDF, and apart in some
-    posture; fused: those that are not. names (K + P): of these and of the P pairs of spheres that stand for bodies
-    without collision geometry.
+    pairs: links neither on one body nor joined by a joint, not in an SRDF, and apart in some posture; fused: never
+    apart. names (K + P): of these and of P pairs of spheres on bodies without geometry.
     """
 
     def __init__(
@@ -111,9 +110,9 @@ class SelfSurfaces:
         disabled: Sequence[DisabledPair] = (),
         recorded: Float64 | None = None,
     ) -> None:
-        """model: with its coverage measured, of these solids; recorded: postures (R, J) that the arm was in."""
+        """model: with coverage of these solids; recorded: logged postures (R, J)."""
         self._model, self._solids = model, solids
-        self._surfaces: dict[str, LinkSurface] = {}  # made when a pair first comes near
+        self._surfaces: dict[str, LinkSurface] = {}  # built when a pair is first near
         leaders = {link: leader for link, (leader, _) in model.urdf.rigid_bodies().items()}
         self._spheres = _SphereBodies(model, leaders)
         links = model.sphere_set.links
@@ -129,9 +128,9 @@ class SelfSurfaces:
         self.names = tuple(f"{a} and {b}" for a, b in (*self.pairs, *((links[a], links[b]) for a, b in self._bare)))
 
     def gaps(self, q: Float64, centers: Float64, enough: float) -> Float64:
-        """The gaps (T, K + P) [m] of what has `names`, at postures (T, J) with sphere centres (T, S, 3).
+        """Return gaps (T, K + P) [m] at postures (T, J).
 
-        Of links exact where they are below `enough` [m]; else a lower bound, which is above it.
+        centers: (T, S, 3). Links' gaps are exact below `enough` [m], else lower bounds above it.
         """
         gaps = self._spheres.bounds(self.pairs, centers)
         for state, pair in np.argwhere(gaps < enough):
@@ -141,11 +140,11 @@ class SelfSurfaces:
         return np.concatenate([gaps, bare], axis=1)
 
     def number_of(self, pair: LinkNames) -> int | None:
-        """Where two links are in `pairs`, either way round; None where they are not."""
+        """Return two links' index in `pairs`, in either order; None if absent."""
         return next((number for number, own in enumerate(self.pairs) if own in (pair, pair[::-1])), None)
 
     def gaps_of(self, pair: LinkNames, q: Float64, centers: Float64, enough: float = np.inf) -> Float64 | None:
-        """The gap (T,) [m] of one pair of links, as `gaps` has it; None where it is none of the pairs."""
+        """Return one pair's gaps (T,) [m], as `gaps`; None for no such pair."""
         if self.number_of(pair) is None:
             return None
         gaps = self._spheres.bounds([pair], centers)[:, 0]
@@ -154,7 +153,7 @@ class SelfSurfaces:
         return gaps
 
     def gap(self, q: Float64, pair: LinkNames) -> float:
-        """The gap [m] of the surfaces of two links at q (J,), negative where they overlap."""
+        """Return the gap [m] of two links' surfaces at q (J,), negative where they overlap."""
         for link in pair:
             if link not in self._surfaces:
                 self._surfaces[link] = LinkSurface(self._solids[link])
@@ -163,9 +162,7 @@ class SelfSurfaces:
         return surface_gap(a, b, invert_transform(T_world_a) @ T_world_b)
 
     def _never_apart(self, pairs: Sequence[LinkNames], recorded: Float64 | None) -> tuple[LinkNames, ...]:
-        """The pairs that overlap in all of SELF_TOUCHING random postures and in all recorded ones: nothing parts
-        them.
-        """
+        """Pairs that overlap in SELF_TOUCHING random postures and all recorded ones."""
         postures = random_postures(self._model, SELF_TOUCHING, seed=0)
         if recorded is not None:
             postures = np.concatenate([recorded, postures])
@@ -178,7 +175,7 @@ class SelfSurfaces:
 
 
 class _SphereBodies:
-    """The spheres by rigid body, each grown by what the spheres of its body leave uncovered of it."""
+    """Spheres by rigid body, grown by its uncovered surface."""
 
     def __init__(self, model: RobotModel, leaders: Mapping[str, str]) -> None:
         self._leaders = leaders
@@ -189,9 +186,6 @@ class _SphereBodies:
         self._reach = (model.sphere_set.radii + model.sphere_deficit)[self._order]
 
     def bounds(self, pairs: Sequence[LinkNames], centers: Float64) -> Float64:
-        """Lower bounds (T, K) [m] on the gaps of pairs of links, from sphere centres (T, S, 3); -inf for a body
-        without spheres.
-        """
         bodies = np.array([[self._number.get(self._leaders[link], -1) for link in pair] for pair in pairs])
         found = np.full((len(centers), len(pairs)), -np.inf)
         known = np.flatnonzero((bodies.reshape(-1, 2) >= 0).all(axis=1))
@@ -204,13 +198,12 @@ class _SphereBodies:
 
 @dataclass(frozen=True, kw_only=True)
 class KeptMargin:
-    """Two links whose spheres keep `margin` [m] instead of what was asked for.
+    """Two links whose spheres keep `margin` [m] instead of the configured one.
 
-    margin: below 0 the spheres may overlap by so much; None: they cannot be kept apart at all, and it stays as asked.
-    apart: the least gap [m] of their surfaces (of their spheres where these are not known) that is not *near*, below.
-    is_fixture: one stands still and carries none, such as a table of the URDF.
-    surface_gap: no gap [m] of their surfaces is less in the sampled postures in which their spheres keep the margin,
-    negative where they overlap; None where the surfaces are not known.
+    margin: negative if the spheres may overlap; None: they cannot be separated, and it stays configured. apart: least
+    gap [m] of their surfaces (of their spheres if unknown) that is not *near* (`kept_margins`). is_fixture: one
+    stands still and carries none, such as a table. surface_gap: least gap [m] of their surfaces in sampled postures
+    that keep the margin, negative where they overlap; None if unknown.
     """
 
     links: tuple[str, str]
@@ -221,8 +214,9 @@ class KeptMargin:
 
 
 def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) -> tuple[KeptMargin, ...]:
-    """The pairs of a link that moves and one of `fixtures`, which no map has: they keep `margin` [m], or a share of
-    the largest gap that they ever have.
+    """Return pairs of a moving link and one of `fixtures`, which no map contains.
+
+    They keep `margin` [m], or a share of their largest gap.
     """
     standing = fixtures(model)
     postures, found = random_postures(model, SELF_TOUCHING, seed=0), []
@@ -233,14 +227,13 @@ def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) ->
 
 
 def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None) -> tuple[KeptMargin, ...]:
-    """The pairs of links whose spheres often (SELF_OFTEN of SELF_POSTURES random postures) do not keep `margin` [m],
-    and what they keep.
+    """Return pairs whose spheres often break `margin` [m], with the margin they keep.
 
-    With their surfaces known: a posture is *near* where the surfaces are nearer than the margin, or than half of the
-    largest gap that they ever have, whichever is less. The pair keeps the largest sphere gap of the near postures,
-    where most of the others keep more: then its row keeps the arm out of every near posture of the sample. Where the
-    spheres are too coarse to tell, and where the surfaces are not known, it keeps what nearly all postures (that are
-    not near) do, in the latter case never less than 0: contact of spheres is then the only contact that is seen.
+    Often: in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* where the surfaces are within the
+    margin or half their largest gap, whichever is less. The pair keeps the largest sphere gap of the near postures if
+    most others keep more: its row then excludes all sampled near postures. With too coarse spheres or unknown
+    surfaces, it keeps what nearly all other postures keep; in the latter case at least 0, for sphere contact is then
+    the only visible contact.
     """
     names = model.sphere_set.links
     owners = [(names[a], names[b]) for a, b in model.self_pairs()]
@@ -254,13 +247,13 @@ def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None
         if np.mean(gap < margin) > SELF_OFTEN:
             surface = None if surfaces is None else surfaces.gaps_of(links, postures, centers, margin)
             if surfaces is not None and surface is not None and surface.max() < margin / SELF_SHARE:
-                surface = surfaces.gaps_of(links, postures, centers)  # exact, for their share counts
+                surface = surfaces.gaps_of(links, postures, centers)  # exact, for a share of the largest counts
             found.append(_kept(links, gap, margin, surface))
     return tuple(pair for pair in found if pair.margin is None or pair.margin < margin)
 
 
 def with_kept_margins(model: RobotModel, margin: float, kept: Sequence[KeptMargin]) -> RobotModel:
-    """The same robot, whose pairs of spheres of these links keep so much less than `margin` [m]."""
+    """Return the robot with self_allowance for these pairs, relative to `margin` [m]."""
     less = {frozenset(pair.links): margin - pair.margin for pair in kept if pair.margin is not None}
     names = model.sphere_set.links
     allowance = [less.get(frozenset((names[a], names[b])), 0.0) for a, b in model.self_pairs()]
@@ -268,7 +261,7 @@ def with_kept_margins(model: RobotModel, margin: float, kept: Sequence[KeptMargi
 
 
 def least_gap(model: RobotModel, surfaces: SelfSurfaces | None, pair: KeptMargin, postures: Float64) -> float:
-    """The least gap [m] of a pair at postures (T, J), exact below `pair.apart` and of what that is of."""
+    """Return a pair's least gap [m] at postures (T, J), exact below `pair.apart`."""
     gaps = None
     if surfaces is not None:
         gaps = surfaces.gaps_of(pair.links, postures, model.sphere_centers_batch(postures), pair.apart)
@@ -276,7 +269,7 @@ def least_gap(model: RobotModel, surfaces: SelfSurfaces | None, pair: KeptMargin
 
 
 def sphere_gaps(model: RobotModel, links: tuple[str, str], postures: Float64) -> Float64:
-    """The least gap (T,) [m] of those of `self_pairs` that are of two links, at postures (T, J)."""
+    """Return the least sphere gap (T,) [m] of two links' `self_pairs` at postures (T, J)."""
     names, radii, centers = model.sphere_set.links, model.sphere_set.radii, model.sphere_centers_batch(postures)
     a, b = np.array([(a, b) for a, b in model.self_pairs() if (names[a], names[b]) == links], dtype=np.int64).T
     gaps = np.linalg.norm(centers[:, a] - centers[:, b], axis=2) - radii[a] - radii[b]
@@ -284,7 +277,6 @@ def sphere_gaps(model: RobotModel, links: tuple[str, str], postures: Float64) ->
 
 
 def _kept(links: tuple[str, str], gap: Float64, margin: float, surface: Float64 | None) -> KeptMargin:
-    """What a pair keeps whose spheres and surfaces have these gaps (T,) [m] in the sampled postures."""
     apart = min(margin, SELF_SHARE * float((gap if surface is None else surface).max()))
     if surface is None:
         least = min(margin, float(np.quantile(gap, SELF_KEPT)))

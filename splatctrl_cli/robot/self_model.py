@@ -1,4 +1,4 @@
-"""The robot's self-model: what moves with its links, whatever the URDF draws, as grids and closed surfaces."""
+"""The robot's self-model: parts that move with its links beyond the URDF, as grids and surfaces."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -15,19 +15,18 @@ from splatctrl_cli.robot.coverage import areas
 from splatctrl_cli.robot.surface import RobotSurface
 
 ALWAYS = (int(np.iinfo(np.int64).min), int(np.iinfo(np.int64).max))  # [ns]
-BOUNDS = ("start_ns", "end_ns", "first_ns")  # that files of earlier versions lack
+BOUNDS = ("start_ns", "end_ns", "first_ns")  # missing from files of earlier versions
 
 
 @dataclass(frozen=True, kw_only=True)
 class LearnedLink:
-    """A link that was seen in clearly different configurations, or what it has for a time alone: a grasped object.
+    """A link seen in clearly different configurations, or a temporary part: a grasped object.
 
-    The robot has its parts from start_ns to end_ns [ns], `ALWAYS` where neither is known. origin (3,) [m], link
-    frame: of the first cell's centre; voxel [m]; distance (X, Y, Z) float32 [m], NaN where nothing is known;
-    configurations (X, Y, Z) uint8 in which a cell was a surface; triangles (F, 3, 3) [m], link frame: closed surfaces
-    of the parts that the visual surface lacks. Of these parts: outside_95, outside_most [m], how far their cells lie
-    outside the visual surface; place (3,) [m], link frame, where most; since [s] from the first frame, when they
-    could be known. Without parts 0 and NaN. first_ns [ns]: of the first frame.
+    Its parts last from start_ns to end_ns [ns], `ALWAYS` if unbounded. origin (3,) [m], link frame: first cell's
+    centre; voxel [m]; distance (X, Y, Z) float32 [m], NaN if unknown; configurations (X, Y, Z) uint8 with a surface
+    there; triangles (F, 3, 3) [m], link frame: closed surfaces of parts beyond the visual surface. outside_95,
+    outside_most [m]: protrusion of 95 % and of all of their cells, most at place (3,) [m]; since [s] from the first
+    frame: when knowable. Without parts 0 and NaN. first_ns [ns]: first frame.
     """
 
     link: str
@@ -47,7 +46,7 @@ class LearnedLink:
     first_ns: int = 0
 
     def words(self, first_ns: int) -> str:
-        """What the link has, when, in seconds after a stamp [ns], and how far it stands out."""
+        """Return the link's part, its times [s] after a stamp [ns] and protrusion, in words."""
         start, end = (f"{1e-9 * (stamp - first_ns):.2f}" for stamp in (self.start_ns, self.end_ns))
         until = f" until {end} s" if self.end_ns != ALWAYS[1] else ""
         if self.start_ns != ALWAYS[0]:
@@ -57,18 +56,21 @@ class LearnedLink:
 
     @property
     def is_always(self) -> bool:
-        """Whether the robot has its parts at all times."""
+        """True for a permanent part."""
         return (self.start_ns, self.end_ns) == ALWAYS
 
     @property
     def area(self) -> float:
-        """The area [m^2] of the part's triangles."""
+        """Area [m^2] of the triangles."""
         return float(areas(self.triangles).sum())
 
 
 @dataclass(frozen=True, kw_only=True)
 class SelfModel:
-    """links: the robot's; digest: of its visual geometry; unknown: links that could not be learned, and why."""
+    """The robot's links, digest of its visual geometry, and learned parts.
+
+    unknown: links not learned, and why.
+    """
 
     links: tuple[str, ...]
     digest: str
@@ -76,29 +78,29 @@ class SelfModel:
     unknown: Mapping[str, str]
 
     def pieces(self) -> list[tuple[str, Float64]]:
-        """Links and the triangles (F, 3, 3) [m], in their frame, that belong to the robot's surface at all times."""
+        """Return links and triangles (F, 3, 3) [m], link frame, of permanent parts."""
         return [(part.link, part.triangles) for part in self.learned if part.is_always and len(part.triangles)]
 
     @property
     def held(self) -> list[LearnedLink]:
-        """Parts that the robot has for a time alone."""
+        """Temporary parts."""
         return [part for part in self.learned if not part.is_always and len(part.triangles)]
 
     def held_at(self, stamp_ns: int) -> list[tuple[str, Float64]]:
-        """Those that the robot has at a stamp [ns], and not always."""
+        """Return the temporary parts at a stamp [ns]."""
         return [(part.link, part.triangles) for part in self.held if part.start_ns <= stamp_ns < part.end_ns]
 
     @property
     def parts(self) -> list[LearnedLink]:
-        """What stands out at any time."""
+        """Parts of any time."""
         return [part for part in self.learned if len(part.triangles)]
 
     def changes(self) -> list[int]:
-        """Stamps [ns], in order, from each of which on `held_at` may differ."""
+        """Return stamps [ns], in order, at which `held_at` may change."""
         return sorted({stamp for part in self.held for stamp in (part.start_ns, part.end_ns)} - set(ALWAYS))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All of it by name, for a file."""
+        """Return all of it by name, for a file."""
         keys = [f"{part.link} {number}" for number, part in enumerate(self.learned)]
         rows = zip(keys, self.learned, strict=True)
         return {
@@ -111,7 +113,7 @@ class SelfModel:
 
     @classmethod
     def from_arrays(cls, found: Mapping[str, Any]) -> Self:
-        """The self-model that `arrays` wrote. Raises KeyError, TypeError or ValueError for other arrays."""
+        """Read `arrays`. Raises KeyError, TypeError or ValueError for others."""
         names = [field.name for field in fields(LearnedLink)]
         rows = [
             {name: found[f"{key}.{name}"] for name in names if f"{key}.{name}" in found or name not in BOUNDS}
@@ -125,7 +127,7 @@ class SelfModel:
         return cls(links=links, digest=str(found["digest"]), learned=tuple(learned), unknown=unknown)
 
     def check_robot(self, surface: RobotSurface, links: Sequence[str], path: Path) -> None:
-        """Raise InputError where the file `path` is of another robot than that of these links and visual surface."""
+        """Raise InputError if file `path` belongs to a robot of other links or visual surface."""
         other = ", ".join(sorted(set(self.links) ^ set(links))[:4])
         if other or self.digest != surface_digest(surface):
             difference = f"one of the two lacks {other}" if other else "its visual geometry differs"
@@ -136,7 +138,7 @@ class SelfModel:
 
 
 def surface_digest(surface: RobotSurface) -> str:
-    """sha256 of the geometry by links, without those that spheres stand for."""
+    """Return sha256 of the links' geometry, except links that spheres replace."""
     digest = hashlib.sha256()
     for number, link in enumerate(surface.links):
         if link not in surface.by_spheres:

@@ -1,10 +1,8 @@
-"""Collision spheres of a robot: sets by the link names of a URDF, how far a joint can move a sphere, whatever the
-posture (so that a planner can trust the space between two samples), and sets on disk: YAML as this tool, robometrics
-and cuRobo write it, and URDFs with collision spheres.
+"""Collision spheres of a robot: files, matching to URDF links, and joints' lever arms.
 
-cuRobo's reading (NVlabs/curobo, cuda_robot_generator.py) is kept: `collision_sphere_buffer`, a number or one by link,
-is added to every radius, `collision_spheres` may name a file of its own, and a sphere whose radius is not above 0
-after that is switched off (as for objects not attached yet; older releases made those above -1 m one millimetre).
+Files are URDFs, and YAML of this tool, robometrics and cuRobo. As in cuRobo (NVlabs/curobo, cuda_robot_generator.py),
+`collision_sphere_buffer`, a number or one per link, adds to every radius; `collision_spheres` may name a file; a
+radius not above 0 is switched off, as for objects not attached yet.
 """
 
 from collections.abc import Sequence
@@ -28,7 +26,7 @@ RENAMED = (
 
 
 def spheres_of(urdf: UrdfFile) -> SphereSet:
-    """`own_spheres`. Raises InputError where there are none."""
+    """Return `own_spheres`. Raises InputError without any."""
     found = own_spheres(urdf)
     if not len(found.radii):
         others = len(urdf.meshes) + len(urdf.other_shapes) + sum(shape.kind != "sphere" for shape in urdf.shapes)
@@ -40,8 +38,9 @@ def spheres_of(urdf: UrdfFile) -> SphereSet:
 
 
 def own_spheres(urdf: UrdfFile) -> SphereSet:
-    """The spheres of a URDF whose collision geometry is spheres and nothing else; else none, as they would leave
-    other shapes uncovered.
+    """Return the spheres of a URDF with no other collision geometry.
+
+    Else none, as they would leave other shapes uncovered.
     """
     has_others = urdf.meshes or urdf.other_shapes or any(shape.kind != "sphere" for shape in urdf.shapes)
     shapes = () if has_others else urdf.shapes
@@ -53,7 +52,7 @@ def own_spheres(urdf: UrdfFile) -> SphereSet:
 
 
 def with_boxes(spheres: SphereSet, boxes: Sequence[tuple[str, Box]]) -> SphereSet:
-    """`spheres`, and those that cover boxes in the frames of links: one for each `CARRIED_CELL`."""
+    """Add spheres that cover boxes in link frames, one per `CARRIED_CELL`."""
     links, centers, radii = [*spheres.links], [spheres.centers], [spheres.radii]
     for link, box in boxes:
         size = box.upper - box.lower
@@ -66,11 +65,10 @@ def with_boxes(spheres: SphereSet, boxes: Sequence[tuple[str, Box]]) -> SphereSe
 
 
 def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[SphereSet, tuple[str, ...]]:
-    """`spheres`, called `name` in errors, by the URDF's link names, and the links that the URDF lacks.
+    """Return the spheres by the URDF's link names, and the links missing there.
 
-    A link that it lacks, such as a hand not mounted, is left out.
-    Where no name agrees, names are compared without their first part: a set for `panda_link1` fits `fr3_link1`.
-    Raises InputError when nothing fits even so.
+    Those are left out, such as a hand not mounted. If no name agrees, names are compared without their first part:
+    `panda_link1` fits `fr3_link1`. Raises InputError about `name` if nothing fits even so.
     """
     names = {link: link for link in urdf.links}
     asked = spheres.links
@@ -90,7 +88,7 @@ def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[Sphere
 
 
 def are_links_renamed(spheres: SphereSet, urdf: UrdfFile) -> bool:
-    """Whether `matched_links` compares names without their first part: the two have no name in common."""
+    """True if the two have no link name in common."""
     return not set(spheres.links) & set(urdf.links)
 
 
@@ -99,11 +97,11 @@ def _without_prefix(link: str) -> str:
 
 
 def lever_arms(chain: Chain, lower: Float64, upper: Float64) -> Float64:
-    """(S, J) upper bounds, over every posture within lower, upper (J,), of a centre's travel per radian (or metre).
+    """Return bounds (S, J) on a centre's travel per radian (or metre) within the limits.
 
-    From the sphere towards the base: about its own joint it keeps to a circle, which a ball about the circle's middle
-    on the axis holds; carried by the next joint, the ball's middle keeps to a circle in turn, and the ball that holds
-    it is as much larger as the middle is away from that axis. 0 where the joint does not move the sphere.
+    About its own joint the centre keeps to a circle, inside a ball about the circle's middle. Each joint towards the
+    base carries that middle on a circle in turn; the ball grows by its distance from the axis. 0 where the joint does
+    not move the sphere.
     """
     levers = np.zeros((len(chain.sphere_body), len(chain.parent) - 1))
     for s, (start, offset) in enumerate(zip(chain.sphere_body, chain.offset, strict=True)):
@@ -129,7 +127,7 @@ URDF_SUFFIXES = (".urdf", ".xml")
 
 @dataclass(frozen=True, kw_only=True)
 class SphereFile:
-    """A sphere file: its layout (such as "cuRobo YAML"), its spheres, and how many more are switched off."""
+    """A sphere file: layout (such as "cuRobo YAML"), spheres, number switched off."""
 
     path: Path
     layout: str
@@ -138,15 +136,15 @@ class SphereFile:
 
 
 def read_spheres(path: Path) -> SphereSet:
-    """The spheres of a file [m], by link; see `read_sphere_file`."""
+    """Return the spheres of a file [m]; see `read_sphere_file`."""
     return read_sphere_file(path).spheres
 
 
 def read_sphere_file(path: Path) -> SphereFile:
-    """The spheres of a YAML file or a URDF: `collision_spheres` at the top or under robot_cfg.kinematics, by link or
-    in Lula's list of links, or the groups of an XRDF.
+    """Read the spheres of a YAML file or a URDF.
 
-    Raises InputError for a missing file, another layout, a number that is not finite, or no sphere at all.
+    `collision_spheres` at the top or under robot_cfg.kinematics, by link or as Lula's list, or an XRDF's groups.
+    Raises InputError for an unreadable file, another layout, a non-finite number, or no sphere.
     """
     if path.suffix.lower() in URDF_SUFFIXES:
         return SphereFile(path=path, layout="URDF", spheres=spheres_of(read_urdf(path)), num_off=0)
@@ -186,7 +184,7 @@ def read_sphere_file(path: Path) -> SphereFile:
 
 
 def spheres_yaml(spheres: SphereSet, comments: Sequence[str] = ()) -> str:
-    """The text of a YAML file of `spheres`, by link, every value as it is, with `comments` on top."""
+    """Return YAML text of `spheres` by link, at full precision, with `comments` on top."""
     lines = [*(f"# {comment}" for comment in comments), "collision_spheres:"]
     for link in dict.fromkeys(spheres.links):
         lines.append(f"  {link}:")
@@ -207,7 +205,6 @@ def _yaml(path: Path) -> Any:
 
 
 def _section(tree: Any) -> dict[Any, Any]:
-    """The mapping that holds `collision_spheres`: the tree, or what is under robot_cfg and kinematics."""
     for key in ("robot_cfg", "kinematics"):
         if isinstance(tree, dict) and key in tree:
             tree = tree[key]
@@ -215,7 +212,6 @@ def _section(tree: Any) -> dict[Any, Any]:
 
 
 def _joined(path: Path, entries: list[dict[Any, Any]]) -> dict[Any, Any]:
-    """A list of {link: spheres} as one table."""
     table: dict[Any, Any] = {}
     for entry in entries:
         for link, spheres in entry.items():
@@ -224,7 +220,7 @@ def _joined(path: Path, entries: list[dict[Any, Any]]) -> dict[Any, Any]:
 
 
 def _xrdf(path: Path, tree: dict[Any, Any]) -> dict[Any, Any]:
-    """The group of spheres that an XRDF takes for collisions with the world, and what it adds to their radii."""
+    """An XRDF's spheres for world collisions, and their buffer."""
     asked = tree.get("collision") or tree.get("world_collision")
     collision, groups = (value if isinstance(value, dict) else {} for value in (asked, tree.get("geometry")))
     name = collision.get("geometry", next(iter(groups), None) if len(groups) == 1 else None)

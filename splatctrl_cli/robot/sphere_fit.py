@@ -1,15 +1,14 @@
-"""Spheres that cover all of a robot's collision surface and stick out of it as little as their number allows.
+"""Spheres that cover a robot's collision surface and protrude as little as their number allows.
 
-A ball centred at c that may stick out by t has the radius t - d(c), d the signed distance to the body (negative
-inside). The surface is cut into small triangles ("patches"); a ball holds a patch where it holds its three corners.
-So covering patch p from centre c takes the protrusion
+A ball at c that may protrude by t has the radius t - d(c), d the signed distance to the body (negative inside). The
+surface is cut into small triangles ("patches"); a ball holds a patch if it holds its corners. Covering patch p from
+centre c takes the protrusion
 
     K[c, p] = max_k |v_pk - c| + d(c),
 
-and the best n spheres of a link are a k-centre problem: the n centres for which the largest over p of the least over
-centres of K is smallest. Greedy set cover at a bisected t gives the centres, alternating assignment (each patch to
-the ball that needs the least) and recentring lowers t, and every ball shrinks to what its patches need. Each patch
-ends up inside one ball: covered by construction, and measured afterwards by `coverage`, which knows no patches.
+and the best n spheres are a k-centre problem: minimise the largest over p of the least K over centres. Greedy set
+cover at a bisected t gives centres, which alternating assignment and recentring improve; then balls shrink. Each
+patch ends up inside one ball: covered by construction. `coverage` measures it independently.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,16 +23,15 @@ from splatctrl_cli.records import Bool, Float64, Index, SphereSet
 from splatctrl_cli.robot.coverage import areas, largest_deficit, refined
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 
-DIGITS = 6  # of a written sphere: micrometres
+DIGITS = 6  # decimals of a written sphere: micrometres
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """What is asked of the spheres.
+    """Requirements on the spheres.
 
-    max_spheres: over all links; or max_protrusion [m], met by as few spheres as are found. max_deficit [m]: how far
-    surface points may stay outside. restarts: greedy covers tried per link and protrusion; num_patches and
-    num_candidates: about so many patches and lattice points in each link.
+    max_spheres: over all links; or max_protrusion [m], with few spheres. max_deficit [m]: of surface points outside.
+    restarts: greedy covers per link and protrusion; num_patches, num_candidates: approximate, per link.
     """
 
     max_spheres: int | None = None
@@ -46,10 +44,9 @@ class FitOptions:
 
 
 def fit_spheres(solids: Mapping[str, Sequence[Solid]], options: FitOptions) -> SphereSet:
-    """Spheres for each link of `solids`, rounded outward to micrometres; the same for the same options and seed.
+    """Fit spheres to each link's solids, rounded outward to micrometres; deterministic by seed.
 
-    Raises UsageError where the options contradict each other or ask for fewer spheres than links; InputError for a
-    link whose surface has no area.
+    Raises UsageError for contradictory options or too few spheres, InputError for a link without area.
     """
     _check(options, len(solids))
     links = [_Link(name, parts, options, index) for index, (name, parts) in enumerate(solids.items())]
@@ -80,10 +77,7 @@ def _check(options: FitOptions, num_links: int) -> None:
 
 
 def _shared_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Float64]]:
-    """Centres and radii by link, `budget` of them, so that the largest protrusion is small.
-
-    One t for all links takes most of them; the rest go one by one to the link that sticks out most.
-    """
+    """Distribute `budget` spheres: one t for all links, then singly to the most protruding."""
     low, high = 0.0, max(link.single for link in links)
     chosen = [np.array([link.middle]) for link in links]
     for _ in range(FIT_BISECTIONS):
@@ -103,7 +97,6 @@ def _shared_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Fl
 
 
 def _covers(links: Sequence["_Link"], t: float, budget: int) -> list[Index] | None:
-    """A cover of each link at protrusion t; None as soon as all together take more than `budget` spheres."""
     covers: list[Index] = []
     for index, link in enumerate(links):
         left = budget - sum(len(cover) for cover in covers) - (len(links) - index - 1)
@@ -115,7 +108,7 @@ def _covers(links: Sequence["_Link"], t: float, budget: int) -> list[Index] | No
 
 
 class _Link:
-    """Patches, candidate centres and the matrix K of one link."""
+    """Patches, candidate centres and matrix K of one link."""
 
     def __init__(self, name: str, parts: Sequence[Solid], options: FitOptions, index: int) -> None:
         self.name = name
@@ -141,9 +134,9 @@ class _Link:
         self.single = float(alone[self.middle])
 
     def cover(self, t: float, *, at_most: int) -> Index | None:
-        """Candidates (n,) whose balls of protrusion t hold every patch, as few as a few greedy passes find.
+        """Candidates (n,) whose balls of protrusion t hold every patch, by greedy passes.
 
-        None where these are more than `at_most`, or t is less than a single patch needs.
+        None beyond `at_most`, or if t is too small for a patch.
         """
         holds = self._cost <= t
         if not holds.any(axis=0).all():
@@ -157,7 +150,7 @@ class _Link:
         return None if best is None else np.array(best, dtype=np.int64)
 
     def within(self, max_protrusion: float) -> tuple[Float64, Float64]:
-        """Few spheres that stick out no more. Raises UsageError where its patches are too coarse for that."""
+        """Few spheres within a protrusion. Raises UsageError where the patches are too coarse."""
         cover = self.cover(max_protrusion + self._options.max_deficit, at_most=self._cost.shape[1])
         if cover is None:
             least = float(self._cost.min(axis=0).max()) - self._options.max_deficit
@@ -169,7 +162,7 @@ class _Link:
         return self.rounded(*self.improved(cover))
 
     def best(self, count: int, state: tuple[Float64, float]) -> tuple[Float64, float]:
-        """Centres (n, 3), n <= count, and their protrusion: the best found, not worse than `state`."""
+        """Best centres (n, 3), n <= count, and their protrusion, not worse than `state`."""
         low, high = 0.0, state[1]
         for _ in range(FIT_BISECTIONS // 2):
             t = 0.5 * (low + high)
@@ -184,7 +177,7 @@ class _Link:
         return state
 
     def improved(self, chosen: Index) -> tuple[Float64, float]:
-        """Centres (n, 3) after alternating assignment and recentring, and their protrusion [m]."""
+        """Centres (n, 3) and protrusion [m] after alternating assignment and recentring."""
         centers = self._candidates[chosen]
         for _ in range(FIT_ROUNDS):
             owner, worst = self._assigned(centers)
@@ -199,24 +192,24 @@ class _Link:
         return self._polished(centers)
 
     def rounded(self, centers: Float64, _protrusion: float) -> tuple[Float64, Float64]:
-        """Spheres with rounded centres, as small as their patches and then the whole surface allow."""
+        """Spheres at rounded centres, as small as patches and then the whole surface allow."""
         owner, _ = self._assigned(centers)
         centers = centers[np.unique(owner)].round(DIGITS)
         owner, _ = self._assigned(centers)
         reach = self._reach(centers)
         radii = np.array(
             [reach[k, owner == k].max(initial=0.0) for k in range(len(centers))]
-        )  # 0: rounded to idleness
+        )  # 0: of no use after rounding
         spare = -max(
             largest_deficit(part.surface.corners, centers, radii - part.slack, floor=-np.inf).proven
             for part in self._parts
         )
-        allowed = max(self._options.max_deficit - DEFICIT_GAP, 0.0)  # so that what is proven keeps to it
+        allowed = max(self._options.max_deficit - DEFICIT_GAP, 0.0)  # so that the proven bound stays within it
         radii = np.maximum(radii - max(spare, 0.0) - allowed, 10**-DIGITS)
         return centers, np.ceil(radii * 10**DIGITS + 1e-3) / 10**DIGITS
 
     def _polished(self, centers: Float64) -> tuple[Float64, float]:
-        """Each centre moved by fractions of the lattice spacing while that lowers what its patches need."""
+        """Move centres by fractions of the lattice spacing while that lowers their patches' need."""
         offsets = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.float64)
         for step in FIT_STEPS:
             owner, worst = self._assigned(centers)
@@ -233,21 +226,16 @@ class _Link:
         return centers, self._assigned(centers)[1]
 
     def _assigned(self, centers: Float64) -> tuple[Index, float]:
-        """The ball (P,) that holds each patch at the least protrusion, and the largest such protrusion."""
         cost = self._reach(centers) + self._distance(centers)[:, None]
         owner = cost.argmin(axis=0)
         return owner.astype(np.int64), float(cost[owner, np.arange(cost.shape[1])].max())
 
     def _reach(self, centers: Float64) -> Float64:
-        """Radius (C, P) a ball at each centre needs to hold each patch."""
         apart = cdist(centers, self._vertices)
         return np.asarray(apart[:, self._faces].max(axis=2) + self._slack)
 
     def _lattice(self, patches: Float64) -> tuple[Float64, float]:
-        """Points in the body on a lattice, about `num_candidates`, and its spacing [m].
-
-        Of a body too thin for many, the middles of the patches too.
-        """
+        """Lattice points in the body; for a thin one also the patches' middles."""
         lower, upper = self._vertices.min(axis=0), self._vertices.max(axis=0)
         size, wanted = np.maximum(upper - lower, 1e-3), self._options.num_candidates
         spacing = float(np.cbrt(np.prod(size) / wanted))
@@ -265,10 +253,7 @@ class _Link:
 
 
 def _greedy(by_patch: Bool, rng: np.random.Generator | None, at_most: int) -> list[int] | None:
-    """Candidates picked one by one for the most patches not yet held, by_patch (P, C) telling who holds which.
-
-    With `rng` one of the nearly best is picked. None beyond `at_most`.
-    """
+    """Pick candidates for the most pending patches each; with `rng`, one of the best."""
     pending = np.ones(len(by_patch), dtype=np.bool_)
     gain = by_patch.sum(axis=0, dtype=np.int32)
     picked: list[int] = []

@@ -1,4 +1,4 @@
-"""The robot's own surface as cameras see it, and how far points lie from it."""
+"""The robot's own surface as cameras see it, and distances to it."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,12 +35,11 @@ KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": BALL, "capsule": CAPSULE}
 class RobotSurface:
     """Solids (P) and triangles (F), each fixed to one of `links` (L) [m].
 
-    kinds (P,) as `kernels.surface_image` numbers them, sizes (P, 3) (half edges; radius and half length; radius),
-    T_link_solid (P, 4, 4), solid_links (P,); triangles (F, 3, 3) in the frame of triangle_links (F,), a `mesh` of all
-    to draw and `trees` by the links' numbers to measure. by_spheres: links that collision spheres stand for, because
-    their geometry is missing or cannot be read. notes: in words, for which links something else stands than their
-    visual geometry, and why. fixed: links that no joint moves. num_carried: the last of `links` again, one for each
-    box around what they carry.
+    kinds (P,) as in `kernels.surface_image`; sizes (P, 3) (half edges; radius and half length; or radius);
+    T_link_solid (P, 4, 4); triangles (F, 3, 3) in the frame of triangle_links (F,), as a `mesh` to draw and `trees`
+    by link number to measure. by_spheres: links of missing or unreadable geometry, where spheres replace it. notes:
+    replaced visual geometry, and why. fixed: links that no joint moves. num_carried: number of carried boxes, each
+    with its link again at the end of `links`.
     """
 
     links: tuple[str, ...]
@@ -59,11 +58,9 @@ class RobotSurface:
 
     @classmethod
     def of(cls, urdf: UrdfFile, spheres: SphereSet, folders: Sequence[Path] = ()) -> "RobotSurface":
-        """The visual geometry of a URDF; of links without, or whose cannot be read, the collision geometry; the
-        spheres of links that have neither.
+        """Build the visual geometry of a URDF, else collision geometry, else spheres, by link.
 
-        folders: where ``package://`` paths are looked for, before the folders above the URDF. Raises InputError for a
-        mesh in another unit.
+        folders: for ``package://``, before those above the URDF. Raises InputError for a mesh in another unit.
         """
         seen = visual_urdf(urdf)
         pieces, unread = _read(seen, folders)
@@ -100,7 +97,7 @@ class RobotSurface:
         by_spheres: tuple[str, ...] = (),
         fixed: tuple[str, ...] = (),
     ) -> "RobotSurface":
-        """Primitives, and triangles (F, 3, 3) in the frame of a link each."""
+        """Build a surface of primitives and triangles (F, 3, 3), each in a link's frame."""
         links = tuple(dict.fromkeys([*(s.link for s in shapes), *(link for link, _ in triangles)]))
         number = {link: index for index, link in enumerate(links)}
         corners = np.concatenate([np.zeros((0, 3, 3)), *(part for _, part in triangles)])
@@ -121,12 +118,12 @@ class RobotSurface:
 
     @classmethod
     def of_balls(cls, centers_world: Float64, radii: Float64) -> "RobotSurface":
-        """Balls (S, 3), (S,) [m] of one link, whose frame is the world."""
+        """Build a surface of balls (S, 3), (S,) [m]; the link's frame is the world."""
         balls = [_ball("spheres", c, r) for c, r in zip(centers_world, radii, strict=True)]
         return cls.from_parts(balls, by_spheres=("spheres",))
 
     def with_boxes(self, boxes: Sequence[tuple[str, Box]]) -> "RobotSurface":
-        """The same with boxes around what the robot carries, each fixed to a link, in its frame."""
+        """Return the surface with carried boxes, each fixed to a link, in its frame."""
         shapes = [
             Shape(
                 link=link,
@@ -149,7 +146,7 @@ class RobotSurface:
         )
 
     def joined(self, pieces: Sequence[tuple[str, Float64]]) -> "RobotSurface":
-        """The same with further triangles (F, 3, 3) [m], each piece in the frame of one of `links`."""
+        """Return the surface with more triangles (F, 3, 3) [m], in frames of `links`."""
         added = [np.full(len(part), self.links.index(link), np.int16) for link, part in pieces]
         triangles, owners = np.concatenate([self.triangles, *(p for _, p in pieces)]), self.triangle_links
         owners = np.concatenate([owners, *added])
@@ -159,23 +156,24 @@ class RobotSurface:
 
     @property
     def vague(self) -> list[int]:
-        """Numbers of the links whose solids only enclose what is there: spheres, and boxes around what is carried."""
+        """Links of enclosing spheres or boxes."""
         first = len(self.links) - self.num_carried
         return [k for k, name in enumerate(self.links) if k >= first or name in self.by_spheres]
 
     @property
     def is_drawn(self) -> bool:
-        """Whether visual meshes stand for every link. Then nothing but the robot is inside of it."""
+        """True if visual meshes cover every link.
+
+        Then nothing but the robot is inside.
+        """
         return bool(self.trees) and not self.notes and not self.vague
 
     def poses(self, T_world_link: Mapping[str, Float64]) -> Float64:
-        """(L, 4, 4) of `links`, from poses by name."""
+        """Return (L, 4, 4) of `links`, from poses by name."""
         return np.array([T_world_link[link] for link in self.links], np.float64).reshape(-1, 4, 4)
 
     def extents(self, T_world_link: Float64) -> dict[str, list[float]]:
-        """By link, at T_world_link (L, 4, 4): lower and upper corner of the box about its solids and triangles [m],
-        and their area [m^2].
-        """
+        """Return box corners (lower, upper) [m] and area [m^2] by link, at T_world_link."""
         T = T_world_link[self.solid_links] @ self.T_link_solid
         half, areas = _half_extents(self.kinds, self.sizes, T[:, :3, :3]), _areas(self.kinds, self.sizes)
         T_link = T_world_link[self.triangle_links]
@@ -200,8 +198,9 @@ class RobotSurface:
         tolerance: float = 0.0,
         quadratic: float = 0.0,
     ) -> SurfaceImage:
-        """What a camera sees of the robot alone with its links at T_world_link (L, 4, 4), and which points of
-        `measured` (H, W) float32 [m] lie inside it; see `kernels.surface_image.render_surface`.
+        """Render the robot alone, and mark points of `measured` (H, W) float32 [m] inside it.
+
+        T_world_link (L, 4, 4); see `kernels.surface_image.render_surface`.
         """
         k = intrinsics
         T_camera_link = invert_transform(T_world_camera) @ T_world_link
@@ -227,10 +226,10 @@ class RobotSurface:
         outside: Bool | None = None,
         num_threads: int = 1,
     ) -> Float64:
-        """Signed distance (Q,) [m] of points (Q, 3) to the nearest solid or triangle, negative inside; to triangles
-        infinite where it is more than `within` (Q,) [m]. With `enough` (Q,) [m] of at least 0 it is any distance on
-        the same side of both bounds, which is found sooner. The links `without` do not count; points `outside` (Q,)
-        of all triangles are not asked whether they are inside, which takes longest.
+        """Return signed distances (Q,) [m] of points (Q, 3), negative inside.
+
+        Infinite to triangles beyond `within` (Q,) [m]. With `enough` (Q,) [m] of at least 0, any distance on the same
+        side of both bounds, which is faster. Points `outside` (Q,) of all triangles skip the slow inside test.
         """
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
         counts = np.array([link not in without for link in self.links], bool)
@@ -244,8 +243,9 @@ class RobotSurface:
         return least
 
     def distance_to(self, link: str, points: Float64, outside: Bool | None = None) -> Float64:
-        """Signed distance (Q,) [m] of points (Q, 3) in a link's frame to its triangles, solids and carried boxes;
-        those `outside` (Q,) are known to be so.
+        """Return signed distances (Q,) [m] of points (Q, 3), link frame, to one link.
+
+        Carried boxes count. outside (Q,): known outside.
         """
         still = np.tile(np.eye(4), (len(self.links), 1, 1))
         return self.distance(still, points, without=[name for name in self.links if name != link], outside=outside)
@@ -253,8 +253,9 @@ class RobotSurface:
     def gaps(
         self, link: str, T_world_link: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
     ) -> Float64:
-        """Signed gap (T,) [m] of a link's triangles, solids and carried boxes from the nearest of balls (N, 3), (N,)
-        [m], with the link at T_world_link (T, 4, 4); infinite without any ball.
+        """Return a link's signed gap (T,) [m] to the nearest ball; infinite without balls.
+
+        Carried boxes count. Balls (N, 3), (N,) [m]; T_world_link (T, 4, 4).
         """
         numbers = [number for number, name in enumerate(self.links) if name == link]
         to_link = np.asarray(np.linalg.inv(T_world_link), np.float64)
@@ -267,12 +268,10 @@ class RobotSurface:
         return np.asarray(np.min(found, axis=0))
 
     def _solids(self, T_solid: NDArray[np.floating]) -> Float64:
-        """Rows (P, 16) of `SurfaceScene` for the frame from which T_solid (P, 4, 4) leads to each solid's own."""
         return np.column_stack([self.kinds, T_solid[:, :3, :3].reshape(-1, 9), T_solid[:, :3, 3], self.sizes])
 
 
 def _half_extents(kinds: Float64, sizes: Float64, R: Float64) -> Float64:
-    """Half edges (P, 3) [m] of the boxes along the axes about solids turned by R (P, 3, 3)."""
     radius, length = sizes[:, :1], np.abs(R[:, :, 2]) * sizes[:, 1:2]
     is_flat = np.isin(kinds, [CYLINDER])[:, None]
     across = radius * np.where(is_flat, np.sqrt(np.maximum(1 - np.square(R[:, :, 2]), 0.0)), 1.0)
@@ -281,7 +280,6 @@ def _half_extents(kinds: Float64, sizes: Float64, R: Float64) -> Float64:
 
 
 def _areas(kinds: Float64, sizes: Float64) -> Float64:
-    """(P,) [m^2]."""
     a, b, c = sizes.T
     of_box, round_part, ends = 8 * (a * b + b * c + c * a), 4 * np.pi * a * b, np.pi * a * a
     choices = [of_box, round_part + 2 * ends, 4 * ends, round_part + 4 * ends]
@@ -289,7 +287,6 @@ def _areas(kinds: Float64, sizes: Float64) -> Float64:
 
 
 def _read(urdf: UrdfFile, folders: Sequence[Path]) -> tuple[list[tuple[str, Float64]], dict[str, str]]:
-    """The link and the triangles (F, 3, 3) of each mesh, in the link's frame; and by link why one cannot be read."""
     pieces, unread = [], {link: f"{urdf.path}: <{tag}> cannot be read" for link, tag in urdf.other_shapes}
     for mesh in urdf.meshes:
         try:
@@ -302,7 +299,6 @@ def _read(urdf: UrdfFile, folders: Sequence[Path]) -> tuple[list[tuple[str, Floa
 
 
 def _notes(by_spheres: Sequence[str], solid: Collection[str], unread: Mapping[str, str]) -> tuple[str, ...]:
-    """For which links spheres, their `solid` collision geometry or nothing stands, and why that of the first."""
     groups: dict[tuple[str, bool], list[str]] = {}
     for link in dict.fromkeys([*by_spheres, *unread]):
         rest = "collision geometry stands" if link in solid else "nothing stands"

@@ -1,4 +1,4 @@
-"""What a URDF says apart from its kinematics: links, joints and collision shapes. Untrusted XML is read safely."""
+"""URDF contents apart from kinematics: links, joints, shapes. Untrusted XML is safe."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -18,9 +18,9 @@ LIMITED = ("revolute", "prismatic")
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """A primitive of one link: `box` (size = full x, y, z), `cylinder` (radius, length along z), `sphere` (radius).
+    """A link's primitive: `box` (full x, y, z), `cylinder` (radius, length along z), `sphere` (radius).
 
-    size [m]; T_link_shape (4, 4) maps the shape's own frame, at its middle, to the link.
+    size [m]; T_link_shape (4, 4) from the shape's frame, at its middle.
     """
 
     link: str
@@ -31,7 +31,7 @@ class Shape:
 
 @dataclass(frozen=True, kw_only=True)
 class MeshShape:
-    """A collision mesh of one link: the file as the URDF names it, its scale (3,), T_link_mesh (4, 4)."""
+    """A link's collision mesh: URDF file name, scale (3,), T_link_mesh (4, 4)."""
 
     link: str
     filename: str
@@ -41,7 +41,7 @@ class MeshShape:
 
 @dataclass(frozen=True, kw_only=True)
 class Joint:
-    """One joint: T_parent_child (4, 4) at position 0, and whom it mimics: (joint, multiplier, offset) or None."""
+    """A joint: T_parent_child (4, 4) at 0; mimic: (joint, multiplier, offset) or None."""
 
     name: str
     kind: str
@@ -53,11 +53,10 @@ class Joint:
 
 @dataclass(frozen=True, kw_only=True)
 class UrdfFile:
-    """The checked text of a URDF, its link names, joints and collision shapes.
+    """Checked text of a URDF, with links, joints and collision shapes.
 
-    A capsule is a cylinder and a sphere at either end of it. other_shapes: (link, tag) of collision elements that are
-    neither a primitive nor a mesh.
-    solid_links have a collision or visual element: there is something to bump into.
+    A capsule becomes a cylinder and two spheres. other_shapes: (link, tag); solid_links: with a collision or visual
+    element.
     """
 
     path: Path
@@ -82,7 +81,7 @@ class UrdfFile:
 
     @property
     def collision_links(self) -> tuple[str, ...]:
-        """Links with collision geometry, in the file's order."""
+        """Links with collision geometry, in order."""
         named = {
             *(s.link for s in self.shapes),
             *(m.link for m in self.meshes),
@@ -91,10 +90,10 @@ class UrdfFile:
         return tuple(link for link in self.links if link in named)
 
     def rigid_bodies(self, movable: Collection[str] | None = None) -> dict[str, tuple[str, Float64]]:
-        """For each link the link that leads its rigid body, and T_leader_link (4, 4).
+        """Return the leader of each link's rigid body, and T_leader_link (4, 4).
 
-        Links joined by fixed joints are one body, led by the link nearest to the root. `movable`: the joints that
-        move (default: all that are not fixed); a joint that is locked elsewhere than at 0 does not belong here.
+        Fixed joints merge links; the one nearest to the root leads. movable: joints that move (default: all not
+        fixed); the others are at 0.
         """
         still = {
             joint.child: joint
@@ -112,8 +111,9 @@ class UrdfFile:
 
     @property
     def grippers(self) -> tuple[str, ...]:
-        """Joints that a gripper's fingers have and an arm has not: one of several prismatic joints on one rigid body,
-        and one that mimics another or is mimicked, without a joint of another kind beyond it.
+        """Joints typical of fingers.
+
+        Several prismatic joints on a rigid body, or mimics and their leaders, without another kind of joint beyond.
         """
         movable = [joint for joint in self.joints if joint.kind != "fixed"]
         leader = {link: led for link, (led, _) in self.rigid_bodies().items()}
@@ -130,8 +130,9 @@ class UrdfFile:
         return tuple(joint.name for joint in movable if joint.name in found - carries_others)
 
     def fingers(self, moved: Collection[str]) -> tuple[str, ...]:
-        """Of `grippers` those that stand still while the `moved` joints move: on an arm that these move, and neither
-        one of them, nor before or in step with one.
+        """Return `grippers` that stand still while the `moved` joints move.
+
+        They are on the moved arm, but neither before a moved joint nor in step with one.
         """
         by_name = {joint.name: joint for joint in self.joints}
         busy = set(moved).union(*(self._before(by_name[name]) for name in moved if name in by_name))
@@ -142,14 +143,14 @@ class UrdfFile:
         )
 
     def _before(self, joint: Joint) -> Iterator[str]:
-        """The joints between a joint and the root, nearest first."""
+        """Joints towards the root, nearest first."""
         by_child = {joint.child: joint for joint in self.joints}
         while joint.parent in by_child:
             joint = by_child[joint.parent]
             yield joint.name
 
     def with_followers(self, locked: Mapping[str, float]) -> dict[str, float]:
-        """`locked` joints at their values, and with each the joints that mimic it, where they are not named."""
+        """Return `locked` values, with unnamed joints that mimic them."""
         followers = {
             joint.name: joint.mimic[1] * locked[joint.mimic[0]] + joint.mimic[2]
             for joint in self.joints
@@ -159,10 +160,10 @@ class UrdfFile:
 
 
 def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
-    """The URDF at `path`, or the `text` that is called so, once it is known to be one robot with a movable joint.
+    """Read and check the URDF at `path`, or its `text`.
 
-    Raises InputError for a file that is missing or no URDF, several root links, a joint without the limits it needs
-    or with an axis of zeros, or no movable joint (which is what an unexpanded xacro looks like).
+    Raises InputError for no URDF, several roots, missing limits, a zero axis, or no movable joint (such as an
+    unexpanded xacro).
     """
     text, root = _parse(path, _read(path) if text is None else text)
     links = tuple(_attribute(path, element, "name") for element in root.findall("link"))
@@ -200,8 +201,9 @@ def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
 
 
 def visual_urdf(urdf: UrdfFile, without: Collection[str] = ()) -> UrdfFile:
-    """The robot as cameras see it: visual geometry replaces the collision geometry of each link that has some, but
-    for the links `without`.
+    """Return the URDF with visual instead of collision geometry, where a link has some.
+
+    without: unchanged links.
     """
     root = ElementTree.fromstring(urdf.text)
     for link in root.findall("link"):
@@ -291,7 +293,7 @@ def _check_limits(where: str, kind: str, limit: Any) -> None:
 
 
 def _shapes(path: Path, link: str, collision: Any) -> Sequence[Shape | MeshShape | tuple[str, str]]:
-    """A primitive or more, a mesh, or (link, tag) of what is neither."""
+    """Primitives, a mesh, or (link, tag) of anything else."""
     geometry = collision.find("geometry")
     element = None if geometry is None else next(iter(geometry), None)
     if element is None:
@@ -320,7 +322,6 @@ def _shapes(path: Path, link: str, collision: Any) -> Sequence[Shape | MeshShape
 
 
 def _capsule(link: str, size: tuple[float, ...], T_link_shape: Float64) -> list[Shape]:
-    """A cylinder of a radius and a length [m], without the caps, and a sphere at either end of it."""
     radius, length = size
     parts = [Shape(link=link, kind="cylinder", size=size, T_link_shape=T_link_shape)]
     for z in (-0.5 * length, 0.5 * length):
