@@ -1,5 +1,6 @@
-"""How much `splatctrl check` looks at, and from where on something becomes a finding. A unit stands in brackets
-before what a number means; without one it is a share, a factor or a count.
+"""Sample sizes and thresholds of `splatctrl check`.
+
+A unit stands in brackets before the meaning; without one, a number is a share, factor or count.
 """
 
 # Cameras: lenses, poses and pairs of images
