@@ -1,6 +1,7 @@
-"""Numbers of the method that are fixed on purpose. They are not settings: each was measured, or follows from the
-method or from what is compared, and a run with another one could not be compared with the rest. A unit stands in
-brackets before what a number decides; without one it is a share, a factor or a count.
+"""Fixed numbers of the method, deliberately no settings.
+
+Each was measured, or follows from the method or a comparison; another would make runs incomparable. A unit stands in
+brackets before the meaning; without one, a number is a share, factor or count.
 """
 
 # Reading a recording: poses, joint states and clocks
