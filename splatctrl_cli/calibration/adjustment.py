@@ -1,6 +1,6 @@
-"""Least squares of a calibration: distances between views, and from the robot's surface.
+"""Least squares of a calibration, over distances between views and from the robot's surface.
 
-Gauss-Newton in float64, with Tukey's biweight narrowing from round to round.
+Gauss-Newton in float64; Tukey's biweight narrows from round to round.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,11 +19,11 @@ ROBOT = "the robot"
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Residuals (M,) [m] of a pair of views, or of a frame and the robot, with their sigma (M,).
+    """Residuals (M,) [m], with sigma (M,), of a pair of views, or of a frame and the robot.
 
-    jacobian (M, 17), in `columns` (17,), is by the two cameras' unknowns and the clock. between: the two compared.
-    clusters (M,): residuals with one number and the same `alike` have correlated errors. num_laid: points that should
-    lie on the other's surface, even beyond the reach; num_hidden: those of them that are occluded.
+    jacobian (M, 17): by the two cameras' unknowns and the clock, in `columns` (17,). clusters (M,): equal numbers of
+    the same `alike` have correlated errors. num_laid: points that should lie on the other's surface, even beyond the
+    reach; num_hidden: the occluded of them.
     """
 
     between: tuple[str, str]
@@ -39,7 +39,7 @@ class Rows:
 
 @dataclass(frozen=True, kw_only=True)
 class Widths:
-    """Limits of the residuals that count: reach [m], and cut [sigma], None for the reach alone."""
+    """Residuals that count: within reach [m] and cut [sigma]; None for the reach alone."""
 
     reach: float
     cut: float | None = None
@@ -47,7 +47,7 @@ class Widths:
 
 @dataclass(kw_only=True)
 class Normal:
-    """The normal equations H (P, P), g (P,), and each cluster's part of g, scores (C, P).
+    """Normal equations H (P, P), g (P,); scores (C, P): g by cluster.
 
     counts: residuals that count, by pair; spread: their robust standard deviation [sigma].
     """
@@ -60,10 +60,10 @@ class Normal:
 
 
 class Adjustment:
-    """Residuals of some evidence, and the estimate that minimises them."""
+    """Residuals of evidence, and the estimate that minimises them."""
 
     def __init__(self, evidence: Evidence, unknowns: Unknowns, basis: Float64 | None = None) -> None:
-        """basis (P, K): the directions of steps, None for all."""
+        """basis (P, K): directions of steps, None for all."""
         self.evidence = evidence
         self.unknowns = unknowns
         self._basis = np.eye(unknowns.size) if basis is None else basis
@@ -71,7 +71,7 @@ class Adjustment:
     def solved(
         self, estimate: Estimate, schedule: Sequence[Widths], rounds: int = fixed.CALIBRATION_ROUNDS
     ) -> Estimate:
-        """The estimate after one round per width, then up to `rounds` at the last until it converges."""
+        """The estimate after a round per width, and up to `rounds` at the last until convergence."""
         start, step = estimate, np.zeros(self.unknowns.size)
         for number, widths in enumerate((*schedule, *(schedule[-1],) * rounds)):
             normal = self.normal(estimate, widths)
@@ -84,8 +84,7 @@ class Adjustment:
     def _step(self, normal: Normal, estimate: Estimate, start: Estimate, hold: float) -> Float64:
         """The Gauss-Newton step; unobserved directions stay near the start.
 
-        `hold`, a share of the residuals' weight, holds all others there, too: at large reach, points pull to wrong
-        surfaces.
+        So do all others by a share `hold` of the residuals' weight: at large reach, wrong surfaces pull.
         """
         weight, offset = self._prior(estimate, start)
         weight = weight + hold * float(np.trace(normal.H)) / len(weight)
@@ -94,7 +93,7 @@ class Adjustment:
         return np.asarray(np.clip(step, -fixed.CALIBRATION_STEP, fixed.CALIBRATION_STEP))
 
     def _prior(self, estimate: Estimate, start: Estimate) -> tuple[Float64, Float64]:
-        """Weight (P,) of a very wide prior about the start, and the offset from it (P,)."""
+        """Weight (P,) of a very wide prior at the start, and the offset from there (P,)."""
         sigma, offset = np.ones(self.unknowns.size), np.zeros(self.unknowns.size)
         for camera in self.unknowns.cameras:
             columns = self.unknowns.columns(camera)
@@ -109,7 +108,7 @@ class Adjustment:
         return 1 / np.square(sigma), offset
 
     def normal(self, estimate: Estimate, widths: Widths, *, with_robot: bool = True) -> Normal:
-        """The normal equations; with_robot: including the robot's surface."""
+        """The normal equations, optionally without the robot."""
         P = self.unknowns.size
         H, g = np.zeros((P, P)), np.zeros(P)
         scores: list[Float64] = []
@@ -145,9 +144,9 @@ class Adjustment:
         return Normal(H=H, g=g, scores=np.array(scores).reshape(-1, P), counts=counts, spread=spread)
 
     def cost(self, estimate: Estimate, reach: float) -> tuple[float, int]:
-        """Misfit of an estimate, and the number of points compared.
+        """Misfit, and the number of points compared.
 
-        The mean over pairs of their mean squared residuals in sigmas, each cut at `CALIBRATION_CUT`.
+        The misfit averages, over pairs, the mean squared residual [sigma], each cut at `CALIBRATION_CUT`.
         """
         sums: dict[tuple[str, str], float] = {}
         laid: dict[tuple[str, str], int] = {}
@@ -161,7 +160,7 @@ class Adjustment:
         return (float(np.mean(means)) if means else most), sum(laid.values())
 
     def distance(self, estimate: Estimate) -> float | None:
-        """The largest median distance [m] of any pair, cut at the first reach; None without comparable points.
+        """Largest median distance [m] of a pair, cut at the first reach; None without points.
 
         Points that occlude the robot do not count.
         """
@@ -185,7 +184,7 @@ class Adjustment:
                 yield rows
 
     def _placed(self, item: DepthView | RgbdFrame, estimate: Estimate) -> tuple[Float64, Float64]:
-        """T_world_camera of a view or frame, and its motion with the clock, in the camera's frame."""
+        """T_world_camera, and its motion with the clock, camera frame."""
         T, twist = self.evidence.recorded(item, estimate.clock)
         correction = estimate.corrections[item.camera]
         return T @ correction, _carried(twist, correction)
@@ -201,7 +200,7 @@ class Adjustment:
         estimate: Estimate,
         reach: float,
     ) -> Rows:
-        """Rows of the points of view a on the surface of view b."""
+        """Rows of view a's points on view b's surface."""
         (scale_a, bias_a), (scale_b, bias_b) = estimate.depth_of(a.camera), estimate.depth_of(b.camera)
         points = a.points * (scale_a + bias_a / a.points[:, 2])[:, None]
         T = invert_transform(T_b) @ T_a
@@ -246,7 +245,7 @@ class Adjustment:
         )
 
     def _robot(self, frame: RgbdFrame, estimate: Estimate, reach: float) -> Rows | None:
-        """Rows of the points of a frame on the robot's surface."""
+        """Rows of a frame's points on the robot's surface."""
         assert self.evidence.arm is not None
         scale, bias = estimate.depth_of(frame.camera)
         depth = np.where(frame.depth > 0, scale * frame.depth + bias, 0.0).astype(np.float32)
@@ -279,13 +278,13 @@ class Adjustment:
 
 
 def _cells(points_world: Float64, depth: float) -> Index:
-    """The world cube of each point (K, 3): there, all cameras see the same errors. depth [m]: the median."""
+    """World cube of each point (K, 3), in which all cameras see the same errors. depth [m]: the median."""
     x, y, z = np.floor(points_world / (fixed.CALIBRATION_CELL * depth)).astype(np.int64).T
     return np.asarray((x * 1_000_003 + y) * 1_000_003 + z)
 
 
 def _carried(twist: Float64, T: Float64) -> Float64:
-    """A small motion (6,) of a frame, seen from a frame at T (4, 4) in it."""
+    """A frame's small motion (6,), in axes of a frame at T (4, 4) on it."""
     if not twist.any():
         return twist
     turn, move = twist[:3], twist[3:]

@@ -39,13 +39,13 @@ class Board:
 
     @property
     def is_one_way_up(self) -> bool:
-        """True if half a turn changes a chessboard of this size."""
+        """True if half a turn changes the chessboard."""
         return (self.columns + self.rows) % 2 == 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sighting:
-    """A board in a frame: T_camera_board (4, 4), and measured over expected depth, None without depth there."""
+    """A board in a frame: T_camera_board (4, 4), and measured over expected depth, or None."""
 
     camera: str
     stamp_ns: int
@@ -66,7 +66,7 @@ def board_of(text: str) -> Board:
 
 
 def sighting_of(board: Board, frame: RgbdFrame) -> Sighting | None:
-    """The board in a frame's colour image; None if not wholly visible, or without a fitting pose."""
+    """The board in a frame's colour image; None if not wholly visible, or no pose fits."""
     gray: UInt8 = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.uint8)
     pixels = _marked_corners(board, gray)
     if pixels is None and board.is_one_way_up:
@@ -75,14 +75,14 @@ def sighting_of(board: Board, frame: RgbdFrame) -> Sighting | None:
 
 
 def other_size(frame: RgbdFrame) -> tuple[int, int] | None:
-    """The inner corners, larger number first, of any chessboard in a frame; None for none or a tiny one."""
+    """Inner corners, larger number first, of any chessboard in view; None for none or a tiny one."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     is_found, _, meta = cv2.findChessboardCornersSBWithMeta(gray, (3, 3), cv2.CALIB_CB_LARGER)
     return (max(meta.shape), min(meta.shape)) if is_found and meta.size >= LEAST else None
 
 
 def _plain_corners(board: Board, gray: UInt8) -> Float64 | None:
-    """Pixels (K, 2) of a chessboard's corners, ordered as `Board.points`, the first at a black square."""
+    """Pixels (K, 2) of a chessboard's corners, as `Board.points`, from a black square on."""
     is_found, corners = cv2.findChessboardCornersSB(
         gray, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
     )
@@ -99,16 +99,12 @@ def _plain_corners(board: Board, gray: UInt8) -> Float64 | None:
 
 
 def _brightness(gray: UInt8, square: Float64) -> float:
-    """Mean grey value inside a square with corners (2, 2, 2) [pixels]."""
     u, v = np.round(square.reshape(4, 2).mean(axis=0)).astype(int)
     return float(gray[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].mean())
 
 
 def _marked_corners(board: Board, gray: UInt8) -> Float64 | None:
-    """Pixels (K, 2) of a ChArUco board's corners, refined from a homography of the markers' middles.
-
-    Middles do not depend on the markers' size.
-    """
+    """Pixels (K, 2) of a ChArUco board's corners, from the markers' middles, whatever their size."""
     for name in MARKERS:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(gray)
@@ -158,7 +154,6 @@ def _sighting(board: Board, frame: RgbdFrame, pixels: Float64) -> Sighting | Non
 
 
 def _depth_ratios(depth: Float32, pixels: Float64, z: Float64) -> Float64:
-    """Measured depth at pixels (K, 2) over expected z (K,) [m], where there is depth."""
     height, width = depth.shape
     u, v = np.round(pixels).astype(int).T
     seen = depth[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)].astype(np.float64)
@@ -195,9 +190,9 @@ class HandEye:
 def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[str, Float64]:
     """T_recorded_camera (4, 4) by camera, from sightings of a board.
 
-    Without a robot or a moving camera, the board ties the others to the held cameras. Otherwise hand-eye calibration
-    first places a moving camera by a stationary board, or a stationary camera by a board on a link. Raises
-    NotEvaluableError if some camera is not reached.
+    Without a robot or a moving camera, the board ties all others to the `held` cameras. Otherwise hand-eye
+    calibration places a moving camera by a stationary board, or a stationary camera by a board on a link, first.
+    Raises NotEvaluableError if it cannot reach all.
     """
     by_camera = {camera: [s for s in sightings if s.camera == camera] for camera in rig.recorded}
     _check_seen(board, by_camera)
@@ -239,7 +234,6 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
 
 
 def _check_seen(board: Board, by_camera: Mapping[str, Sequence[Sighting]]) -> None:
-    """Raise NotEvaluableError for too few sightings, or squares of another size."""
     fewest = fixed.CALIBRATION_BOARD_FEWEST
     few = [f"{camera} in {len(its)}" for camera, its in by_camera.items() if len(its) < fewest]
     if few:
@@ -274,7 +268,7 @@ def _board_stands(by_camera: Mapping[str, Sequence[Sighting]], rig: Rig) -> bool
 
 
 def _carried(arm: Arm, sightings: Sequence[Sighting]) -> HandEye:
-    """T_world_camera of a camera that sees the board on a link: the best-fitting link."""
+    """T_world_camera of a camera that sees the board on the best-fitting link."""
     fits: list[HandEye] = []
     reasons = ["no joint states at its frames"]
     for link in arm.model.frame_names:
@@ -301,9 +295,9 @@ def _check_fit(found: HandEye, what: str) -> None:
 def hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> HandEye:
     """X (4, 4) such that ``A X B`` is the same for all pairs (A, B) of poses.
 
-    From ``(A_j^-1 A_i) X = X (B_j B_i^-1)``: X turns the right's rotation vectors into the left's; given its
-    rotation, the translation is linear (after Park and Martin, Robot sensor calibration, 1994). Outlying pairs are
-    dropped once. Raises NotEvaluableError for too few pairs, or rotation about fewer than two axes.
+    From ``(A_j^-1 A_i) X = X (B_j B_i^-1)``: X turns the right's rotation vectors into the left's, and its
+    translation is linear (after Park and Martin, Robot sensor calibration, 1994). Outliers are dropped once. Raises
+    NotEvaluableError for too few pairs, or rotation about fewer than two axes.
     """
     pairs = spread(pairs, fixed.CALIBRATION_FRAMES)
     if len(pairs) < fixed.CALIBRATION_BOARD_VIEWS:
@@ -356,9 +350,9 @@ def _votes(
     rig: Rig,
     stands: bool,
 ) -> list[Float64]:
-    """T_world_camera (4, 4) of a stationary camera, by each sighting shared with a placed one.
+    """T_world_camera (4, 4) of a stationary camera, per sighting shared with a placed one.
 
-    placed: T_recorded_camera by camera; T_world_board: of a stationary board, if known.
+    placed: T_recorded_camera by camera; T_world_board: of a stationary board, or None.
     """
     votes = []
     if camera in rig.moving:

@@ -1,4 +1,4 @@
-"""``calibration.toml``: poses of cameras, corrections of depths and clocks, and their certainty."""
+"""``calibration.toml``: camera poses, depth and clock corrections, and their certainty."""
 
 import json
 import math
@@ -25,9 +25,8 @@ class CalibratedCamera:
 
     T (4, 4): T_world_camera if stationary, T_recorded_camera if moving. recorded (4, 4): the recording's
     T_world_camera, None if moving. scale, bias [m]: the true depth is ``scale depth + bias``. sigma_position (3,)
-    [m], sigma_rotation (3,) [rad]: along and about the world's axes, a moving camera's own. sigma_depth: of scale and
-    bias. depth_noticed: the smallest |scale - 1| and |bias| [m] to be solved for, inf if not looked for. held: what
-    was not solved for. unobserved: directions kept as recorded for lack of evidence.
+    [m], sigma_rotation (3,) [rad]: in the world's axes, a moving camera's own. depth_noticed: the least |scale - 1|
+    and |bias| [m] to be solved for, inf if none. unobserved: directions kept as recorded.
     """
 
     T: Float64
@@ -52,8 +51,8 @@ class CalibratedCamera:
 class Calibration:
     """The calibration of a recording.
 
-    clock [s]: a frame's stamp minus the joint state's at that instant, None if not solved for; digests: sha256 of the
-    recording's files, by name.
+    clock [s]: a frame's stamp minus the joint state's at that instant, None if not solved for; digests: sha256 by
+    file.
     """
 
     recording: str
@@ -65,7 +64,7 @@ class Calibration:
     sigma_clock: float = 0.0
 
     def is_held(self, camera: str) -> bool:
-        """True if a camera's pose stayed as recorded."""
+        """True if the camera's pose stayed as recorded."""
         return f"camera {camera}" in self.held
 
 

@@ -16,22 +16,19 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, kw_only=True)
 class Certainty:
-    """Covariance (P, P) of the unknowns; reach (P, P) maps them to displacements [m] of what cameras see."""
+    """Covariance (P, P) of the unknowns; reach (P, P): their displacements [m] of visible points."""
 
     unknowns: Unknowns
     covariance: Float64
     reach: Float64
 
     def of_camera(self, camera: str) -> Float64:
-        """Covariance (6, 6) of a camera's rotation and translation in its own frame; 0 if held."""
+        """Covariance (6, 6) of a camera's rotation and translation, own frame; 0 if fixed."""
         columns = self.unknowns.columns(camera)[:POSE]
         return np.zeros((POSE, POSE)) if columns[0] < 0 else self.covariance[np.ix_(columns, columns)]
 
     def displacement(self, camera: str) -> Float64:
-        """Covariance (6, 6) of displacements [m] of what a camera sees.
-
-        First the rotation about its middle, as a length at its rim; then the middle's translation.
-        """
+        """Covariance (6, 6) [m] of a rotation about the view's middle, at its rim, and of that middle."""
         columns = self.unknowns.columns(camera)[:POSE]
         if columns[0] < 0:
             return np.zeros((POSE, POSE))
@@ -39,30 +36,29 @@ class Certainty:
         return np.asarray(block @ self.of_camera(camera) @ block.T)
 
     def sigma_depth(self, camera: str) -> tuple[float, float]:
-        """Sigma of depth scale and bias [m]; 0 if held."""
+        """Sigma of scale and bias [m]; 0 if fixed."""
         columns = self.unknowns.columns(camera)[POSE:]
         scale, bias = (0.0 if at < 0 else float(np.sqrt(self.covariance[at, at])) for at in columns)
         return scale, bias
 
     @property
     def is_full(self) -> bool:
-        """True if every direction of every camera is known within `CALIBRATION_SIGMA`."""
+        """True if all directions of all cameras are within `CALIBRATION_SIGMA`."""
         spreads = [np.linalg.eigvalsh(self.displacement(camera))[-1] for camera in self.unknowns.poses]
         return max(spreads, default=0.0) <= fixed.CALIBRATION_SIGMA**2
 
     @property
     def sigma_clock(self) -> float:
-        """Sigma [s]; 0 if held."""
+        """Sigma [s]; 0 if fixed."""
         return float(np.sqrt(self.covariance[-1, -1])) if self.unknowns.has_clock else 0.0
 
 
 def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> Certainty:
     """The certainty of a solved estimate.
 
-    ``A^-1 M A^-T`` (the sandwich of White, 1980): M sums products of the clusters' gradients, so that correlated
-    errors count; A is the gradient's derivative. Noise tilts normals of flat surfaces, which the normal equations
-    mistake for shape. Between views, A therefore comes from differences with points projected anew, where that
-    cancels.
+    ``A^-1 M A^-T`` (the sandwich of White, 1980): M sums products of clusters' gradients, to count correlated errors;
+    A is the gradient's derivative. Noise tilts normals of flat surfaces, which the normal equations mistake for
+    shape. Between views, A therefore uses differences with points projected anew, where that cancels.
     """
     whole = adjustment.normal(estimate, widths)
     between = adjustment.normal(estimate, widths, with_robot=False)
@@ -114,7 +110,7 @@ def _reach(adjustment: Adjustment, estimate: Estimate) -> Float64:
 
 
 def middle_of(adjustment: Adjustment, camera: str) -> tuple[Float64, float]:
-    """The middle (3,) [m] of what a camera sees, in its frame, and its radius [m]."""
+    """Middle (3,) [m] of a camera's points, in its frame, and their radius [m]."""
     points = [view.points for view in adjustment.evidence.views if view.camera == camera]
     cloud = np.concatenate([*points, np.zeros((0, 3))])
     if not len(cloud):
@@ -162,14 +158,14 @@ def unobserved(certainty: Certainty, camera: str, T_world_camera: Float64, plane
 
 
 def _share(unknown: Float64, direction: Float64, T_world_camera: Float64) -> float:
-    """The share of a direction (6,), world, within the unknown ones (6, K), camera frame."""
+    """Share of a direction (6,), world, in the unknown ones (6, K), camera frame."""
     R = T_world_camera[:3, :3].T
     own = np.concatenate([R @ direction[:3], R @ direction[3:]])
     return float(np.sum(np.square(unknown.T @ own)))
 
 
 def _named_directions(plane: Plane | None) -> Sequence[tuple[str, tuple[Float64, Float64]]]:
-    """Named rotations and translations, world: by a plane, or else by the world's axes."""
+    """Named rotations and translations, world: of a plane, or the world's axes."""
     zero = np.zeros(3)
     if plane is None:
         return [

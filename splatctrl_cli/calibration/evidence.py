@@ -1,4 +1,4 @@
-"""Evidence of a calibration, overlapping views and the arm's link poses; and its unknowns."""
+"""Evidence of a calibration: overlapping views and the arm's links; and its unknowns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,11 +29,10 @@ HELD = -1
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """Poses, depth corrections and clock offset of a calibration.
+    """Poses, depth corrections and clock offset.
 
-    corrections: T_recorded_camera (4, 4), ``T_world_camera = T_world_recorded @ T_recorded_camera``. depth: scale and
-    bias [m], the true depth is ``scale depth + bias``. clock [s]: a frame's stamp minus the joint state's at that
-    instant.
+    ``T_world_camera = T_world_recorded @ T_recorded_camera``, with corrections (4, 4). depth: scale and bias [m], the
+    true depth is ``scale depth + bias``. clock [s]: a frame's stamp minus the joint state's at that instant.
     """
 
     corrections: Mapping[str, Float64]
@@ -47,7 +46,7 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Unknowns:
-    """Unknowns of a calibration: the cameras' `poses`, depth `scales` and `biases`, and the joint states' clock."""
+    """Unknowns of a calibration: `poses`, depth `scales` and `biases` by camera, and the clock."""
 
     cameras: Sequence[str]
     poses: Sequence[str]
@@ -111,11 +110,11 @@ STEP_NS = 10_000_000  # [ns] before and after, from which a velocity is taken: l
 
 @dataclass(frozen=True, kw_only=True)
 class ArmRows:
-    """Distances of M measured points from the robot's surface: residual (M,) [m], positive outside.
+    """Distances of M points from the robot's surface: residual (M,) [m], positive outside.
 
-    jacobian (M, 6) is by the camera's rotation and translation in its own frame, clock (M,) [m/s] by the clock.
-    points, normals (M, 3): in the camera's frame. num_seen: pixels that should show the robot; num_hidden: those
-    occluded by more than `width`.
+    jacobian (M, 6): by the camera's rotation and translation in its frame; clock (M,) [m/s]: by the clock. points,
+    normals (M, 3): camera frame. num_seen: pixels that should show the robot; num_hidden: those occluded by more than
+    `width`.
     """
 
     residual: Float64
@@ -149,7 +148,7 @@ class Arm:
         return None if q is None else self.model.frame_pose(q, link)
 
     def _surface_poses(self, stamp_ns: int) -> Float64 | None:
-        """T_world_link (L, 4, 4) of the surface's links; None if no state is near."""
+        """T_world_link (L, 4, 4) of the surface's links, or None."""
         q = self._posture(stamp_ns)
         if q is None:
             return None
@@ -164,10 +163,10 @@ class Arm:
         stamp_ns: int,
         width: float,
     ) -> ArmRows | None:
-        """Rows of the pixels within `width` [m] of the robot's rendered surface; None without joint states.
+        """Rows of pixels within `width` [m] of the robot's rendered surface; None without joint states.
 
-        stamp_ns is a joint state's time; camera_twist (6,) [1/s] the camera's motion with the clock, in its own
-        frame. Pixels at a link's border, and links modelled by spheres or boxes, do not count.
+        stamp_ns: of the joint states; camera_twist (6,) [1/s]: the camera's motion with the clock, own frame. Link
+        borders, and links modelled by spheres or boxes, do not count.
         """
         poses, before, after = (self.surface_poses(stamp_ns + step) for step in (0, -STEP_NS, STEP_NS))
         if poses is None:
@@ -204,7 +203,7 @@ class Arm:
         )
 
     def mount_of(self, poses: list[tuple[int, Float64]]) -> tuple[str, Float64] | None:
-        """The link that carries a camera with these stamps [ns] and T_world_camera, and T_link_camera; or None."""
+        """The link that carries a camera with stamps [ns] and T_world_camera, and T_link_camera; or None."""
         for link in reversed(self.model.frame_names):
             mounted = [(self.link_pose(link, stamp), T) for stamp, T in poses]
             offsets = np.array([invert_transform(at) @ T for at, T in mounted if at is not None])
@@ -236,7 +235,7 @@ def _velocities(before: Float64, after: Float64, poses: Float64, T_world_camera:
 
 
 def _around(shows: Bool) -> tuple[tuple[slice, slice], tuple[int, int]]:
-    """The bounding part (rows, columns) of `shows` with a one-pixel border, and its corner."""
+    """Bounding part (rows, columns) of `shows` with a one-pixel border, and its corner."""
     rows, columns = (np.flatnonzero(shows.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
         return (slice(0, 3), slice(0, 3)), (0, 0)
@@ -255,11 +254,10 @@ def _inside_links(link: NDArray[np.int16], depth: Float32) -> Bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """Views, frames and the robot that a calibration is solved from.
+    """Views, frames and robot of a calibration.
 
     views: one per stationary camera (`still_frame`), several per moving one. pairs (i, j): points of view i are
-    compared with view j. frames: searched for the robot. mounts: the link that carries a moving camera, and
-    T_link_camera as recorded.
+    compared with view j. frames: searched for the robot. mounts: link of a moving camera, and recorded T_link_camera.
     """
 
     views: Sequence[DepthView]
@@ -282,7 +280,7 @@ class Evidence:
     def recorded(self, item: DepthView | RgbdFrame, clock: float) -> tuple[Float64, Float64]:
         """Uncorrected T_world_camera (4, 4), and its motion with the clock (6,) [1/s].
 
-        A camera carried by the robot is where the joint states place it at its stamp by their clock.
+        On the robot, the joint states place the camera, at its stamp by their clock.
         """
         if self.arm is None or item.camera not in self.mounts:
             return item.T_world_camera, np.zeros(POSE)
@@ -297,7 +295,7 @@ class Evidence:
         return now, twist_between(after, before) / (2e-9 * STEP_NS)  # a later clock takes an earlier pose
 
     def thinned(self) -> "Evidence":
-        """Fewer pairs and robot frames, equally many per camera, for a first look."""
+        """Fewer pairs and robot frames, for a first look."""
         frames = [
             frame
             for camera in self.cameras
@@ -351,7 +349,7 @@ def moving_cameras(frames: Sequence[RgbdFrame]) -> frozenset[str]:
 
 
 def _step(frame: RgbdFrame, num_averaged: int) -> int:
-    """Baseline of normals [pixels] over which depth noise turns them little."""
+    """Baseline of normals [pixels], long against depth noise."""
     depth = frame.depth[frame.depth > 0]
     if not len(depth):
         return 1
@@ -362,7 +360,7 @@ def _step(frame: RgbdFrame, num_averaged: int) -> int:
 
 
 def _robot_near(frame: RgbdFrame, arm: Arm | None) -> Bool:
-    """Pixels (h, w) where the robot may appear, for any plausible pose error."""
+    """Pixels (h, w) where the robot may appear, despite pose errors."""
     poses = None if arm is None else arm.surface_poses(frame.stamp_ns)
     if arm is None or poses is None:
         return np.zeros(frame.depth.shape, np.bool_)
@@ -376,7 +374,7 @@ def _robot_near(frame: RgbdFrame, arm: Arm | None) -> Bool:
 
 
 def _pairs(views: Sequence[DepthView], moving: frozenset[str]) -> list[tuple[int, int]]:
-    """Ordered pairs of views of two cameras, or of one moving camera from different places."""
+    """Ordered pairs of views of two cameras, or of a moving one from different places."""
     still, others = [], []
     for i, a in enumerate(views):
         for j, b in enumerate(views):

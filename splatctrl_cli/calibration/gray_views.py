@@ -28,7 +28,7 @@ class GrayView:
 
 
 def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
-    """The view of a frame, at most about `REFINE_ROWS` rows."""
+    """The frame's view at about `REFINE_ROWS` rows."""
     stride = max(1, round(frame.depth.shape[0] / fixed.REFINE_ROWS))
     depth = cv2.medianBlur(np.ascontiguousarray(frame.depth / np.float32(scale)), 5)
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255)
@@ -60,7 +60,7 @@ def scaled(T: Float64, factor: float) -> Float64:
 def overlapping(
     views: Sequence[GrayView], poses: Sequence[Float64], among: Bool, is_free: Bool
 ) -> list[tuple[int, int]]:
-    """Pairs of a view `among` (N,) and others that see most of its points; one of each pair is free."""
+    """Pairs of views `among` (N,) that share most points, one of them free."""
     chosen = np.flatnonzero(among).tolist()
     middles = np.array([transform_points(poses[i], np.median(views[i].depth.points, axis=0)[None])[0]
                         if len(views[i].depth.points) else np.full(3, np.inf) for i in chosen])  # fmt: skip
@@ -77,7 +77,6 @@ def overlapping(
 
 
 def _share(a: GrayView, b: GrayView, T_a: Float64, T_b: Float64) -> float:
-    """The share of view a's points that land near view b's surface."""
     points = transform_points(invert_transform(T_b) @ T_a, a.depth.points[::8])
     lands, surface, _ = landed(points, b.depth)
     return (
@@ -89,9 +88,9 @@ def _share(a: GrayView, b: GrayView, T_a: Float64, T_b: Float64) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Weighted residuals (R,) [sigma], and derivatives by the motions of views a and b (R, 12).
+    """Weighted residuals (R,) [sigma], and derivatives by views a's and b's motions (R, 12).
 
-    by_own, by_other (R,): by the log-depth of view a's point number `own` and view b's pixel number `other`.
+    by_own, by_other (R,): by log-depth of view a's point `own` and view b's pixel `other`.
     """
 
     residuals: Float64
@@ -103,7 +102,7 @@ class Rows:
 
 
 def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
-    """Rows of every second point of view a that lands on view b, at T (4, 4) from a."""
+    """Rows of every second point of view a on view b, at T (4, 4) from a."""
     number = np.arange(0, len(a.depth.points), 2)
     there, lands, surface, normals, distance = on_surface(a, b, T, slice(None, None, 2))
     sigma = np.hypot(depth_sigma(there[:, 2]), depth_sigma(a.depth.points[number, 2]))
@@ -143,16 +142,16 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
 
 
 def _stretched(own: Float64, gradient: Float64, T: Float64) -> Float64:
-    """Derivatives of a value with a gradient (K, 3), at T (4, 4), by points' log-depth (K,)."""
+    """Derivatives by log-depth (K,) of a value with a gradient (K, 3), at T (4, 4)."""
     return np.asarray(np.einsum("ki,ki->k", gradient @ T[:3, :3], own))
 
 
 def on_surface(
     a: GrayView, b: GrayView, T: Float64, which: slice = EVERY
 ) -> tuple[Float64, Bool, Float64, Float64, Float64]:
-    """Points of view a in view b, at T (4, 4) from a: (K, 3), hits (K,), surface, normals, distances (K,).
+    """View a's points in view b (K, 3), hits (K,), surface, normals, distances (K,); T (4, 4) from a.
 
-    A hit lands on a surface that faces as its own.
+    A hit's surface faces like the point's own.
     """
     there = transform_points(T, a.depth.points[which])
     lands, surface, normals = landed(there, b.depth)
@@ -161,7 +160,7 @@ def on_surface(
 
 
 def _alike(value: Float64, other: Float64) -> Float64:
-    """Grey differences (K,) after a robust gain and offset between the two images."""
+    """Grey differences (K,), less a robust gain and offset."""
     gain, offset = 1.0, float(np.median(value - other))
     for _ in range(2):
         near = np.abs(value - gain * other - offset) < fixed.REFINE_CUT * fixed.REFINE_COLOR
@@ -175,10 +174,9 @@ def _alike(value: Float64, other: Float64) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class BandRatios:
-    """E median brightness ratios of the same surfaces, between B bands of rows of N images.
+    """E median brightness ratios of shared surfaces, between B bands of rows of N images.
 
-    channels (E,); pairs (E, 2): two bands, B times the image's number and its own; ratios (E,): the logarithm of the
-    first over the second.
+    pairs (E, 2): bands, numbered B times the image plus their own; ratios (E,): log of first over second.
     """
 
     num_images: int
@@ -189,9 +187,9 @@ class BandRatios:
     weights: Float64
 
     def gains(self, is_free: Bool) -> Float64:
-        """Least-squares gains (N, B, 3) of red, green and blue in log ratios.
+        """Gains (N, B, 3) of red, green and blue, by least squares of logarithms.
 
-        A wide prior keeps them about 1; images not `is_free` (N,) keep gain 1.
+        A wide prior keeps them about 1; images not `is_free` (N,) keep 1.
         """
         num_gains, is_kept = self.num_bands * self.num_images, np.repeat(~is_free, self.num_bands)
         A = np.tile(np.eye(num_gains) / fixed.EXPOSURE_PRIOR**2, (3, 1, 1))
@@ -206,14 +204,14 @@ class BandRatios:
         return np.asarray(np.exp(logs).reshape(self.num_images, self.num_bands, 3))
 
     def misfit(self, gains: Float64) -> float:
-        """Median absolute residual of the log ratios, given gains (N, B or 1, 3)."""
+        """Median absolute residual of log ratios, for gains (N, B or 1, 3)."""
         logs = np.log(np.broadcast_to(gains, (self.num_images, self.num_bands, 3)).reshape(-1, 3))
         first, second = (logs[self.pairs[:, k], self.channels] for k in range(2))
         return float(np.median(np.abs(self.ratios - (first - second)))) if len(self.ratios) else 0.0
 
 
 def exposure_gains(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | None = None) -> Float64:
-    """Gains (N, 3) of red, green and blue; images divided by them match each other.
+    """Gains (N, 3) of red, green and blue; images divided by them match.
 
     scale: of the recording's lengths; views not `free` (N,) keep gain 1.
     """
@@ -222,7 +220,7 @@ def exposure_gains(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool |
 
 
 def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_bands: int) -> BandRatios:
-    """Ratios of all overlapping pairs with a free view, without values near black and white."""
+    """Ratios of overlapping pairs with a free view, without near black and white."""
     views = [gray_view(frame, scale) for frame in frames]
     poses = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
     colors = [_small(frame, view.gray.shape[0]) for frame, view in zip(frames, views, strict=True)]
@@ -257,7 +255,6 @@ def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_ba
 
 
 def _median_ratio(ratios: Float64) -> tuple[float, float]:
-    """The median of log ratios, and its weight."""
     ratio = float(np.median(ratios))
     spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
     return ratio, 1 / (fixed.EXPOSURE_ERROR**2 + spread**2 / len(ratios))
@@ -270,7 +267,7 @@ def exposed(frame: RgbdFrame, gain: Float64) -> RgbdFrame:
 
 
 def _small(frame: RgbdFrame, rows: int) -> Float64:
-    """Smoothed levels (h, w, 3) at the pixels of a `GrayView` with `rows` rows."""
+    """Smoothed levels (h, w, 3) at a `GrayView`'s pixels."""
     stride = -(-frame.color.shape[0] // rows)
     smooth = cv2.GaussianBlur(frame.color, (0, 0), fixed.EXPOSURE_BLUR * stride)
     return np.asarray(smooth[::stride, ::stride], np.float64)

@@ -1,11 +1,11 @@
-"""Joint refinement of the poses of views of a still scene, and of the bends of their depths.
+"""Joint refinement of view poses of a still scene, and of the bends of their depths.
 
-Gauss-Newton in float64, with Tukey's biweight, on two residuals. One is the point-to-plane distance (Chen and
-Medioni, Object modelling by registration, 1992); the other the grey difference (Park, Zhou and Koltun, Colored point
-cloud registration revisited, 2017).
+Gauss-Newton in float64, with Tukey's biweight, on point-to-plane distances and grey differences. Sources: Chen and
+Medioni, Object modelling by registration, 1992; Park, Zhou and Koltun, Colored point cloud registration revisited,
+2017.
 
-A triangulating camera with imperfectly calibrated lenses errs in disparity, so surfaces bend, more with distance. A
-camera's offset of disparity is smooth and constant. Its part in (1, u, v) is a projective map of space that poses
+With imperfectly calibrated lenses, a triangulating camera errs in disparity: surfaces bend, more with distance. The
+offset of disparity is smooth and constant per camera. Its part in (1, u, v) is a projective map of space that poses
 would absorb; it stays. After Zhou and Koltun, Simultaneous localization and calibration (2014), whose lattice lies in
 space.
 """
@@ -26,7 +26,7 @@ from splatctrl_cli.records import Bool, Float64, Index, RgbdFrame
 
 
 def stretch(depth: Float64, offset: Float64) -> tuple[Float64, Float64]:
-    """Factor on depths (...) [m] for an offset (...) of disparity [1/m], and its log-derivative [m].
+    """Factor on depths (...) [m] for disparity offsets (...) [1/m], and its log-derivative [m].
 
     ``1 / z' = 1 / z - offset``, the offset cut at `BEND_MOST` of the disparity.
     """
@@ -36,14 +36,14 @@ def stretch(depth: Float64, offset: Float64) -> tuple[Float64, Float64]:
 
 
 def unbent(frame: RgbdFrame, grid: Float64) -> RgbdFrame:
-    """The frame's depth without offsets of disparity (rows, columns) [1/m], bilinear between nodes."""
+    """The frame with disparity offsets (rows, columns) [1/m], bilinear, removed from depth."""
     offset = (_weights(frame.depth.shape) @ grid.ravel()).reshape(frame.depth.shape)
     factor, _ = stretch(frame.depth.astype(np.float64), offset)
     return replace(frame, depth=(frame.depth * factor).astype(np.float32))
 
 
 def largest_share(grid: Float64, depth: float) -> float:
-    """The grid's largest correction, as a share of `depth` [m]."""
+    """Largest correction, as a share of `depth` [m]."""
     return float(np.abs(stretch(np.full_like(grid, depth), grid)[0] - 1).max())
 
 
@@ -86,7 +86,7 @@ def bends_alone() -> Float64:
 class BentViews:
     """Views, and the bends (C, G) of their cameras to solve for.
 
-    `cameras` (N,): each view's, `HELD` where its depth is exact. now: the views without the current bends.
+    `cameras` (N,): `HELD` where depth is exact. now: the views without current bends.
     """
 
     recorded: Sequence[GrayView]
@@ -114,7 +114,7 @@ class BentViews:
         return BendEquations(views=self, num_pairs=num_pairs, cross=cross, own=own, slope=slope)
 
     def by_offsets(self, i: int, j: int, rows: Rows) -> csr_array:
-        """(R, C G) derivatives of the residuals of view i on view j by the offsets."""
+        """(R, C G) derivatives of view i's residuals on view j by offsets."""
         size, parts = len(self._basis), []
         own = self._pixels[i][rows.own]
         for k, pixels, by_stretch in ((i, own, rows.by_own), (j, rows.other, rows.by_other)):
@@ -128,7 +128,7 @@ class BentViews:
         return parts[0] + parts[1]
 
     def joined(self, H: Float64, g: Float64, bent: "BendEquations") -> tuple[Float64, Float64]:
-        """The equations of poses, H (P, P) and g (P,), extended by the bends' free coordinates."""
+        """Pose equations H (P, P), g (P,), extended by the bends' free coordinates."""
         Q = np.kron(np.eye(self._num), self._basis)
         R = bent.num_pairs * np.kron(np.eye(self._num), self._prior)
         cross = bent.cross @ Q
@@ -170,7 +170,7 @@ class BendEquations:
     slope: Float64
 
     def add(self, i: int, j: int, rows: Rows, columns: Index, J: Float64) -> None:
-        """Add view i on view j, whose pose derivatives J (R, F) stand in `columns` (F,)."""
+        """Add view i on view j, with pose derivatives J (R, F) in `columns` (F,)."""
         by_offsets = self.views.by_offsets(i, j, rows)
         self.cross[columns] += (by_offsets.T @ J).T
         square = (by_offsets.T @ by_offsets).tocoo()
@@ -178,7 +178,7 @@ class BendEquations:
         self.slope[:] += by_offsets.T @ rows.residuals
 
     def joined(self, H: Float64, g: Float64) -> tuple[Float64, Float64]:
-        """The equations of poses H (P, P), g (P,) extended by these."""
+        """Pose equations H (P, P), g (P,), extended by these."""
         return self.views.joined(H, g, self)
 
 
@@ -189,12 +189,10 @@ def _pixels(view: GrayView) -> Index:
 
 @dataclass(frozen=True, kw_only=True)
 class RefinedPoses:
-    """Refined T_world_camera (4, 4), and how far each frame moved [m] and turned [deg], (N,).
+    """Refined T_world_camera (4, 4); how far each moved [m] and turned [deg], (N,).
 
-    before, after: the median distance [m] between views' surfaces, over points not used in the refinement.
-
-    is_held (N,): frames kept as recorded, because untied or moved too far. is_better: False if all poses stayed,
-    since a change would gain nothing.
+    before, after: median distance [m] between views' surfaces, at points not used. is_held (N,): kept as recorded,
+    because untied or moved too far. is_better: False if all stayed, since a change gains nothing.
     """
 
     T_world_camera: tuple[Float64, ...]
@@ -207,9 +205,9 @@ class RefinedPoses:
 
 
 def refined_poses(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | None = None) -> RefinedPoses:
-    """Refine the poses of the `free` (N,) frames; scale: of the recording's lengths.
+    """Refine the poses of `free` (N,) frames; scale: of the recording's lengths.
 
-    A wide prior anchors the views as a whole. A frame that would move beyond `REFINE_FARTHEST` stays as recorded.
+    A wide prior anchors the whole. Frames that would move beyond `REFINE_FARTHEST` stay.
     """
     views = [gray_view(frame, scale) for frame in frames]
     recorded = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
@@ -243,9 +241,9 @@ def refined_poses(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundBends:
-    """Offsets of disparity (rows, columns) [1/m] by camera, absent where not observable.
+    """Disparity offsets (rows, columns) [1/m] by camera, where observable.
 
-    gains: by which share each half's bend reduces the other half's distances. unlike: cameras whose halves disagree.
+    gains: shares by which each half's bend reduces the other half's distances. unlike: cameras whose halves disagree.
     """
 
     grids: Mapping[str, Float64] = field(default_factory=dict)
@@ -254,11 +252,10 @@ class FoundBends:
 
 
 def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float = 1.0) -> FoundBends:
-    """The bends of the cameras' depths, solved together with the `refined` poses.
+    """The bends of the cameras' depths, solved with the `refined` poses.
 
     Each half (every second view) of a camera's views must yield a bend that reduces the other half's distances by
-    `BEND_GAIN` over poses alone. Cameras with fewer than `BEND_VIEWS` views, or whose halves agree less than
-    `BEND_ALIKE`, get none.
+    `BEND_GAIN` over poses alone. Cameras need `BEND_VIEWS` views, and halves that agree by `BEND_ALIKE`.
     """
     views = [replace(f, T_world_camera=T) for f, T in zip(frames, refined.T_world_camera, strict=True)]
     views = [view for view, held in zip(views, refined.is_held, strict=True) if not held]
@@ -289,7 +286,7 @@ def freed(frames: Sequence[RgbdFrame], grids: Mapping[str, Float64]) -> list[Rgb
 
 
 def _joint(frames: Sequence[RgbdFrame], cameras: Sequence[str], scale: float) -> dict[str, Float64]:
-    """Bends [1/m] of `cameras`, solved together with all poses."""
+    """Bends [1/m] of `cameras`, solved with all poses."""
     views = [gray_view(frame, scale) for frame in frames]
     poses = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
     every = np.ones(len(views), np.bool_)
@@ -300,7 +297,6 @@ def _joint(frames: Sequence[RgbdFrame], cameras: Sequence[str], scale: float) ->
 
 
 def _likeness(a: Float64, b: Float64) -> float:
-    """The cosine between two grids."""
     return float(np.vdot(a, b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
 
 
@@ -311,7 +307,7 @@ def _solved(
     is_free: Bool,
     bends: BentViews | None = None,
 ) -> list[Float64]:
-    """Poses after rounds of narrowing width; `bends` are solved along, in place."""
+    """Poses after rounds of narrowing width; `bends` are solved in place."""
     poses, column = list(recorded), np.cumsum(is_free) - 1
     size = POSE * int(is_free.sum())
     prior = np.tile(np.repeat(1 / np.square(fixed.REFINE_PRIOR), 3), int(is_free.sum()))
@@ -348,7 +344,7 @@ def _solved(
 def _distances(
     views: Sequence[GrayView], poses: Sequence[Float64], pairs: Sequence[tuple[int, int]], *, odd: bool
 ) -> float:
-    """Median distance of points from other views' surfaces; `odd`: those that `rows_of` leaves out."""
+    """Median distance of points from other surfaces; `odd`: those not in `rows_of`."""
     found = [np.zeros(0)]
     for i, j in pairs:
         T = invert_transform(poses[j]) @ poses[i]

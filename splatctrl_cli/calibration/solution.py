@@ -1,4 +1,4 @@
-"""From evidence to a calibration: starts, unknowns, and a check that the solution is unique."""
+"""From evidence to a calibration: starts, unknowns, and uniqueness."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,9 +18,9 @@ FREED = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_FREED)
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """The estimate, its certainty, and the residuals that it minimises within `widths`.
+    """The estimate, its certainty, and its residuals within `widths`.
 
-    noticed, by camera: the smallest |scale - 1| and |bias| [m] that would have been solved for.
+    noticed: by camera, the least |scale - 1| and |bias| [m] to be solved for.
     """
 
     estimate: Estimate
@@ -49,9 +49,9 @@ class Solution:
 
 
 def solved(evidence: Evidence, start: Estimate, held: Sequence[str]) -> Solution:
-    """Calibrate all cameras but the held.
+    """Calibrate all cameras but `held`.
 
-    Raises NotEvaluableError if cameras share no surface, and if two solutions fit alike.
+    Raises NotEvaluableError if cameras share no surface, or two solutions fit alike.
     """
     cameras = evidence.cameras
     free = [camera for camera in cameras if camera not in held]
@@ -71,7 +71,7 @@ def solved(evidence: Evidence, start: Estimate, held: Sequence[str]) -> Solution
 
 
 def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution:
-    """The solution near a rough one, with the clock and depth corrections that the evidence supports."""
+    """The solution near a rough one, with supported clock and depth corrections."""
     near = adjustment.solved(rough, [WIDE[-1]], rounds=2)
     solution = _solution(adjustment, adjustment.solved(near, [narrow(adjustment, near)]))
     unknowns = adjustment.unknowns
@@ -83,7 +83,7 @@ def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution
 
 
 def _costs(adjustment: Adjustment, estimates: Sequence[Estimate]) -> list[float]:
-    """Misfit of each estimate; inf with few comparable points, where a good fit means little."""
+    """Misfits; inf with few comparable points, where a good fit means little."""
     fits = [adjustment.cost(one, WIDE[-1].reach) for one in estimates]
     most = max(num for _, num in fits)
     return [cost if 2 * num >= most else np.inf for cost, num in fits]
@@ -111,13 +111,12 @@ def _solution(adjustment: Adjustment, estimate: Estimate) -> Solution:
 
 
 def narrow(adjustment: Adjustment, estimate: Estimate) -> Widths:
-    """The final widths: Tukey's, from the residuals' actual spread."""
+    """Final widths: Tukey's, by the residuals' actual spread."""
     spread = adjustment.normal(estimate, WIDE[-1]).spread
     return Widths(reach=WIDE[-1].reach, cut=fixed.CALIBRATION_TUKEY * max(spread, fixed.CALIBRATION_LEAST_SPREAD))
 
 
 def _starts(unknowns: Unknowns, start: Estimate) -> list[Estimate]:
-    """The start, and random others about it."""
     rng = np.random.default_rng(0)
     starts, num = [start], POSE * len(unknowns.poses)
     for _ in range(fixed.CALIBRATION_STARTS if num else 0):
@@ -128,7 +127,7 @@ def _starts(unknowns: Unknowns, start: Estimate) -> list[Estimate]:
 
 
 def _apart(solution: Solution, other: Estimate) -> float:
-    """Largest displacement [m] of what a camera sees, at its middle or rim, by another estimate."""
+    """Largest displacement [m] of a camera's points by another estimate."""
     apart = [0.0]
     for camera in solution.adjustment.unknowns.poses:
         middle, radius = middle_of(solution.adjustment, camera)
@@ -165,10 +164,10 @@ def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
 
 
 def _with_depths(solution: Solution) -> Solution:
-    """Solve again with depth scales and biases, where the recording clearly supports them.
+    """Solve again with clearly supported depth scales and biases.
 
-    All are tried together, as others compensate for a wrong one held fixed. The least certain are then fixed one by
-    one, until all left differ by `CALIBRATION_DEPTH_SURE[0]` sigmas.
+    All are tried together, as others compensate for a wrong fixed one. The least certain are fixed one by one, until
+    all left differ by `CALIBRATION_DEPTH_SURE[0]` sigmas.
     """
     unknowns = solution.adjustment.unknowns
     tried = _freed(solution, replace(unknowns, scales=unknowns.poses, biases=unknowns.cameras))
@@ -185,9 +184,9 @@ def _with_depths(solution: Solution) -> Solution:
 
 
 def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
-    """Offsets (P,) of depth unknowns from 1 or 0, covariance (P, P), and the columns left free.
+    """Depth unknowns' offsets (P,) from 1 or 0, covariance (P, P), and free columns.
 
-    Of a scale and a bias that explain the same, the likelier stays (`CALIBRATION_DEPTH_USUAL`).
+    If a scale and a bias explain the same, the likelier stays (`CALIBRATION_DEPTH_USUAL`).
     """
     unknowns, covariance = tried.adjustment.unknowns, tried.certainty.covariance
     off, free, usual = np.zeros(unknowns.size), [], []
@@ -210,19 +209,19 @@ def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
 
 
 def _with_held(off: Float64, covariance: Float64, at: int) -> tuple[Float64, Float64]:
-    """Estimates (P,) and covariance (P, P), given that one is fixed at 0."""
+    """Estimates (P,) and covariance (P, P), with one fixed at 0."""
     gain = covariance[:, at] / max(covariance[at, at], np.finfo(float).tiny)
     return off - gain * off[at], _positive(covariance - np.outer(gain, covariance[at]))
 
 
 def _positive(covariance: Float64) -> Float64:
-    """A covariance (P, P) with variances that rounding made nonpositive raised to tiny."""
+    """A covariance (P, P) with positive variances despite rounding."""
     np.fill_diagonal(covariance, np.maximum(np.diag(covariance), np.finfo(float).tiny))
     return covariance
 
 
 def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
-    """Smallest |scale - 1| and |bias| [m] to be noticed, by camera; inf where not solved for."""
+    """Least |scale - 1| and |bias| [m] to be noticed, by camera; inf if none."""
     unknowns = tried.adjustment.unknowns
     held = [at for at in range(POSE * len(unknowns.poses), unknowns.size - unknowns.has_clock) if at not in free]
     found = {}
@@ -242,7 +241,7 @@ def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, flo
 
 
 def _is_sure(tried: Solution, at: int, off: float, variance: float) -> bool:
-    """True if a scale or bias clearly differs from 1 or 0, and changes depths noticeably."""
+    """True if a scale or bias clearly differs from 1 or 0."""
     unknowns = tried.adjustment.unknowns
     camera = next(camera for camera in unknowns.cameras if at in unknowns.columns(camera))
     change = off if at == unknowns.columns(camera)[-1] else off * _far(tried, camera)
@@ -256,7 +255,7 @@ def _is_absurd(scale: float, bias: float) -> bool:
 
 
 def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
-    """Solve again with scales and biases, from the best of several initial scales."""
+    """Solve again with scales and biases, from the best of several scales."""
     evidence = solution.adjustment.evidence
     adjustment, few = Adjustment(evidence, unknowns), Adjustment(evidence.thinned(), unknowns)
     estimates = []
@@ -270,7 +269,7 @@ def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
 
 
 def _far(solution: Solution, camera: str) -> float:
-    """The depth [m] that 90 % of a camera's points are nearer than; 0 without points."""
+    """90th percentile of a camera's depths [m]; 0 without points."""
     seen = [view.points[:, 2] for view in solution.adjustment.evidence.views if view.camera == camera]
     depths = np.concatenate(seen)
     return float(np.percentile(depths, 90)) if len(depths) else 0.0

@@ -1,4 +1,4 @@
-"""Depth images prepared for comparison: surfaces, normals, and points projected on them."""
+"""Depth images for comparison: surfaces, normals, and points projected on them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,8 +18,8 @@ SMOOTH = 0.1  # of the depth, that a pixel and its four neighbours may differ by
 class DepthView:
     """One depth image, in its camera's optical frame [m].
 
-    surface, normals (h, w, 3): each pixel's point, and unit normal towards the camera, 0 if unknown. points,
-    point_normals (K, 3): some of those with a normal, in image parts tiles (K,). T_world_camera (4, 4): as recorded.
+    surface, normals (h, w, 3): per pixel, normals towards the camera, 0 if unknown. points, point_normals (K, 3): a
+    subset with normals, in image parts tiles (K,). T_world_camera (4, 4): as recorded.
     """
 
     camera: str
@@ -34,7 +34,7 @@ class DepthView:
 
     @classmethod
     def of(cls, frame: RgbdFrame, num_points: int, step: int = 1) -> "DepthView":
-        """The view of a frame, with at most `num_points` points; step: of `surface_normals`."""
+        """A frame's view with at most `num_points` points; step: of `surface_normals`."""
         surface = back_project(frame.intrinsics, frame.depth)
         normals = surface_normals(surface, step)
         normals[bend(frame.depth, step) > fixed.CALIBRATION_CREASE * depth_sigma(frame.depth)] = 0.0
@@ -57,7 +57,7 @@ class DepthView:
 def _of_all_directions(normals: Float64, most: int) -> Index:
     """Numbers, in order, of at most `most` normals (N, 3), balanced over directions.
 
-    A table would outnumber its objects, which alone constrain the camera along the table. Normal-space sampling after
+    A table outnumbers its objects, which alone constrain the camera along it. Normal-space sampling after
     Rusinkiewicz and Levoy, Efficient variants of the ICP algorithm (2001).
     """
     side = np.argmax(np.abs(normals), axis=1)
@@ -74,7 +74,7 @@ def _of_all_directions(normals: Float64, most: int) -> Index:
 
 
 def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
-    """Every n-th pixel of a frame, for at most about `rows` rows; without colour."""
+    """Every n-th pixel, for at most about `rows` rows; without colour."""
     stride = max(1, frame.depth.shape[0] // rows)
     depth = np.ascontiguousarray(frame.depth[::stride, ::stride])
     lens = strided_lens(frame.intrinsics, stride)
@@ -84,9 +84,9 @@ def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
 
 
 def surface_normals(surface: Float64, step: int = 1) -> Float64:
-    """Unit normals (h, w, 3) towards the camera of a surface (h, w, 3) in its frame.
+    """Unit normals (h, w, 3) towards the camera of a surface (h, w, 3), camera frame.
 
-    From the points `step` pixels to either side; 0 along edges and without depth.
+    From points `step` pixels to either side; 0 along edges and without depth.
     """
     normals = np.zeros_like(surface)
     middle, low, high = slice(step, -step), slice(None, -2 * step), slice(2 * step, None)
@@ -102,7 +102,7 @@ def surface_normals(surface: Float64, step: int = 1) -> Float64:
 
 
 def bend(depth: Float32, step: int = 1) -> Float64:
-    """Largest deviation (h, w) [m] of depth from the mean `step` pixels to either side."""
+    """Largest deviation (h, w) [m] of depth from the mean `step` pixels aside."""
     bent = np.zeros(depth.shape)
     middle, low, high = slice(step, -step), slice(None, -2 * step), slice(2 * step, None)
     z = depth.astype(np.float64)
@@ -114,7 +114,7 @@ def bend(depth: Float32, step: int = 1) -> Float64:
 
 
 class Surface(Protocol):
-    """Surface and normals (h, w, 3) that points are compared with, seen through a lens."""
+    """Surface and normals (h, w, 3), with their lens."""
 
     @property
     def lens(self) -> Intrinsics: ...
@@ -137,9 +137,9 @@ def landed(points: Float64, view: Surface) -> tuple[Bool, Float64, Float64]:
 def by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64) -> Float64:
     """Derivatives (K, 12) of a value with gradient (K, 3) at `there` (K, 3) by two cameras' motions.
 
-    The first camera has the point at `own` (K, 3), at T (4, 4); the second sees it. Each moves by a rotation and
-    translation in its own frame. T exp(x) moves points by ``x[:3] x p + x[3:]``, so ``g . T exp(x) p`` changes by
-    ``(p x R^T g) . x[:3] + R^T g . x[3:]``; the second camera's sign is opposite.
+    The first camera has the point at `own` (K, 3), at T (4, 4); the second sees it. Motions are a rotation and
+    translation in own frames. T exp(x) moves points by ``x[:3] x p + x[3:]``, so ``g . T exp(x) p`` changes by ``(p x
+    R^T g) . x[:3] + R^T g . x[3:]``; the second camera's sign is opposite.
     """
     along = gradient @ T[:3, :3]
     return np.hstack([np.cross(own, along), along, -np.cross(there, gradient), -gradient])
@@ -148,9 +148,9 @@ def by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64) -> Fl
 def overlap_rows(
     points: Float64, T: Float64, which: Bool, surface: Float64, normals: Float64
 ) -> tuple[Float64, Float64]:
-    """Distances (M,) [m] of the points `which` from a view's surface planes, and derivatives (M, 12).
+    """Distances (M,) [m] of points from a view's surface planes, and derivatives (M, 12), `by_twists`.
 
-    points (K, 3), which (K,): of the other view, at T (4, 4), that land (`landed`). Derivatives as `by_twists`.
+    points (K, 3): of the other view, at T (4, 4); which (K,): those that land (`landed`).
     """
     there, normal = transform_points(T, points[which]), normals[which]
     residual = np.einsum("ki,ki->k", there - surface[which], normal)
@@ -160,8 +160,7 @@ def overlap_rows(
 def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
     """A stationary camera's frame: the mean of inverse depths near their median.
 
-    Sensors err in disparity, proportional to inverse depth. A pixel counts where half of the frames agree within
-    three `depth_sigma`.
+    Sensors err in disparity, proportional to inverse depth. Half of the frames must agree within three `depth_sigma`.
     """
     if len(frames) == 1:
         return frames[0]
@@ -180,12 +179,12 @@ def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
 
 
 def depth_sigma(depth: NDArray[np.floating]) -> Float64:
-    """Assumed sigma [m] of depths (...) [m]: a constant plus disparity error, growing with the square."""
+    """Assumed sigma [m] of depths (...) [m]: constant plus quadratic, as disparity errs."""
     return np.asarray(fixed.CALIBRATION_NOISE[0] + fixed.CALIBRATION_NOISE[1] * np.square(depth), np.float64)
 
 
 def tiles_of(pixels: Index, shape: tuple[int, ...]) -> Index:
-    """The tile (K,) of each pixel, among `CALIBRATION_TILES` rows and columns."""
+    """Each pixel's tile (K,), of `CALIBRATION_TILES` rows and columns."""
     rows, columns = fixed.CALIBRATION_TILES
     v, u = np.divmod(pixels, shape[1])
     return np.asarray((v * rows // shape[0]) * columns + u * columns // shape[1], dtype=np.int64)
