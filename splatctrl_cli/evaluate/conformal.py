@@ -1,13 +1,12 @@
 """A bound on a map's missed surface from held-out depth: split conformal prediction over time.
 
-Each held-out frame set has one number, its largest miss. Neighbouring sets are dependent, so they are joined to
-stretches of the misses' autocorrelation time, that long apart; a stretch's score is its largest miss. Let n scores
-and a new one be exchangeable. The k-th smallest, ``k = ceil((n + 1) * confidence)``, bounds the new one with
-probability at least `confidence` (Vovk, Gammerman and Shafer 2005; Lei et al. 2018, section 2). Such a k exists up to
-``n / (n + 1)``, to which higher requests are lowered.
+Each held-out frame set has one number, its largest miss. As neighbouring sets are dependent, they form stretches of
+the misses' autocorrelation time, that long apart; a stretch's score is its largest miss. If n scores and a new one
+are exchangeable, the k-th smallest bounds the new one with probability at least `confidence`. Here ``k = ceil((n + 1)
+* confidence)``, up to confidence ``n / (n + 1)`` (Vovk, Gammerman and Shafer 2005; Lei et al. 2018, section 2).
 
-The bound is for a further stretch of the same kind, before it is recorded, not for each state. It does not cover
-surface without depth return, changes of scene or camera, or unprecedented moments.
+The bound is for a further stretch of the same kind, before it is recorded, not for each state. It excludes surface
+without depth return, changes of scene or camera, and unprecedented moments.
 """
 
 import math
@@ -25,7 +24,7 @@ ROUNDING = 1e-9  # of (n + 1) * confidence, which is a whole number where it sho
 class ConformalBound:
     """A score [m] that a further stretch does not exceed with `confidence`.
 
-    From num_stretches of `length` sets each. at: index of the deciding set in the misses.
+    From num_stretches of `length` sets; at: index of the deciding set.
     """
 
     bound: float
@@ -38,7 +37,7 @@ class ConformalBound:
 def conformal_bound(misses: Float64, confidence: float) -> ConformalBound | None:
     """The bound of misses (T,) [m], one per frame set by time, NaN for none.
 
-    None below FEWEST_STRETCHES stretches. `confidence` is lowered to what their number allows.
+    None below FEWEST_STRETCHES stretches. Their number limits `confidence`.
     """
     if not np.isfinite(misses).any():
         return None
@@ -63,10 +62,10 @@ def conformal_rank(num_scores: int, confidence: float) -> int:
 
 
 def autocorrelation_time(misses: Float64) -> int:
-    """Number of frame sets, at least 1, over which misses (T,) stay correlated.
+    """Number of frame sets, at least 1, over which misses (T,) correlate.
 
-    ``1 + 2 sum_k rho_k``, rounded up, to the first lag k with nonpositive autocorrelation rho (Geyer 1992, by single
-    lags). NaN is left out; constant misses give 1.
+    ``1 + 2 sum_k rho_k``, rounded up, to the first lag k with autocorrelation rho <= 0 (Geyer 1992, by single lags).
+    NaN is left out; constant misses give 1.
     """
     is_there = np.isfinite(misses)
     apart = np.where(is_there, misses, 0.0) - is_there * (np.mean(misses[is_there]) if is_there.any() else 0.0)
@@ -87,7 +86,7 @@ def autocorrelation_time(misses: Float64) -> int:
 def stretches(num_sets: int, length: int) -> Index:
     """The stretch (T,) of each set: `length` sets, starting `length` after the last one's end.
 
-    Sets in between and at the end count to the previous one. That only raises its score, so the bound still holds.
+    Other sets count to the previous stretch, which only raises its score: the bound still holds.
     """
     period = 2 * length - 1
     whole = max((num_sets + period - length) // period, 1)
@@ -95,7 +94,7 @@ def stretches(num_sets: int, length: int) -> Index:
 
 
 def stretch_scores(misses: Float64, stretch: Index) -> tuple[Float64, Index]:
-    """The largest miss (n,) of every stretch with any, and its set (n,)."""
+    """Each stretch's largest miss (n,), and its set (n,)."""
     known = np.flatnonzero(np.isfinite(misses))
     order = known[np.lexsort((-misses[known], stretch[known]))]
     first = order[np.unique(stretch[order], return_index=True)[1]]

@@ -20,7 +20,7 @@ from splatctrl_cli.robot.mesh_distance import MeshDistance
 
 @dataclass(frozen=True, kw_only=True)
 class BandAccuracy:
-    """Errors field - truth [m] in a band of true distance; positive is unsafe. None if empty."""
+    """Errors field - truth [m] in a distance band; positive is unsafe. None if empty."""
 
     lower: float
     upper: float
@@ -34,7 +34,7 @@ class BandAccuracy:
 
 @dataclass(frozen=True, kw_only=True)
 class OverEstimate:
-    """Share of cells that exceed the truth by more than `allowance` [m], and by how much."""
+    """Share of cells above the truth by more than `allowance` [m], and their excess."""
 
     allowance: float
     count: int
@@ -45,7 +45,7 @@ class OverEstimate:
 
     @property
     def holds(self) -> bool:
-        """True if there are cells, none beyond the allowance."""
+        """True if no cell, of any, exceeds the allowance."""
         return self.count > 0 and self.count_beyond == 0
 
 
@@ -70,9 +70,9 @@ OVER_SCALES = {
 
 @dataclass(frozen=True, kw_only=True)
 class FieldAccuracy:
-    """Accuracy of several fields at the same points: bands by field name, everywhere and where seen.
+    """Bands by field name, everywhere and where seen, at the same points.
 
-    If visibility is unknown, seen is empty and the over-estimate is over all points.
+    Without known visibility, seen is empty and the over-estimate is over all points.
     """
 
     everywhere: Mapping[str, tuple[BandAccuracy, ...]]
@@ -118,9 +118,9 @@ def field_accuracy(
 ) -> FieldAccuracy:
     """Compare fields with the truth at points outside the objects.
 
-    distances: name -> (Q,) [m], including `hard`. truth (Q,) [m]: >= 0 counts. seen (Q,): True where a training
-    camera saw the nearest true surface point, None if unknown. The over-estimate is of `hard` at seen points up to 20
-    cm, against 1 cm + `median_radius` [m]. Raises InputError for unequal lengths, or without `hard`.
+    distances: name -> (Q,) [m], including `hard`. truth (Q,) [m]: >= 0 counts. seen (Q,): a training camera saw the
+    nearest true surface point; None if unknown. The over-estimate is of `hard` at seen points up to 20 cm, against 1
+    cm + `median_radius` [m]. Raises InputError for unequal lengths, or without `hard`.
     """
     if "hard" not in distances:
         raise InputError(f"distances: expected one named hard, got {', '.join(distances) or 'none'}")
@@ -140,21 +140,21 @@ def field_accuracy(
 
 @dataclass(frozen=True, kw_only=True)
 class GridDistance:
-    """A grid's distance channel (X, Y, Z) [m], and an offset [m] to add."""
+    """A distance channel (X, Y, Z) [m], and an offset [m] to add."""
 
     values: NDArray[np.generic]
     added: float = 0.0
 
     def at(self, cells: NDArray[np.int64]) -> Float64:
-        """Distances [m] by flat index, without copying the channel, which may be on disk."""
+        """Distances [m] by flat index, without copying a channel on disk."""
         return np.asarray(self.values.reshape(-1)[cells].astype(np.float64) + self.added)
 
 
 def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
     """A grid's distances by field name: sdf, hard, se, gpdf.
 
-    Without its channel, hard is ``bound`` plus the header's margin, equal within a micrometre (including obstacles
-    made of never-seen cells). Raises InputError for a grid with neither.
+    Without its channel, hard is ``bound`` plus the header's margin, within a micrometre (and includes never-seen
+    obstacle cells). Raises InputError with neither.
     """
     found: dict[str, GridDistance] = {
         name: GridDistance(values=grid.channels[name])
@@ -173,7 +173,7 @@ def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
 
 
 def median_radius(grid: DistanceGrid) -> float:
-    """The median splat radius [m] in the grid's header. Raises InputError without one."""
+    """The median splat radius [m] in the header. Raises InputError without one."""
     health = grid.header.get("health")
     if not isinstance(health, dict) or not isinstance(health.get("radius"), int | float):
         raise InputError("distance grid: expected health.radius in its header, got none", remedy="bake it again")
@@ -187,7 +187,7 @@ def _bands(error: Float64, truth: Float64, chosen: Bool) -> tuple[BandAccuracy, 
 
 
 def band_accuracy(error: Float64, lower: float, upper: float) -> BandAccuracy:
-    """Statistics of errors (Q,) [m] in a band of true distance."""
+    """Statistics of errors (Q,) [m] in a distance band."""
     is_empty = not len(error)
     return BandAccuracy(
         lower=lower,
@@ -220,10 +220,7 @@ REACH = BANDS[-1][1]  # [m] of true distance that is compared
 
 @dataclass(frozen=True, kw_only=True)
 class TrueCells:
-    """Q sampled cells, world: centres, the grid's `FIELDS` and the true distance (Q,) [m].
-
-    surface (Q, 3) [m]: the point that gives the distance.
-    """
+    """Q sampled cells, world: centres, `FIELDS`, true distance (Q,) [m], and its surface point (Q, 3)."""
 
     points: Float64
     fields: Mapping[str, Float64]
@@ -236,10 +233,10 @@ class TruthComparison:
     """The accuracy against the truth, and its cell counts.
 
     num_drawn cells were sampled; num_blank have no distance (field.unknown = nan); num_near of the rest lie outside
-    the objects within 20 cm. A training camera saw the nearest surface point of num_seen inside the workspace, and of
-    num_outside_workspace outside, where the scene keeps no splats. reliability: per probability form, at seen cells
-    within 20 cm of a surface, inside or out. error_mean, error_sigma [m]: of sdf at seen cells within
-    `PROBABILITY_NEAR`; None without any.
+    the objects within 20 cm. A training camera saw the nearest surface point of num_seen, and of
+    num_outside_workspace where the scene keeps no splats. reliability: by probability form, at seen cells within 20
+    cm of a surface, either side. error_mean, error_sigma [m]: of sdf at seen cells within `PROBABILITY_NEAR`, or
+    None.
     """
 
     accuracy: FieldAccuracy
@@ -272,7 +269,7 @@ def compare_with_truth(
     """Accuracy of `FIELDS`, and reliability of probabilities, where `frames` saw the surface.
 
     name: of the truth, for errors. workspace: where the scene keeps splats, None if unknown. probabilities: functions
-    of points (Q, 3) and sdf (Q,) [m]. Raises NotEvaluableError without a cell near an object.
+    of points (Q, 3) and sdf (Q,) [m]. Raises NotEvaluableError with no cell near an object.
     """
     sdf, distance = cells.fields["sdf"], cells.distance
     is_blank = ~np.isfinite(sdf)
@@ -317,9 +314,9 @@ def _curve(found: Reliability) -> dict[str, object]:
 class MeshComparison:
     """The accuracy against the mesh `file`, and its cell counts.
 
-    num_in_reach cells lie in the mesh's box widened by 20 cm; num_drawn of them were sampled. num_unknown of these
-    have no distance (NaN, by the unknown-space policy), num_inside lie inside the mesh near its surface, and the
-    num_near compared lie outside within 20 cm. is_closed: the mesh has an inside.
+    num_in_reach cells lie in the mesh's box widened by 20 cm; num_drawn were sampled. num_unknown of these have no
+    distance (NaN, by the unknown-space policy); num_inside lie inside the mesh near its surface. The num_near
+    compared lie outside within 20 cm.
     """
 
     file: str
@@ -341,9 +338,9 @@ class MeshComparison:
 def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_points: int = 50_000) -> MeshComparison:
     """Errors of the grid's distances at cells sampled by `seed`, against the exact mesh distance.
 
-    The mesh is in the grid's frame [m]. Inside a closed mesh, where the field is a shell, nothing is compared. An
+    The mesh is in the grid's frame [m]. Inside a closed mesh, where the field is a shell, nothing is compared; an
     open mesh's unsigned distance is the truth on both sides. `seen` is empty. Raises InputError for no mesh,
-    NotEvaluableError without a cell near it.
+    NotEvaluableError with no cell near it.
     """
     mesh = load_mesh(mesh_path)
     distances = grid_distances(grid)
@@ -382,7 +379,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
 
 
 def _drawn_cells(grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int) -> tuple[Index, int]:
-    """Sampled cells (C, 3), in order, with centres in a box, and the number of all."""
+    """Sampled cells (C, 3), in order, with centres in a box, and the count of all."""
     shape = np.array(grid.channels["sdf"].shape)
     first = np.maximum(np.ceil((lower - grid.origin) / grid.voxel).astype(np.int64), 0)
     last = np.minimum(np.floor((upper - grid.origin) / grid.voxel).astype(np.int64), shape - 1)

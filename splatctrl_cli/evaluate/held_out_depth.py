@@ -1,8 +1,8 @@
 """A baked field against held-out depth, and a scene's surface against reference points.
 
 A depth pixel at point p bounds the distance at x by ``|x - p|``, and the ray up to p is free. A field above the
-distance to the nearest measured point over-estimates in any case. A lower one may know a surface that no held-out
-pixel shows: it errs only if the ball around x, up to that point, was seen to be free.
+distance to the nearest measured point over-estimates. A lower one may know surface that no held-out pixel shows. It
+errs only if the ball around x, up to that point, was seen free.
 """
 
 import math
@@ -54,12 +54,11 @@ def cloud_score(
 ) -> dict[str, float]:
     """Distances between the surface's points (P, 3) and the reference's (R, 3) [m], world; seen (R,).
 
-    As DTU's evaluation and jzhangbs/DTUeval-python, eval.py: means over distances below `max_distance`; farther
-    points count only in the `*_beyond` shares. accuracy [m]: from the surface, of points in counts (P,) or all, to
-    the reference. completeness: from the whole reference to the surface. chamfer: the mean of both.
-    completeness_seen: over points that a training camera saw. nan without points. unit: metres per unit of the
-    reference's file, for messages. Raises NotEvaluableError without near points, or if the reference would fit in
-    another unit.
+    As DTU's evaluation and jzhangbs/DTUeval-python, eval.py: means of distances below `max_distance`; others count
+    only in the `*_beyond` shares. accuracy [m]: surface points, of counts (P,) or all, to the reference.
+    completeness: the whole reference to the surface. chamfer: the mean of both. completeness_seen: of points that a
+    training camera saw. nan without points. unit: metres per unit of the reference's file, for messages. Raises
+    NotEvaluableError without near points, or if another unit fits.
     """
     if not max_distance > 0:
         raise UsageError(f"--cloud-max: expected a distance above 0 m, got {max_distance:g}")
@@ -105,7 +104,7 @@ def _check_unit(points: Float64, reference: Float64, margin: float, unit: float)
 
 
 def _overlap(points: Float64, others: Float64, margin: float) -> float:
-    """Intersection over union of the boxes, trimmed by 1 % per end, widened by `margin` [m]."""
+    """Intersection over union of boxes, trimmed by 1 % per end, widened by `margin` [m]."""
     (low, high), (low_other, high_other) = (np.percentile(p, (1, 99), axis=0) for p in (points, others))
     sides = np.minimum(high, high_other) - np.maximum(low, low_other) + 2 * margin
     shared = float(np.prod(np.maximum(sides, 0.0)))
@@ -123,8 +122,8 @@ CLOUD_SCALES = {  # by the names of `cloud_score`
 def spaced(points: Float64, spacing: float) -> Float64:
     """Points (P, 3), visited in random order, farther than `spacing` [m] from all kept before.
 
-    As DTU's evaluation thins (DTUeval-python, eval.py), so that every layer about a surface counts. One point per
-    cube would improve accuracy by a tenth. Cubes of half the edge are merged first (the whole edge above 6 million
+    As DTU thins (DTUeval-python, eval.py), so that every layer of a scattered surface counts; one point per cube
+    would improve accuracy by a tenth. Cubes of half the edge are merged first (the whole edge above 6 million
     points).
     """
     _check_spacing(spacing)
@@ -146,7 +145,7 @@ def spaced(points: Float64, spacing: float) -> Float64:
 
 
 def thinned(points: Float64, spacing: float) -> Float64:
-    """The first of the points (P, 3) in each cube of edge `spacing` [m]; independent of prior thinning of parts."""
+    """The first of the points (P, 3) per cube of edge `spacing` [m]; thinning parts before is harmless."""
     _check_spacing(spacing)
     if not len(points):
         return points
@@ -163,13 +162,13 @@ def _check_spacing(spacing: float) -> None:
 
 
 def points_on(mesh: TriangleMesh, spacing: float) -> Float64:
-    """Random points (P, 3) [m] on a mesh, by area: four per `spacing` [m] squared, 2 million at most."""
+    """Random points (P, 3) [m] by area: four per `spacing` [m] squared, at most 2 million."""
     num = min(math.ceil(4 * 0.5 * np.linalg.norm(face_normals(mesh.corners), axis=1).sum() / spacing**2), MAX_POINTS)
     return drawn_on(mesh, num, np.random.default_rng(0))[0]
 
 
 def drawn_on(mesh: TriangleMesh, num: int, rng: np.random.Generator) -> tuple[Float64, NDArray[np.int64]]:
-    """Random points (num, 3) [m] on a mesh, by area, and their triangles (num,)."""
+    """Random points (num, 3) [m] by area, and their triangles (num,)."""
     corners, doubled = mesh.corners, np.linalg.norm(face_normals(mesh.corners), axis=1)
     face = rng.choice(len(corners), num, p=doubled / doubled.sum())
     u, v = rng.random((2, num))
@@ -184,7 +183,7 @@ def _nearest(points: Float64, others: Float64, limit: float, threads: int) -> Fl
 
 
 def _mean_below(distances: NDArray[np.floating], limit: float) -> tuple[float, float]:
-    """Mean of the distances below the limit, and the share beyond."""
+    """Mean of distances below the limit, and the share of others."""
     if not len(distances):
         return math.nan, math.nan
     near = distances[distances < limit]
@@ -206,10 +205,10 @@ REACH = fixed.BANDS[-1][1]  # [m] before the surface that points are put on a ra
 class HeldOutComparison:
     """Errors [m] against held-out depth, and counts of points.
 
-    on_surface: the fields at measured points, whose distance is 0. before: at points on the rays in front; `seen`
-    have a ball, up to the nearest measured point, that was seen free, so under-estimates count too. over_estimate is
-    over all points. num_edges pixels were left out at depth edges; num_outside points lie outside the grid,
-    num_unknown at a corner without distance.
+    on_surface: at measured points, whose distance is 0. before: on the rays in front; `seen` points have a ball, up
+    to the nearest measured point, seen free, so under-estimates count too. over_estimate is over all points.
+    num_edges pixels were left out at depth edges; num_outside points lie outside the grid, num_unknown at a corner
+    without distance.
     """
 
     on_surface: dict[str, BandAccuracy]
@@ -236,11 +235,11 @@ def compare_with_held_out_depth(
     counted: Sequence[Bool] | None = None,
     max_points: int = 20_000,
 ) -> HeldOutComparison:
-    """Errors of the grid's interpolated distances on `max_points` held-out rays, sampled by `seed`.
+    """Errors of interpolated distances on `max_points` held-out rays, sampled by `seed`.
 
-    frames: of held-out cameras, at the bake's stamp, in the grid's frame. counted: per frame (H, W), False where the
-    field leaves out what is seen (the robot). Raises InputError for masks that do not fit, NotEvaluableError without
-    a measured point in the grid.
+    frames: of held-out cameras, at the bake's stamp, in the grid's frame. counted: per frame (H, W), False on objects
+    that the field leaves out (the robot). Raises InputError for masks that do not fit, NotEvaluableError without a
+    measured point in the grid.
     """
     distances = grid_distances(grid)
     upper = grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1)
@@ -296,7 +295,7 @@ def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float
 
 
 def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: Box) -> tuple[Float64, Float64, int]:
-    """Surface points (M, 3) in a box, their eyes (M, 3), and the number of edges left out."""
+    """Surface points (M, 3) in a box, their eyes (M, 3), and the edges left out."""
     if counted is not None and [mask.shape for mask in counted] != [frame.depth.shape for frame in frames]:
         raise InputError(
             f"counted: expected a mask of the size of each of {len(frames)} frames, got {len(counted)} masks"
@@ -316,7 +315,7 @@ def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: 
 
 
 def depth_edges(depth: NDArray[np.float32]) -> Bool:
-    """(H, W) True where a neighbour's depth differs by more than a share of the smaller."""
+    """(H, W) True where a neighbour's depth differs by a share of the smaller."""
     is_edge = np.zeros(depth.shape, dtype=np.bool_)
     for axis in (0, 1):
         here, there = [slice(None)] * 2, [slice(None)] * 2
@@ -338,7 +337,7 @@ def _interpolated(grid: DistanceGrid, distances: dict[str, GridDistance], points
 
 
 def _ball_is_free(points: Float64, radius: Float64, frames: Sequence[RgbdFrame]) -> Bool:
-    """(Q,) True if all probes in a point's ball were seen free."""
+    """(Q,) True if all probes in the ball were seen free."""
     index = np.arange(fixed.FREE_DIRECTIONS)
     height, turn = 1 - (2 * index + 1) / fixed.FREE_DIRECTIONS, index * np.pi * (3 - np.sqrt(5))  # Fibonacci's spiral
     flat = np.sqrt(1 - height**2)

@@ -1,4 +1,4 @@
-"""Declared metrics: value, count, fold over states and scale; and clearances against the truth."""
+"""Declared metrics: value, count, fold over states and scale; clearances against the truth."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Better(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """Scale of a figure: a change for the worse counts beyond absolute + relative times the earlier value."""
+    """Scale of a figure: worsening counts beyond absolute + relative times the earlier value."""
 
     unit: str = ""
     better: Better = Better.NEITHER
@@ -59,7 +59,7 @@ LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
 
 @dataclass(frozen=True, kw_only=True)
 class Shown:
-    """The row of a state table that shows a figure: where `column` is "least", "largest", or the word `pick`."""
+    """The row of a state table for a figure: `column` at its "least", "largest", or word `pick`."""
 
     column: str
     pick: str
@@ -77,10 +77,10 @@ def largest_of(column: str) -> Shown:
 
 @dataclass(frozen=True, kw_only=True)
 class Metric(Generic[R]):
-    """One figure: its value, and how many states, views or points it rests on.
+    """One figure: its value, and the number of states, views or points behind it.
 
-    running: its value before the first state, and up to each (T,); None if not made of single states. shown: its row
-    in a table of states.
+    running: its value before the first state, and up to each (T,); None if not of single states. shown: its row in a
+    table of states.
     """
 
     name: str
@@ -101,30 +101,30 @@ class Fold:
 
 
 def _of_known(fold: Callable[[Float64], np.floating], values: Float64) -> float | None:
-    """A fold of the values that are not NaN; None without one."""
+    """A fold without NaN; None for no value."""
     there = values[~np.isnan(values)]
     return float(fold(there)) if len(there) else None
 
 
 def least(values: Float64) -> float | None:
-    """The smallest finite value; None without one."""
+    """The smallest finite value, or None."""
     finite = values[np.isfinite(values)]
     return float(finite.min()) if len(finite) else None
 
 
 def lowest(values: Float64) -> float | None:
-    """The least value that is not NaN, perhaps infinite; None without one."""
+    """The least value, perhaps infinite, without NaN; or None."""
     return _of_known(np.min, values)
 
 
 def largest(values: Float64) -> float | None:
-    """The largest value; None if one is infinite or none exists."""
+    """The largest value; None if any is infinite."""
     there = values[~np.isnan(values)]
     return float(np.max(there)) if len(there) and np.isfinite(there).all() else None
 
 
 def last(values: Float64) -> float | None:
-    """The last finite value; None without one."""
+    """The last finite value, or None."""
     there = values[np.isfinite(values)]
     return float(there[-1]) if len(there) else None
 
@@ -138,7 +138,7 @@ TOTAL = Fold(of=lambda values: int(np.nansum(values)))
 
 
 def known(values: Float64) -> int:
-    """The number of values that are not NaN."""
+    """The number of values except NaN."""
     return int(np.sum(~np.isnan(values)))
 
 
@@ -151,7 +151,7 @@ def folded(
     scale: Scale = DESCRIBES,
     shown: Shown | None = None,
 ) -> Metric[R]:
-    """A column's fold; counts values that are not NaN, unless `count` is given."""
+    """A column's fold; counts all but NaN, unless `count` is given."""
     accumulate = fold.accumulate
     return Metric(
         name=name,
@@ -220,7 +220,7 @@ def clearance_agreement(
     """Agreement of clearance (T,) with truth (T,) [m], over states within 10 cm of a seen (T,) surface.
 
     By `FIGURES`: states compared; |clearance - truth| as median, 95 % and largest [m]; largest over-estimate [m];
-    share within the tolerance [m]. None without states.
+    share within tolerance [m]. None without states.
     """
     tolerance = MAP_ALLOWANCE + median_radius
     compared = (truth < CLEARANCE_NEAR) & is_seen & np.isfinite(clearance)
@@ -238,9 +238,9 @@ def clearance_agreement(
 def mark_seen(
     seen: Bool, points_world: FloatRows, stamp_ns: Stamps, frame: RgbdFrame, *, has_clock: bool = True
 ) -> None:
-    """Set `seen` (T,) where `frame` saw a surface point (T, 3) [m], world, no later than its stamp.
+    """Set `seen` (T,) where `frame`, not later than the stamp (T,), saw the point (T, 3) [m].
 
-    Points are read in blocks, and only where not yet seen.
+    Points are read in blocks, and only those not yet seen.
     """
     for first in range(0, len(seen), BLOCK):
         part = slice(first, first + BLOCK)

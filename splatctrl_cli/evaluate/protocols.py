@@ -1,10 +1,10 @@
-"""DTU's scoring protocols, comparable with published figures: view splits, and where points count.
+"""DTU's scoring protocols, for published figures: view splits, and where points count.
 
 Views are numbered from 0: view 0 is ``rect_001`` of DTU.
 
-ObsMaskN_10.mat and PlaneN.mat of DTU's ObsMask folder, in millimetres, say where points count. ObsMask (X, Y, Z)
-marks the cells of BB (2, 3), Res [mm] wide, that the reference scanner observed. Reference points count where P (4) .
-(x, y, z, 1) > 0, above the ground (DTU's PointCompareMain.m; jzhangbs/DTUeval-python, eval.py).
+ObsMaskN_10.mat and PlaneN.mat of DTU's ObsMask folder, in millimetres, say where points count. ObsMask (X, Y, Z):
+cells of BB (2, 3), Res wide, that the reference scanner observed. Reference points count above the ground, at ``P (4)
+. (x, y, z, 1) > 0`` (DTU's PointCompareMain.m; jzhangbs/DTUeval-python, eval.py).
 """
 
 import re
@@ -49,9 +49,9 @@ class Split:
 class ScoreProtocol:
     """A named scoring protocol.
 
-    mask: pixels in the published figure: of a mask if given, of the object (mask required), or with reference depth.
-    fill: colour outside the mask in the published SSIM; is_zero_padded: border without a mask. size [px], scans: of
-    the published figures. Without training and scored views, a rule splits.
+    mask: pixels of the published figure: of a mask if given, of the object (mask required), or with reference depth.
+    fill: colour outside the mask in the published SSIM; is_zero_padded: its border without a mask. size [px], scans:
+    as published. Without training and scored views, a rule splits.
     """
 
     name: str
@@ -72,10 +72,7 @@ class ScoreProtocol:
         return not (self.scored or self.every)
 
     def split(self, numbers: Sequence[int], where: str) -> Split:
-        """Split the views `numbers` of the scan `where`, leaving out views not named.
-
-        Raises InputError for missing views.
-        """
+        """Split views `numbers` of scan `where`; others are left out. Raises InputError for missing ones."""
         if self.scores_training:
             return Split(training=tuple(numbers), scored=tuple(numbers))
         if self.every:
@@ -147,7 +144,7 @@ PROTOCOLS = {protocol.name: protocol for protocol in _FIXED}
 
 
 def score_protocol(name: str) -> ScoreProtocol:
-    """The protocol of a name or ``holdout:`` rule. Raises UsageError with the choices."""
+    """The protocol of a name or ``holdout:`` rule, else UsageError."""
     if name.startswith("holdout:"):
         return _holdout(name)
     if name in PROTOCOLS:
@@ -189,9 +186,9 @@ def _ranges(numbers: Sequence[int]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservedSpace:
-    """Observed cells (X, Y, Z) from `low` (3,) [m], `resolution` [m] wide, in a box up to `high` (3,) [m].
+    """Observed cells (X, Y, Z), `resolution` [m] wide, of a box from `low` to `high` (3,) [m].
 
-    plane (4,): above the ground, plane . (x, y, z, 1) > 0 [m].
+    plane (4,): ``plane . (x, y, z, 1) > 0`` is above the ground [m].
     """
 
     is_observed: Bool
@@ -201,7 +198,7 @@ class ObservedSpace:
     plane: Float64
 
     def near(self, points: Float64) -> Bool:
-        """(Q,) True for points (Q, 3) [m] near the box; only these are compared."""
+        """(Q,) True for points (Q, 3) [m] near the box, to be compared."""
         return np.asarray(((points >= self.low - BEFORE) & (points < self.high + BEYOND)).all(axis=1))
 
     def observed(self, points: Float64) -> Bool:
@@ -226,7 +223,7 @@ def scan_number(scan: str) -> int:
 
 
 def cloud_of_scan(folder: Path, scan: str) -> Path:
-    """A scan's points (``stl024_total.ply``, ``scan24.ply``). Raises InputError without either."""
+    """Path of ``scan24.ply`` or ``stl024_total.ply``. Raises InputError without either."""
     names = [f"{scan}.ply"] + ([f"stl{scan_number(scan):03d}_total.ply"] if scan[-1:].isdigit() else [])
     for name in names:
         if (folder / name).is_file():
@@ -235,7 +232,7 @@ def cloud_of_scan(folder: Path, scan: str) -> Path:
 
 
 def read_observed(folder: Path, scan: str) -> ObservedSpace:
-    """The observed space of a scan. Raises InputError naming the file."""
+    """A scan's observed space. Raises InputError naming the file."""
     number = scan_number(scan)
     path, plane_path = folder / f"ObsMask{number}_10.mat", folder / f"Plane{number}.mat"
     box, resolution = _array(path, "BB", 6).reshape(2, 3), float(_array(path, "Res", 1)[0])

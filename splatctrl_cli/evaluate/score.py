@@ -49,7 +49,7 @@ PROTOCOL = {
 
 @dataclass(frozen=True, kw_only=True)
 class RegionScore:
-    """Figures of one region of a view: `share` of its pixels; psnr [dB]; nan for an empty region.
+    """Figures of a region: `share` of the view's pixels; psnr [dB]; nan if empty.
 
     in_front: share of pixels with both depths where the render lies before the measured surface.
     """
@@ -78,10 +78,10 @@ CORRECTABLE = tuple(f"{name}_{region}" for name in REGION if name != "depth_pixe
 
 @dataclass(frozen=True, kw_only=True)
 class ViewScore:
-    """One view: `valid_share` of its pixels have reference depth; `all`, `seen` and `masked` are regions.
+    """One view: valid_share has reference depth; `all`, `seen` and `masked` are regions.
 
-    ssim_published: with a mask, the rest is filled; without one, the protocol decides. size: width, height [px].
-    corrected: the view with corrected pose and exposure, its depth without its camera's bend.
+    ssim_published: filled outside a mask; without one, if the protocol has it. size: width, height [px]. corrected:
+    with corrected pose, exposure and depth bend.
     """
 
     view: str
@@ -136,9 +136,9 @@ def score_view(
 ) -> ViewScore:
     """Score a rendering against `frame`, by `PROTOCOL`.
 
-    color (H, W, 3) in [0, 1]; depth (H, W) [m], normalised by accumulated opacity, 0 = none. seen (H, W): seen by a
-    training camera. mask (H, W): selected by the mask rule. The published SSIM uses `fill` as grey outside the mask,
-    or is_zero_padded without one. Invalid pixels of `frame` are in no region.
+    color (H, W, 3) in [0, 1]; depth (H, W) [m], normalised by accumulated opacity, 0 = none. seen, mask (H, W):
+    pixels seen in training, and of the mask rule. The published SSIM has grey `fill` outside the mask, or
+    is_zero_padded without one. Invalid pixels of `frame` are in no region.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
     photo = frame.color.astype(np.float64) / 255.0
@@ -177,8 +177,8 @@ def score_view(
 def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float:
     """Share of the splats' mass with centres in voxels observed free; nan without mass.
 
-    Mass is opacity times squared radius, what a splat can cover. The robot's splats, which move through free space,
-    are left out. A seen voxel is free below occupancy free_below.
+    Mass is opacity times squared radius, what a splat can cover. The robot's are left out, since they cross free
+    space. free_below: a free voxel's occupancy.
     """
     mass = np.where(splats.labels == Label.ROBOT, 0.0, splats.opacities * splats.radii.astype(np.float64) ** 2)
     is_free = (grid.num_updates > 0) & (grid.log_odds < math.log(free_below / (1.0 - free_below)))
@@ -189,7 +189,7 @@ def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float
 
 
 def in_front(depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool) -> float:
-    """Share of masked pixels with both depths [m] whose `depth` is nearer by more than IN_FRONT; nan without any."""
+    """Share of masked pixels with both depths [m] whose `depth` is nearer by IN_FRONT; nan without any."""
     both = mask & (depth > 0) & (reference > 0)
     return float(np.mean(depth[both] < reference[both] - IN_FRONT)) if both.any() else math.nan
 
@@ -211,10 +211,7 @@ def metric_scales() -> dict[str, Scale]:
 
 
 def total_score(views: Sequence[ViewScore]) -> dict[str, float]:
-    """Each figure's mean over the views that have it; nan without any.
-
-    Raises NotEvaluableError without a view.
-    """
+    """Each figure's mean over views that have it, or nan. Raises NotEvaluableError without a view."""
     if not views:
         raise NotEvaluableError("no view was scored: expected at least one, got 0")
     rows = [view.figures() for view in views]
@@ -226,5 +223,5 @@ def total_score(views: Sequence[ViewScore]) -> dict[str, float]:
 
 
 def as_json(figures: dict[str, float]) -> dict[str, Any]:
-    """The figures, None if not finite, for JSON."""
+    """The figures, None if not finite."""
     return {name: value if math.isfinite(value) else None for name, value in figures.items()}

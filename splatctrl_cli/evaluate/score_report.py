@@ -1,7 +1,7 @@
 """Conclusions from a score: means over scans, changes, verdict and doubts.
 
-A report is the content of ``score.json``: ``metrics`` by flat name, ``protocol``, ``warnings``, and ``views``, or
-``results`` by scan.
+A report is ``score.json``: ``metrics`` by flat name, ``protocol``, ``warnings``, and ``views``, or ``results`` by
+scan.
 """
 
 import json
@@ -41,7 +41,7 @@ NAMES_WITH_CHANGES = (*NAMES, *(PREFIX + name for name in NAMES))  # since a bas
 
 
 def read_baseline(path: Path) -> dict[str, Any]:
-    """The report of an earlier score. Raises InputError for another file."""
+    """An earlier score's report. Raises InputError for another file."""
     try:
         earlier = json.loads(path.read_text(encoding="utf-8"))
         if isinstance(earlier["metrics"], dict) and isinstance(earlier["protocol"], dict):
@@ -54,7 +54,7 @@ def read_baseline(path: Path) -> dict[str, Any]:
 
 
 def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
-    """New minus old of each figure, None if either is. Raises InputError if not comparable."""
+    """New minus old figures, None if either is. Raises InputError if not comparable."""
     earlier = read_baseline(path)
     now, then = ({**one["protocol"], "scans": one.get("scans")} for one in (report, earlier))
     for name in COMPARED:
@@ -71,7 +71,7 @@ def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
 
 
 def report_of_scans(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over the scans; None for a figure that one does not have."""
+    """Means over the scans; None for a figure missing in one."""
     each, scans = list(results.values()), list(results)
     metrics = {
         name: (sum_of if name in SUMS else mean_of)([one["metrics"].get(name) for one in each])
@@ -124,7 +124,7 @@ def other_scans(protocol: Mapping[str, Any], scans: Sequence[str]) -> list[str]:
 
 
 def score_verdict(report: Mapping[str, Any], require: Sequence[str], *, is_damaged: bool) -> Verdict:
-    """The verdict on a report: number of views, warnings, and each gate."""
+    """The verdict on a report: views, warnings, and gates."""
     metrics, counts = report["metrics"], counts_of(report)
     num_views, num_scans = metrics["num_views"], metrics.get("num_scans")
     compared = Reason(
@@ -161,7 +161,7 @@ THUMBNAIL = (16, 12)  # pixels
 class Doubts:
     """Collected oddities of views: inverted masks, training views, wrong poses.
 
-    is_still: the scene is static, so each view has its own picture; may_train: training views are scored on purpose.
+    is_still: a static scene, with one picture per view; may_train: training views are scored on purpose.
     """
 
     is_still: bool
@@ -174,7 +174,7 @@ class Doubts:
     _twins: list[str] = field(default_factory=list)
 
     def look(self, view: View, render: NDArray[np.floating], mask: Bool | None) -> None:
-        """Check a view, its render (H, W, 3) in [0, 1] and its mask (H, W).
+        """Check a view, its render (H, W, 3) in [0, 1] and mask (H, W).
 
         Raises InputError for an empty mask: the mean would miss a view.
         """

@@ -1,4 +1,4 @@
-"""Verdicts of judging commands: an outcome and its criteria; requirements on metrics."""
+"""Verdicts of judging commands: outcome and criteria; requirements on metrics."""
 
 import inspect
 import math
@@ -30,12 +30,11 @@ _WORST_FIRST = (Outcome.FAILED, Outcome.NOT_EVALUABLE, Outcome.PASSED)  # a defi
 
 @dataclass(frozen=True, kw_only=True)
 class Reason:
-    """One criterion's finding; `criterion` is empty until `Criterion.reasons` names it.
+    """One criterion's finding; `Criterion.reasons` names its `criterion`.
 
-    value, threshold: in `unit`, None without one. time_s [s]: as in the output's files. place (3,) [m]: world. who:
-    the link, sphere, joint or camera. cause: what is there. remedy: what the user can do. count: how many states,
-    views or points the value rests on. label: the outcome's name if this decides it, such as "contact". is_note:
-    worth a line though it decides nothing.
+    value, threshold: in `unit`, or None. time_s [s]: as in the output's files. place (3,) [m]: world. who: link,
+    sphere, joint or camera. cause: what is there. remedy: for the user. count: states, views or points behind the
+    value. label: the outcome's name if this decides, such as "contact". is_note: worth a line, decides nothing.
     """
 
     criterion: str = ""
@@ -77,8 +76,8 @@ def held(sentence: str, value: float, threshold: float, unit: str, count: int) -
 class Criterion(Generic[E]):
     """One criterion of a verdict.
 
-    find: its reasons, none where it does not apply; the first paragraph of its docstring enters the documentation's
-    table. broken: that table's cell on a violation.
+    find: its reasons, if it applies; its docstring's first paragraph enters the documentation's table. broken: that
+    table's cell on a violation.
     """
 
     name: str
@@ -100,9 +99,8 @@ class Criterion(Generic[E]):
 class Verdict:
     """The outcome of a command and its reasons, deciding ones first.
 
-    label: the outcome in the command's word, such as "safe"; how: how it passed, such as "proven" or "waived"; scope:
-    what was judged; notes: decide nothing. is_damaged: part of the input was lost. counts: states, views or points by
-    metric.
+    label: the outcome in the command's word, such as "safe"; how: such as "proven" or "waived"; scope: what was
+    judged; notes: decide nothing. is_damaged: part of the input was lost. counts: states, views or points by metric.
     """
 
     command: str
@@ -120,11 +118,11 @@ class Verdict:
 
     @property
     def exit_code(self) -> int:
-        """1 failed, 5 not evaluable, 0 passed, 3 passed with damaged input."""
+        """0 passed, 1 failed, 3 passed on damaged input, 5 not evaluable."""
         return EXIT_CODES[self.outcome] or (DAMAGED if self.is_damaged else 0)
 
     def exit_code_of(self, criteria: tuple[str, ...] | None) -> int:
-        """`exit_code` of the reasons whose criterion begins with one of `criteria` (None: all)."""
+        """`exit_code` by criteria that begin with one of `criteria` (None: all)."""
         if criteria is None:
             return self.exit_code
         asked = [reason.outcome for reason in self.reasons if reason.criterion.startswith(criteria)]
@@ -153,7 +151,7 @@ class Verdict:
         return f"{self.command}: {self.label.upper()}{scope}: {self.decisive[0]}{others}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; numbers that are not finite are None."""
+        """Plain values for JSON; non-finite numbers are None."""
         return {
             "outcome": str(self.outcome),
             "label": self.label,
@@ -181,8 +179,7 @@ def verdict_of(
 ) -> Verdict:
     """The verdict on reasons: failed if any failed, else not evaluable if any is, else passed.
 
-    No reason at all is not evaluable. passed: the label when passed. The label of a failure is the first
-    `Reason.label`.
+    No reason is not evaluable. passed: the label when passed; a failure takes the first `Reason.label`.
     """
     given = list(reasons)
     if not given:
@@ -247,9 +244,9 @@ _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": ope
 def check_gate_names(
     requirements: Sequence[str], names: Collection[str], elsewhere: Mapping[str, Collection[str]] | None = None
 ) -> None:
-    """Raise UsageError for a metric not in `names`; call before the work.
+    """Raise UsageError for a metric not in `names`, before the work.
 
-    elsewhere: metrics that other options would give, by those options.
+    elsewhere: metrics of other options, by those options.
     """
     for requirement in requirements:
         name, _, _ = parse_gate(requirement)
@@ -270,8 +267,7 @@ def gate_reasons(
 ) -> list[Reason]:
     """A reason per requirement: passed, failed, or not evaluable without a finite value or count.
 
-    counts: states, views or points by metric. first_time: the first time [s] a metric's states violate a requirement,
-    or None.
+    counts: states, views or points by metric. first_time: first time [s] of a violating state, or None.
     """
     check_gate_names(requirements, metrics)
     reasons = []
@@ -303,7 +299,7 @@ def _holds(comparison: str, bound: float, value: float) -> bool:
 
 
 def gate(text: str) -> str:
-    """`text` itself, for argparse. Raises UsageError if it is no requirement."""
+    """`text` itself, for argparse, else UsageError."""
     parse_gate(text)
     return text
 

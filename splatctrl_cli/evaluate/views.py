@@ -1,4 +1,4 @@
-"""Views to score, what cameras saw by then, and the similarity of images."""
+"""Views to score, visibility by training cameras, and similarity of images."""
 
 import math
 from collections import Counter
@@ -19,7 +19,7 @@ from splatctrl_cli.records import Bool, Float32, Float64, Index, RecordSource, R
 class View:
     """A frame to score, its name, and the training frames known at its time.
 
-    The name is the camera and a number: among the camera's frames with a clock, among all views without, or the
+    The name is the camera and a number: within the camera's frames with a clock, among all views without, or the
     stamp.
     """
 
@@ -39,8 +39,8 @@ def views_to_score(
 ) -> Iterator[View]:
     """The frames of the `scoring` cameras in time order.
 
-    With a clock, each training camera's newest frame up to the view's stamp is known; without one, every training
-    frame, and the recording is read twice. corrected: a frame with the pose, exposure and depth of training.
+    With a clock, each training camera's newest frame up to the view's stamp is known; without, every training frame,
+    in two passes. corrected: a frame with training's pose, exposure and depth.
     """
     if not has_clock:
         known = tuple(corrected(frame) for frame in frames_of(source) if frame.camera in training)
@@ -86,7 +86,7 @@ def _moments(source: RecordSource) -> Iterator[list[RgbdFrame]]:
 def seen_by(points_world: NDArray[np.floating], frames: Iterable[RgbdFrame], tolerance: float = 0.02) -> Bool:
     """(Q,) True where a frame measured a surface at a point (Q, 3) [m].
 
-    Its nearest pixel's depth agrees within `tolerance` [m]: neither occluded nor in free space.
+    The nearest pixel's depth agrees within `tolerance` [m]: neither occluded nor in free space.
     """
     seen = np.zeros(len(points_world), dtype=np.bool_)
     for frame in frames:
@@ -120,7 +120,7 @@ def _agrees(points_world: NDArray[np.floating], frame: RgbdFrame, tolerance: flo
 
 
 def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tuple[Index, Float64, Float32]:
-    """Indices (K,) of points (Q, 3) on the image, their depth (K,) [m], and the measured one."""
+    """Indices (K,) of points (Q, 3) in the image, their depth (K,) [m], and the measured one."""
     points_camera = transform_points(invert_transform(frame.T_world_camera), points_world)
     landing = np.flatnonzero(points_camera[:, 2] > 1e-6)
     pixels = np.floor(project(frame.intrinsics, points_camera[landing]) + 0.5)
@@ -133,7 +133,7 @@ def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tupl
 
 @dataclass(frozen=True, kw_only=True)
 class DepthErrors:
-    """Absolute depth errors over `num_pixels` pixels with depth in both images; nan without any.
+    """Absolute depth errors where both images have depth; nan without any.
 
     median, mean, p90 [m]; within_1cm and within_2cm are shares.
     """
@@ -165,8 +165,8 @@ def ssim_map(
     """Structural similarity (H, W, 3) of images (H, W, 3) in [0, 1] (Wang et al. 2004).
 
     Gaussian window 11×11, sigma 1.5, C1 = 0.01², C2 = 0.03², population moments. The border is mirrored with its edge
-    pixel; or zero-padded, as in 3D Gaussian splatting (graphdeco-inria/gaussian-splatting, utils/loss_utils.py),
-    which hides errors there.
+    pixel. Zero-padding, as in 3D Gaussian splatting (graphdeco-inria/gaussian-splatting, utils/loss_utils.py), hides
+    errors there.
     """
     x, y = image.astype(np.float64), np.asarray(reference, dtype=np.float64)
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = (
@@ -180,11 +180,11 @@ def ssim_map(
 
 
 def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool, fill: float) -> float:
-    """SSIM of images (H, W, 3) in [0, 1], set to `fill` outside the mask, as NeRF's papers print it.
+    """SSIM of images (H, W, 3) in [0, 1], `fill` outside the mask, as in NeRF's papers.
 
     scikit-image's default (skimage/metrics/_structural_similarity.py before 0.20): box window of 7 pixels, sample
     moments, data range 2 for floats, 3 border pixels left out. That range lifts the figure: compare only within its
-    kind. nan below 7 pixels and for an empty mask.
+    kind. nan below 7 pixels, or for an empty mask.
     """
     if min(mask.shape) < SSIM_BOX or not mask.any():
         return math.nan

@@ -22,10 +22,9 @@ INK, PAPER = (34, 34, 34), (255, 255, 255)
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """Spheres (S, 3) and radii (S,) [m], world, and the worst of them, to draw.
+    """Spheres (S, 3), radii (S,) [m], world, and the worst of them, to draw.
 
-    obstacle (3,): the nearest surface point, NaN if unknown. caption: lines under the image. is_moving (S,): moved by
-    a joint.
+    obstacle (3,): nearest surface point, or NaN. caption: lines under the image. is_moving (S,): moved by a joint.
     """
 
     stamp_ns: int
@@ -46,14 +45,14 @@ class Sight:
 
     @property
     def age_s(self) -> float:
-        """Age [s] of the image at the moment."""
+        """Age [s] of the image."""
         return (self.moment.stamp_ns - self.frame.stamp_ns) * 1e-9
 
 
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
     """Indices of at most `num` states with least clearance (T,), ascending.
 
-    Each is the least within `APART` on either side, so that an event counts once. NaN does not count.
+    Each is the least within `APART`, so that an event counts once. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
     beside = np.concatenate([[np.inf], values, [np.inf]])
@@ -74,7 +73,7 @@ def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> 
 def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Sight | None]:
     """The newest image up to each moment, of the camera that sees its worst sphere best, or None.
 
-    One pass over the frames (by stamp), keeping one frame per camera.
+    One pass over frames (by stamp), one kept per camera.
     """
     found: list[Sight | None] = [None] * len(moments)
     waiting = sorted(range(len(moments)), key=lambda i: -moments[i].stamp_ns)
@@ -92,7 +91,7 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
 
 
 def draw_sight(path: Path, sight: Sight) -> None:
-    """Write the image with the spheres' silhouettes, the worst bold, a line to its obstacle, and the caption."""
+    """Write the image with silhouettes of spheres, the worst bold, a line to its obstacle, and the caption."""
     moment, frame = sight.moment, sight.frame
     zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
     image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
@@ -120,7 +119,7 @@ def _best(moment: Moment, newest: dict[str, RgbdFrame]) -> Sight | None:
 
 
 def _view(moment: Moment, frame: RgbdFrame) -> tuple[int, int, float]:
-    """Rank of an image: sphere and obstacle in view, not occluded, sphere size [px]."""
+    """Rank: sphere and obstacle in view, not occluded, size [px]."""
     R, t = frame.T_world_camera[:3, :3], frame.T_world_camera[:3, 3]
     sphere, obstacle = ((point - t) @ R for point in (moment.centers[moment.worst], moment.obstacle))
     radius = float(moment.radii[moment.worst])
@@ -133,7 +132,7 @@ def _view(moment: Moment, frame: RgbdFrame) -> tuple[int, int, float]:
 
 
 def _cell(point: Float64, intrinsics: Intrinsics) -> tuple[int, int] | None:
-    """Row and column of a point in camera coordinates; None outside the image."""
+    """Row and column of a point, camera frame; None outside."""
     if not np.isfinite(point).all() or point[2] <= NEAR:
         return None
     column, row = (round(float(v)) for v in _pixel(point, intrinsics, 1))
@@ -141,7 +140,7 @@ def _cell(point: Float64, intrinsics: Intrinsics) -> tuple[int, int] | None:
 
 
 def _pixel(point: Float64, intrinsics: Intrinsics, zoom: int) -> Float64:
-    """(2,) column and row of a point, in an image enlarged by `zoom`."""
+    """(2,) column and row of a point, enlarged by `zoom`."""
     plane = np.array([intrinsics.fx, intrinsics.fy]) * point[:2] / point[2] + [intrinsics.cx, intrinsics.cy]
     return np.asarray((plane + 0.5) * zoom - 0.5)
 
@@ -155,7 +154,6 @@ def _outline(
     color: tuple[int, int, int],
     thickness: int,
 ) -> None:
-    """Draw a sphere's silhouette: its projected tangent circle."""
     away = float(np.linalg.norm(center))
     if center[2] - radius <= NEAR:
         return
