@@ -1,4 +1,4 @@
-"""Agreement of the robot's motion with depth images, and corrections of clocks or joint order."""
+"""The robot's motion against depth images, and corrections of clocks or joint order."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,12 +20,12 @@ LATE = "synchronise the clocks, or shift the stamps: robot labels and replay com
 
 @dataclass(frozen=True, kw_only=True)
 class ArmAgreement:
-    """Measured minus rendered depth of the robot's surface, over its pixels in one camera's frames.
+    """Measured minus rendered depth on the robot's pixels, in one camera's frames.
 
-    median [m]: of those within `ARM_NEAR`, positive if measured behind the surface. misfit [m]: mean distance from it
-    (from 0 if negative, beyond `ARM_COVER` if more), each cut at `ARM_NEAR`. seen_through: share of pixels more than
-    `ARM_NEAR` behind. num_pixels: with depth; num_frames: with joint states. scale: measured over rendered depth, if
-    one factor fits most pixels.
+    median [m]: within `ARM_NEAR`, positive if measured behind the surface. misfit [m]: mean distance from it (from 0
+    if negative, from `ARM_COVER` if more), each cut at `ARM_NEAR`. seen_through: share more than `ARM_NEAR` behind.
+    num_pixels: with depth; num_frames: with joint states. scale: measured over rendered depth, if one factor fits
+    most pixels.
     """
 
     median: float
@@ -54,7 +54,7 @@ def reduced(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
 def arm_agreement(
     model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture, *, offset_s: float = 0.0
 ) -> ArmAgreement | None:
-    """Agreement of one camera's frames; None if too little of the arm is visible.
+    """One camera's agreement; None if too little of the arm shows.
 
     offset_s: the camera's clock minus the joints'.
     """
@@ -91,9 +91,9 @@ def arm_agreement(
 
 
 def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[float, float] | None:
-    """Clock offset [s] of a camera against the joint states that fits depth best, and its misfit [m].
+    """Best clock offset [s] of a camera against the joint states, and its misfit [m].
 
-    None if no offset fits much better than others, or the best is at the edge.
+    None if others fit about as well, or it lies at the edge.
     """
 
     def misfit(offset: float) -> float:
@@ -119,7 +119,7 @@ def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture)
 
 
 def swapped_joints(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[int, int] | None:
-    """Two joints whose exchange puts the arm where depth shows it, or None."""
+    """Two joints whose exchange fits depth, or None."""
     few = spread(frames, limits.SWAPPED_FRAMES)
     plain = arm_agreement(model, few, posture)
     best: tuple[float, tuple[int, int]] | None = None
@@ -145,7 +145,7 @@ def _exchanged(posture: Posture, i: int, j: int) -> Posture:
 
 
 def arm_finding(where: str, agreement: ArmAgreement, units: Iterable[float | None]) -> Finding:
-    """Finding of a camera that shows the arm in place, except perhaps for scale (units: `rescaled`)."""
+    """Finding of a camera that shows the arm in place, perhaps at another scale (units: `rescaled`)."""
     share = f"{100 * agreement.seen_through:.0f} % of {agreement.num_pixels} pixels"
     seen = f"in {agreement.num_frames} depth images {share} show what is behind it"
     if agreement.is_good and agreement.scale is None:
@@ -158,7 +158,7 @@ def arm_finding(where: str, agreement: ArmAgreement, units: Iterable[float | Non
 
 
 def misplaced_finding(bad: Mapping[str, ArmAgreement], cause: str) -> Finding:
-    """Finding of cameras that show the arm elsewhere; cause: the correction, if known."""
+    """Finding of cameras that show the arm elsewhere; cause: the correction, or ""."""
     where = f"camera{'s' if len(bad) > 1 else ''} {', '.join(bad)}"
     off = ", ".join(f"{1e3 * agreement.misfit:.0f}" for agreement in bad.values())
     through = ", ".join(f"{100 * agreement.seen_through:.0f}" for agreement in bad.values())
@@ -176,9 +176,9 @@ def motion_findings(
     model: RobotModel | None,
     units: Iterable[float | None] = (None,),
 ) -> list[Finding]:
-    """Findings on the joint states (in the model's order, if any) by the cameras.
+    """Findings on joint states (in the model's order, if any) by the cameras.
 
-    frames: reduced, a few per camera; motion: of each camera's first images; units: of depth, as for `rescaled`.
+    frames: reduced, a few per camera; motion: of each camera's first images; units: as for `rescaled`.
     """
     found: list[Finding] = []
     offsets: dict[str, float] = {}
@@ -199,7 +199,7 @@ def motion_findings(
 def _arm_findings(
     model: RobotModel, frames: Sequence[RgbdFrame], states: StateColumns, units: Iterable[float | None]
 ) -> tuple[dict[str, float], list[Finding]]:
-    """Clock offsets [s] of cameras that fit better with one, and findings on the arm."""
+    """Clock offsets [s] that improve cameras, and findings on the arm."""
     posture = states.postures(limits.ARM_CLOSE_NS)
     found: list[Finding] = []
     timings: dict[str, tuple[float, float]] = {}
@@ -227,10 +227,7 @@ def _arm_findings(
 def _own_offsets(
     timings: Mapping[str, tuple[float, float]], model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture
 ) -> dict[str, float]:
-    """Offsets of cameras that fit much better at their own than at the median.
-
-    Other differences have other causes, such as a misplaced camera.
-    """
+    """Offsets of cameras that fit much better at their own than the median; else a pose may be off."""
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
     kept = {}
     for camera, (offset_s, misfit) in timings.items():
@@ -251,7 +248,7 @@ def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> s
 
 
 def _timing_findings(offsets: Mapping[str, float]) -> list[Finding]:
-    """One finding for all cameras on one clock, and one for each other camera."""
+    """A finding for the common clock, and one per other camera."""
     middle = float(np.median(list(offsets.values())))
     apart = limits.TIME_OFFSET + limits.TIME_ERROR
     others = {c: offset for c, offset in offsets.items() if abs(offset - middle) > apart and len(offsets) > 2}
@@ -273,7 +270,7 @@ def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:
 
 
 def _clock_finding(where: str, text: str, offset_s: float, least_s: float) -> Finding:
-    """A warning for an offset [s] beyond `least_s`, else a note."""
+    """A warning beyond `least_s` [s], else a note."""
     is_off = abs(offset_s) > least_s
     make = warning if is_off else note
     remedy = LATE.format("late" if offset_s > 0 else "early") if is_off else ""

@@ -1,4 +1,4 @@
-"""Checks of images: encodings, sizes, amount and range of depth, and registration of depth to colour by edges."""
+"""Checks of images: encodings, sizes, depth, and registration of depth to colour by edges."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """Every `stride`-th pixel of an image: depth (h, w) [m] or colour (h, w, 3); full width, height [px]."""
+    """Every `stride`-th pixel: depth (h, w) [m] or colour (h, w, 3); full width, height [px]."""
 
     stamp_ns: int
     stride: int
@@ -38,9 +38,9 @@ class Thumbnail:
 
 
 class ImageWatch:
-    """Statistics of one topic's or camera's images, in bounded memory.
+    """Statistics of a topic's or camera's images, in bounded memory.
 
-    The first `limits.DECODED_IMAGES` images are decoded, then every second, fourth, ... (`is_wanted`).
+    The first `limits.DECODED_IMAGES` are decoded, then every second, fourth, ... (`is_wanted`).
     """
 
     def __init__(self, where: str, scale: float | None = None) -> None:
@@ -59,7 +59,7 @@ class ImageWatch:
         self._wanted: Thinned[None] = Thinned(limits.DECODED_IMAGES)
 
     def is_wanted(self) -> bool:
-        """True if the next image is to be decoded; call once per image."""
+        """True if the next image is to be decoded; call once each."""
         is_next = self._wanted.is_next()
         if is_next:
             self._wanted.add(None)
@@ -111,7 +111,7 @@ class ImageWatch:
             self.thumbnails.append(Thumbnail(stamp_ns=stamp_ns, depth=thumbnail))
 
     def rescale(self, scale: float) -> None:
-        """Set the scale [m per count] once the log names its unit."""
+        """Set the scale [m per count] of a log that names it."""
         factor = np.float32(scale / (self.unit or 1.0))
         self.scale = scale
         if factor != 1.0:
@@ -131,14 +131,14 @@ class ImageWatch:
         return self.scale if self.scale is not None else None if self.is_float else MILLIMETRE
 
     def add_undecoded(self, encoding: str, width: int, height: int) -> None:
-        """Count an image that is not read beyond its head."""
+        """Count an image without its pixels."""
         self.count += 1
         self.encodings[encoding] += 1
         self.sizes[width, height] += 1
 
 
 def _constant(depth: Float32) -> list[float]:
-    """The largest depth [m] if frequent and isolated, as a no-return code is."""
+    """The largest depth [m], if frequent and isolated like a no-return code."""
     values, counts = np.unique(depth, return_counts=True)
     if len(values) < 2 or counts[-1] < limits.CONSTANT_SHARE * depth.size:
         return []
@@ -184,7 +184,7 @@ def image_findings(images: ImageWatch) -> list[Finding]:
 
 
 def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
-    """A note if not every image was decoded."""
+    """A note on images not decoded."""
     few = [images for images in topics if images.num_decoded + images.num_bad < images.count and images.num_decoded]
     if not few:
         return []
@@ -251,7 +251,7 @@ def _scale(images: ImageWatch) -> list[Finding]:
 
 
 def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
-    """Findings on colour-depth registration of every camera with colour."""
+    """Findings on colour-depth registration, by camera."""
     edges = {
         camera: [_spectra(f) for f in its[:: max(1, len(its) // limits.EDGE_FRAMES)][: limits.EDGE_FRAMES]]
         for camera in sorted({frame.camera for frame in frames})
@@ -280,7 +280,7 @@ def _shifted(where: str, du: int, dv: int, width: int, peak: float) -> Finding:
 
 
 def _exchanged(camera: str, other: tuple[str, float, float], *, is_mutual: bool) -> Finding:
-    """An error only if both cameras fit foreign depth: an exchange has two sides."""
+    """An error only if mutual: an exchange has two sides."""
     name, own, peak = other
     text = f"its colour edges meet the depth edges of camera {name} (correlation {peak:.2f}), not its own ({own:.2f})"
     severity = error if is_mutual else warning
@@ -291,7 +291,7 @@ def _exchanged(camera: str, other: tuple[str, float, float], *, is_mutual: bool)
 def _other(
     camera: str, edges: dict[str, list[tuple[Float64, Float64]]], own: float
 ) -> tuple[str, float, float] | None:
-    """The camera whose depth clearly fits this one's colour, this one's own score, and the other's."""
+    """The camera whose depth clearly fits this one's colour, and both scores (own first)."""
     pairs = {name: list(zip(edges[camera], its, strict=False)) for name, its in edges.items() if name != camera}
     scores = {
         name: _at_zero(np.mean([_correlation(a[0], b[1]) for a, b in its], axis=0))
@@ -304,7 +304,7 @@ def _other(
 
 
 def _spectra(frame: RgbdFrame) -> tuple[Float64, Float64]:
-    """Spectra of colour and depth edges, each of mean 0 and length 1."""
+    """Spectra of colour and depth edges, of mean 0 and length 1."""
     gray = cv2.GaussianBlur(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
     slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
     slope = np.minimum(slope, np.percentile(slope, 95))
@@ -325,12 +325,12 @@ def _transformed(image: Float32) -> Float64:
 
 
 def _correlation(color: Float64, depth: Float64) -> Float64:
-    """(h, w) by shift of colour edges against depth edges, zero shift in the middle."""
+    """(h, w) by shift of colour against depth edges, zero in the middle."""
     return np.fft.fftshift(np.fft.irfft2(color * np.conj(depth)))
 
 
 def _peak(surface: Float64) -> tuple[int, int, float, float]:
-    """Rows and columns of the best shift, its correlation, and the best one apart from it."""
+    """Rows and columns of the best shift, its correlation, and the next best."""
     height, width = surface.shape
     rows, columns = height // limits.EDGE_SEARCHED, width // limits.EDGE_SEARCHED
     near = surface[

@@ -44,7 +44,7 @@ def check_log(
 ) -> CheckReport:
     """Check `log` in one pass and bounded memory; at most `num_images` per topic.
 
-    Raises InputError for options that do not fit the log.
+    Raises InputError for unfitting options.
     """
     options.refuse(("root", "holdout"), "a log", log.path)
     watch = LogWatch(log, options, num_images)
@@ -104,7 +104,7 @@ def check_log(
 
 
 def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    """The cameras that the options select. Raises InputError for unknown ones."""
+    """The selected cameras. Raises InputError for unknown ones."""
     cameras = camera_topics(log, found, options)
     names = tuple(camera.name for camera in cameras)
     if not names:
@@ -162,7 +162,7 @@ def _is_beside(watch: LogWatch, name: str, cameras: Sequence[CameraTopics]) -> b
 
 
 def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics], unlike: Collection[str]) -> list[Finding]:
-    """Findings on image topics; notes for those without a camera. unlike: topics with depth's encoding only."""
+    """Findings on image topics; notes if no camera uses them. unlike: topics with only depth's encoding."""
     findings = []
     for name, images in sorted(watch.images.items()):
         its = image_findings(images)

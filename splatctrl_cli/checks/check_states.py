@@ -1,4 +1,4 @@
-"""Checks of joint states: presence, finiteness, units, velocities, limits and end-effector poses."""
+"""Checks of joint states: values, units, velocities, limits and end-effector poses."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ PoseVerdict = Literal["agree", "tool", "base", "disagree", "still"]  # of logged
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """Median and largest difference of poses, in position [m] and rotation [rad]."""
+    """Median and largest pose difference, in position [m] and rotation [rad]."""
 
     median_position: float
     max_position: float
@@ -54,8 +54,8 @@ class Spread:
 class PoseAgreement:
     """Logged end-effector poses against forward kinematics.
 
-    difference: from `link`, the nearest; offset (4, 4): the constant transform that explains most of it, T_link_ee of
-    a tool or T_logged_base of a wrong base; rest: the remaining difference.
+    difference: from `link`, the nearest. offset (4, 4): the constant transform that explains most, T_link_ee of a
+    tool or T_logged_base of a wrong base. rest: what remains.
     """
 
     verdict: PoseVerdict
@@ -86,7 +86,7 @@ class PoseAgreement:
 
 
 def check_states(states: StateColumns, joints: Sequence[str]) -> None:
-    """Raise InputError without states, for decreasing stamps, too long a pause, or a position that is not finite."""
+    """Raise InputError for no states, decreasing stamps, too long a pause, or non-finite positions."""
     stamps = states.stamp_ns
     if not len(stamps):
         raise InputError("joint states: expected at least one, got none", remedy="check the log's /joint_states")
@@ -115,7 +115,7 @@ def check_states(states: StateColumns, joints: Sequence[str]) -> None:
 
 
 def check_angles(model: RobotModel, states: Sequence[JointState], name: str) -> None:
-    """Raise InputError for positions (model order) far beyond the limits that would fit as degrees."""
+    """Raise InputError for positions (model order) far beyond limits that fit as degrees."""
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     if not len(states) or not limited.any():
         return
@@ -151,10 +151,10 @@ def _unit_remedy(names: Sequence[str]) -> str:
 
 
 def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgreement | None:
-    """Agreement of logged poses in `states` (model order) with the robot's links; None without poses.
+    """Agreement of logged poses in `states` (model order) with the best link; None without poses.
 
-    Every link is tried. A difference that is constant in a link's frame is a tool, one constant in the world a wrong
-    base. Any other grows with motion: another robot.
+    A constant difference in a link's frame is a tool, in the world a wrong base. Any other grows with motion: another
+    robot.
     """
     posed = _posed(states)
     if not len(posed):
@@ -239,7 +239,7 @@ def _spread(poses: Float64, logged: Float64) -> Spread:
 
 
 def _angle(R: Float64) -> float:
-    """Angle [rad] of a rotation, exact near zero too."""
+    """Angle [rad] of a rotation, exact near zero."""
     axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     return float(np.arctan2(np.linalg.norm(axis), np.trace(R) - 1.0))
 
@@ -250,7 +250,7 @@ def _cost(spread: Spread) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotStates:
-    """Joint states, in the order of `model` if any, and findings on them.
+    """Joint states, in the model's order if any, and findings.
 
     Without states, `lack` says why. The model is as the states move it.
     """
@@ -288,7 +288,7 @@ def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) 
 
 
 def robot_states(model: RobotModel | None, names: Sequence[str], states: StateColumns) -> RobotStates:
-    """States of joints `names`, as from `log_states`."""
+    """States of joints `names`, like `log_states`."""
     if model is None:
         return RobotStates(model=None, states=states)
     model = model.moved_by(names)
@@ -304,7 +304,7 @@ def robot_states(model: RobotModel | None, names: Sequence[str], states: StateCo
 
 
 def stream_findings(where: str, stream: JointStream) -> list[Finding]:
-    """Findings on a topic's states that name the same joints, as recorded."""
+    """Findings on a topic's states of the same joints, as recorded."""
     found: list[Finding] = []
     position = stream.columns().get("position")
     if position is None:
@@ -347,7 +347,7 @@ def _velocities(where: str, stream: JointStream, is_moving: bool) -> list[Findin
 
 
 def robot_findings(model: RobotModel, states: Sequence[JointState], where: str) -> list[Finding]:
-    """Findings of states (model order) against limits, and of logged end-effector poses against FK."""
+    """Findings of states (model order) against limits, and of logged poses against FK."""
     try:
         check_angles(model, states, where)
     except InputError as wrong:

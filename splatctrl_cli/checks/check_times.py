@@ -1,4 +1,4 @@
-"""Timing of topics: rate, gaps, repeated or decreasing stamps, header stamps against log times."""
+"""Timing of topics: rate, gaps, repeated or decreasing stamps, clocks."""
 
 import heapq
 from collections.abc import Callable, Iterator, Mapping
@@ -19,14 +19,14 @@ T = TypeVar("T")
 
 
 class Thinned(Generic[T]):
-    """Every k-th of a series, at most `limit` values; k doubles to stay below it."""
+    """Every k-th of a series; k doubles beyond `limit` values."""
 
     def __init__(self, limit: int) -> None:
         self._limit, self._step, self._num = limit, 1, 0
         self._kept: list[T] = []
 
     def is_next(self) -> bool:
-        """True if the next value is kept; call once per value, before `add`."""
+        """True if the next value is kept; call once each, before `add`."""
         is_kept = self._num % self._step == 0
         self._num += 1
         return is_kept
@@ -50,7 +50,7 @@ class Thinned(Generic[T]):
 
 
 class TimesWatch:
-    """Timing of one topic in bounded memory, by header stamps if present, else log times."""
+    """Bounded timing of one topic, by header stamps, else log times."""
 
     def __init__(self, topic: str, *, has_stamps: bool) -> None:
         self.topic, self.has_stamps = topic, has_stamps
@@ -116,7 +116,7 @@ class TimesWatch:
         return float(np.median(self.delays[:, 1])) if len(self._delays) and not self.num_zero else None
 
     def gaps(self) -> list[tuple[float, int]]:
-        """Intervals [s] far above the median, each with the stamp before; none without a rate."""
+        """Intervals [s] far above the median, with the stamp before each; none without a rate."""
         median = self.median_interval
         if median is None or not self.is_regular:
             return []
@@ -165,7 +165,7 @@ def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
 
 
 def joined_gaps(findings: list[Finding]) -> list[Finding]:
-    """The findings, those of topics and transforms that pause together joined."""
+    """Findings, with common pauses of topics and transforms joined."""
     kept = [f for f in findings if f.code not in {"gap", "tf-gap"}]
     groups: list[list[Finding]] = []
     for finding in (f for f in findings if f.code in {"gap", "tf-gap"}):
@@ -218,7 +218,7 @@ def ending_findings(edges: list[TimesWatch], last_ns: int) -> list[Finding]:
 
 
 def part_findings(topics: list[TimesWatch]) -> list[Finding]:
-    """Topics that start long after the others, or end long before."""
+    """Topics that start long after others, or end long before."""
     several = [t for t in topics if t.count > 2 and t.median_interval is not None]
     found = []
     first, last = (min((t.first_ns for t in several), default=0), max((t.last_ns for t in several), default=0))
@@ -235,7 +235,7 @@ def part_findings(topics: list[TimesWatch]) -> list[Finding]:
 
 
 def peer_findings(topics: list[TimesWatch]) -> list[Finding]:
-    """Topics whose log delay differs from that of the other cameras' same topics."""
+    """Topics whose log delay differs from the other cameras'."""
     stamped = [t for t in topics if t.delay is not None and t.count > 1]
     if len(stamped) < 3:
         return []
@@ -255,7 +255,7 @@ def peer_findings(topics: list[TimesWatch]) -> list[Finding]:
 
 
 def clock_findings(topics: list[TimesWatch]) -> list[Finding]:
-    """Findings of header stamps against log times: another clock, offset, drift."""
+    """Header stamps against log times: another clock, offset, drift."""
     stamped = [t for t in topics if t.delay is not None and t.count > 1]
     if not stamped:
         return []
@@ -301,7 +301,7 @@ def _drift(times: TimesWatch) -> Finding | None:
 
 
 def _slope(at: Float64, delay: Float64) -> float:
-    """Median slope between the halves, robust to a few late messages."""
+    """Median slope between the halves, robust to late messages."""
     half = len(at) // 2
     rise = delay[-half:] - delay[:half]
     run = at[-half:] - at[:half]

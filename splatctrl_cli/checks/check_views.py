@@ -1,4 +1,4 @@
-"""Consistency of views of one scene: depth scales and camera moves that make them fit."""
+"""Consistency of views of one scene, and the depth scales and camera moves it needs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ FINE = np.linspace(0.92, 1.08, 17)
 
 @dataclass(frozen=True, kw_only=True)
 class _View:
-    """A reduced view: normals (h, w, 3), 0 if unknown, and some points (K, 3), camera frame."""
+    """A reduced view: normals (h, w, 3), 0 if unknown, and points (K, 3), camera frame."""
 
     frame: RgbdFrame
     surface: Float64
@@ -36,9 +36,7 @@ class _View:
 
 @dataclass(frozen=True, kw_only=True)
 class Move:
-    """Correction of a camera: T_camera_corrected, its length [m], angle [deg], and mean cut residual [m] before and
-    after.
-    """
+    """Correction T_camera_corrected, its length [m], angle [deg], and mean cut residual [m] before and after."""
 
     camera: str
     T_camera_corrected: Float64
@@ -57,9 +55,9 @@ def check_views(
 ) -> tuple[list[Finding], list[RgbdFrame], list[RgbdFrame]]:
     """Compare views from different places, of one moment or a static scene.
 
-    Returns the findings, the frames at the fitting scale, and those also at the fitting poses. used: metres per count
-    of each camera's depth, None for floats. is_sure: False if the unit is doubtful; then views must meet. only_errors
-    skips wrong poses, which are warnings.
+    Returns the findings, the frames at fitting scales, and those at fitting poses too. used: metres per count of
+    depth by camera, None for floats. is_sure: False if the unit is doubtful; views must then meet. only_errors skips
+    wrong poses.
     """
     views = [_view(frame) for frame in _chosen(frames)]
     pairs = _pairs(views)
@@ -82,7 +80,7 @@ def check_views(
 
 
 def are_far(frames: Sequence[RgbdFrame]) -> bool:
-    """True if cameras are so far apart, given their depth, that their positions may have another unit."""
+    """True if camera distances, against depth, suggest another unit."""
     medians = [float(np.median(seen)) for frame in frames if (seen := frame.depth[frame.depth > 0]).size]
     places = np.array([frame.T_world_camera[:3, 3] for frame in frames])
     return bool(medians) and float(np.linalg.norm(np.ptp(places, axis=0))) > limits.VIEWS_FAR * float(
@@ -91,9 +89,9 @@ def are_far(frames: Sequence[RgbdFrame]) -> bool:
 
 
 def wrong_scales(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> dict[str, float]:
-    """Depth factor by camera that fits the other views, empty if none is needed.
+    """Depth factor by camera that makes views fit, if any.
 
-    One factor for all cameras is tried first, then one for each alone.
+    A common factor is tried first, then one per camera.
     """
     cameras = sorted({view.frame.camera for view in views})
     together = _best_scale(views, pairs, cameras)
@@ -111,7 +109,7 @@ def wrong_scales(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> di
 
 
 def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> list[Move]:
-    """Cameras whose views fit the others much better after a small move, largest gain first."""
+    """Cameras that fit the others much better after a small move, largest gain first."""
     cameras = sorted({view.frame.camera for view in views})
     moves: list[Move] = []
     for _ in range(max(1, len(cameras) // 2)):
@@ -147,9 +145,9 @@ def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> lis
 def _overlap_findings(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], used: Mapping[str, float | None], *, is_sure: bool
 ) -> list[Finding]:
-    """Findings of unusual depths whose views would meet at a tenth or ten times the scale.
+    """Findings of unusual depths at which views would meet at a tenth or ten times.
 
-    If the unit is not sure, any other scale counts.
+    If the unit is not sure, any scale counts.
     """
     low, high = limits.TABLE_DEPTH[0], limits.VIEWS_UNUSUAL * limits.TABLE_DEPTH[1]
     depths = np.concatenate([view.points[:, 2] for view in views])
@@ -171,7 +169,7 @@ def _scaled(frames: Sequence[RgbdFrame], scales: Mapping[str, float]) -> list[Rg
 
 
 def rescaled(units: Iterable[float | None], factor: float) -> str:
-    """Remedy with the --depth-scale that makes depths `factor` times as large.
+    """Remedy: the --depth-scale for depths `factor` times as large.
 
     units: [m] per count, None for floats in metres.
     """
@@ -214,7 +212,7 @@ def _pose_finding(move: Move, cameras: Sequence[str]) -> Finding:
 
 
 def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """Equally many frames of each camera, spread over time."""
+    """Equally many frames per camera."""
     cameras = sorted({frame.camera for frame in frames})
     each = max(2, min(8, limits.VIEWS // max(len(cameras), 1)))
     of_cameras = [[frame for frame in frames if frame.camera == camera] for camera in cameras]
@@ -222,7 +220,6 @@ def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
 
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
-    """Ordered pairs of views from different places."""
     places = [view.frame.T_world_camera[:3, 3] for view in views]
     pairs = [
         (i, j)
@@ -252,26 +249,26 @@ def _view(frame: RgbdFrame) -> _View:
 
 
 def _landed(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Bool, Float64, Float64]:
-    """Points (K, 3) of view a in b's frame, hits on depth (K,), and b's surface and normals (K, 3)."""
+    """View a's points (K, 3) in b's frame, hits on depth (K,), b's surface and normals (K, 3)."""
     points = transform_points(_transform(a, b), a.points * scale_a)
     lands, surface, normals = landed(points, b)
     return points, lands, surface * scale_b, normals
 
 
 def _transform(a: _View, b: _View) -> Float64:
-    """T_b_a (4, 4), from camera a to camera b."""
+    """T_b_a (4, 4)."""
     return invert_transform(b.frame.T_world_camera) @ a.frame.T_world_camera
 
 
 def _distances(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Float64]:
-    """Distances [m] of view a's points from view b's surface planes, and their depth."""
+    """Distances [m] of view a's points from view b's planes, and depth."""
     points, lands, surface, normals = _landed(a, b, scale_a, scale_b)
     lands &= np.any(normals != 0, axis=1)
     return np.abs(np.einsum("ki,ki->k", points - surface, normals))[lands], points[lands, 2]
 
 
 def _best_scale(views: Sequence[_View], pairs: Sequence[tuple[int, int]], cameras: Sequence[str]) -> float | None:
-    """Factor on these cameras' depths with which far more points fit, or None."""
+    """Factor on these cameras' depths that fits far more points, or None."""
     medians = [float(np.median(v.points[:, 2])) for v in views if v.frame.camera in cameras and len(v.points)]
     if not medians:
         return None
@@ -302,7 +299,7 @@ def _best_scale(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera
 def _fitting(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], cameras: Sequence[str], scale: float, share: float = 1.0
 ) -> tuple[int, int]:
-    """Points within `share` of `VIEWS_FIT` at a scale of these cameras' depths, and all that land."""
+    """Points within `share` of `VIEWS_FIT` at a scale, and all that land."""
     num_fit = num = 0
     for i, j in pairs:
         a, b = views[i], views[j]
@@ -324,7 +321,7 @@ def _fitted(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: st
 def _descended(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str, widths: Sequence[float]
 ) -> Float64 | None:
-    """T_camera_corrected by Gauss-Newton on point-to-plane residuals, with Tukey's biweight per width."""
+    """T_camera_corrected by Gauss-Newton on point-to-plane residuals, with Tukey's biweight."""
     its = _with(views, pairs, camera)
     T = np.eye(4)
     for width in widths:
@@ -345,7 +342,7 @@ def _descended(
 
 
 def _rows(a: _View, b: _View, camera: str) -> tuple[Float64, Float64]:
-    """Derivatives (K, 6) by the camera's rotation and translation in its frame, and residuals (K,) [m]."""
+    """Derivatives (K, 6) by the camera's motion in its frame, and residuals (K,) [m]."""
     points, lands, surface, normals = _landed(a, b)
     lands &= np.any(normals != 0, axis=1) & (np.abs(points[:, 2] - surface[:, 2]) < 3 * limits.MOVE_WIDE[0])
     residual, derivatives = overlap_rows(a.points, _transform(a, b), lands, surface, normals)
@@ -354,7 +351,7 @@ def _rows(a: _View, b: _View, camera: str) -> tuple[Float64, Float64]:
 
 
 def _cost(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
-    """Mean distance from surfaces [m], cut at `limits.MOVE_CUT`, and the share of points that fit."""
+    """Mean distance [m], cut at `limits.MOVE_CUT`, and share of fitting points."""
     total = num = num_good = 0.0
     for i, j in pairs:
         off, depth = _distances(views[i], views[j])
@@ -365,7 +362,6 @@ def _cost(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> tuple[flo
 
 
 def _moved(views: Sequence[_View], camera: str, T: Float64) -> list[_View]:
-    """The views with T applied on the right of one camera's T_world_camera."""
     return [
         replace(view, frame=replace(view.frame, T_world_camera=view.frame.T_world_camera @ T))
         if view.frame.camera == camera

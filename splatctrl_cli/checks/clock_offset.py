@@ -1,6 +1,6 @@
-"""Offset between a robot's clock and its cameras', from the motion both record.
+"""Offset between a robot's clock and its cameras', by the motion both record.
 
-Image changes between frames are compared with the changes that a moving robot of spheres predicts.
+Image changes between frames are compared with those that a moving robot of spheres predicts.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ _NEAR = 0.05  # [m] in front of the camera
 
 @dataclass(kw_only=True)
 class CameraMotion:
-    """One camera's stamps (K + 1) [ns] and changes (K) of (h, w) float32 in [0, 1] between them."""
+    """A camera's stamps (K + 1) [ns], and changes (K) of (h, w) float32 in [0, 1] between."""
 
     intrinsics: Intrinsics
     T_world_camera: Float64
@@ -31,7 +31,7 @@ class CameraMotion:
 
 @dataclass(kw_only=True)
 class ImageMotion:
-    """Collector of the image changes of each camera."""
+    """Collected image changes by camera."""
 
     cameras: dict[str, CameraMotion] = field(default_factory=dict)
     _last: dict[str, tuple[Float32, UInt8]] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class ImageMotion:
 
 
 def _change(depth_a: Float32, gray_a: UInt8, depth_b: Float32, gray_b: UInt8) -> Float32:
-    """Change per pixel in [0, 1]: of depth if both frames have it, else of brightness."""
+    """Change per pixel in [0, 1]: of depth if in both frames, else of brightness."""
     both = (depth_a > 0) & (depth_b > 0)
     of_depth = np.minimum(np.abs(depth_b - depth_a) / limits.MOTION_DEPTH_STEP, 1.0)
     of_gray = np.minimum(np.abs(gray_b.astype(np.float32) - gray_a) / limits.MOTION_COLOR_STEP, 1.0)
@@ -67,9 +67,9 @@ def _change(depth_a: Float32, gray_a: UInt8, depth_b: Float32, gray_b: UInt8) ->
 
 
 def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) -> Float32:
-    """Depth (T, h, w) [m] of spheres, centres (T, S, 3) and radii (S,), seen by a camera; 0 = none.
+    """Depth (T, h, w) [m] of spheres (T, S, 3) with radii (S,) in a camera; 0 = none.
 
-    A sphere is drawn as a disc of its radius at its distance, exact on the optical axis.
+    A sphere is a disc of its radius at its distance, exact on the optical axis.
     """
     intrinsics = camera.intrinsics
     centers = transform_points(invert_transform(camera.T_world_camera), centers_world)
@@ -88,14 +88,14 @@ def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) ->
 
 
 def predicted_change(depth_a: Float32, depth_b: Float32) -> Float32:
-    """Change (K, h, w) in [0, 1] between silhouettes (K, h, w): 1 where only one shows the robot."""
+    """Change (K, h, w) in [0, 1] of silhouettes (K, h, w): 1 where only one shows the robot."""
     a, b = depth_a > 0, depth_b > 0
     of_depth = np.minimum(np.abs(depth_b - depth_a) / np.float32(limits.MOTION_DEPTH_STEP), np.float32(1.0))
     return np.where(a & b, of_depth, (a ^ b).astype(np.float32)).astype(np.float32)
 
 
 def correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Pearson correlation of all entries; 0 if one is constant. Not by dot products, which vary with threads."""
+    """Pearson correlation; 0 if constant. Dot products would vary with threads."""
     x, y = np.asarray(a, dtype=np.float64).ravel(), np.asarray(b, dtype=np.float64).ravel()
     x, y = x - x.mean(), y - y.mean()
     length = float(np.sqrt(np.sum(x * x)) * np.sqrt(np.sum(y * y)))
@@ -114,9 +114,9 @@ class RobotPoints:
 class ClockOffset:
     """The offset of two clocks, and its certainty.
 
-    offset_s: a frame's stamp minus that of the joint state at that instant [s], None if unknown (reason says why).
-    uncertainty_s: the larger of the cameras' disagreement and the method's known error. correlation, runner_up: at
-    the best and the next best peak.
+    offset_s: a frame's stamp minus the joint state's at that instant [s], None if unknown, for `reason`.
+    uncertainty_s: the larger of camera disagreement and the method's error. correlation, runner_up: at the best and
+    next peak.
     """
 
     offset_s: float | None
@@ -142,10 +142,9 @@ def estimate_clock_offset(
 ) -> ClockOffset:
     """The offset at which robot and image motion correlate best.
 
-    states: by stamp. With `robot` and stationary cameras, each pixel's change is compared with that of the spheres'
-    silhouette; else the change of whole images with the distance the joints move, which is coarser. The offset is the
-    parabolic peak of the mean over cameras. It is unknown without motion, at low correlation, with a rival peak, or
-    at the end of the search.
+    states: by stamp. With `robot` and stationary cameras, pixel changes are compared with the spheres' silhouette;
+    else, coarser, whole images with joint motion. The offset is the parabolic peak of the mean over cameras. It is
+    unknown without motion, at low correlation, with a rival peak, or at the end of the search.
     """
     cameras = [motion.cameras[name] for name in sorted(motion.cameras) if motion.cameras[name].changes]
     num = sum(len(camera.changes) for camera in cameras)
@@ -173,9 +172,9 @@ def estimate_clock_offset(
 
 
 def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
-    """Indices (K,) of those states, with ascending stamps (T,), that `estimate_clock_offset` needs.
+    """Indices (K,) of states, with ascending stamps (T,), that suffice for `estimate_clock_offset`.
 
-    It finds the same as from all; a long or dense log needs few.
+    A long or dense log needs few.
     """
     cameras = [camera for camera in motion.cameras.values() if camera.changes]
     if not cameras:
@@ -199,13 +198,13 @@ def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
 
 
 def _span(cameras: Sequence[CameraMotion]) -> tuple[int, int]:
-    """First and last stamp [ns] that an offset within `OFFSET_REACH` can bring to a frame."""
+    """First and last stamp [ns] within `OFFSET_REACH` of a frame."""
     reach = round(limits.OFFSET_REACH * 1e9)
     return min(c.stamps_ns[0] for c in cameras) - reach, max(c.stamps_ns[-1] for c in cameras) + reach
 
 
 def _offsets(span_s: float, cameras: Sequence[CameraMotion]) -> tuple[Float64, float]:
-    """Offsets [s] to try over states of `span_s`, none if too short, and their step."""
+    """Offsets [s] to try over `span_s`, none if too short, and their step."""
     step = min(float(np.median(np.diff(camera.stamps_ns))) * 1e-9 for camera in cameras) / limits.OFFSET_STEPS
     count = int(min(limits.OFFSET_REACH, limits.OFFSET_SHARE * span_s) / step) if step > 0 else 0
     if count < 2 * limits.OFFSET_STEPS:
@@ -220,7 +219,7 @@ def _since(camera: CameraMotion, start: int) -> Float64:
 def _near(
     states: Sequence[JointState], robot: RobotPoints | None, cameras: Sequence[CameraMotion]
 ) -> tuple[list[JointState], RobotPoints | None]:
-    """The states, and the robot's points, within `_span`."""
+    """States and robot points within `_span`."""
     first, last = _span(cameras)
     near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
     points = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
@@ -266,7 +265,7 @@ def _kept(is_inside: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> "np.ndarra
 
 
 def _at(seconds: Float64, curve: Float64, at: Float64) -> Float64:
-    """Rows (K, D) of a curve (T, D), interpolated at times (K,)."""
+    """Rows (K, D) of a curve (T, D) at times (K,), linear."""
     after = _after(seconds, at)
     before = after - 1
     share = np.clip((at - seconds[before]) / (seconds[after] - seconds[before]), 0.0, 1.0)[:, None]
@@ -274,7 +273,7 @@ def _at(seconds: Float64, curve: Float64, at: Float64) -> Float64:
 
 
 def _after(seconds: Float64, at: Float64) -> Index:
-    """Index (K,) of the state that ends each time's interval, or the nearest one."""
+    """State (K,) that ends each time's interval, or the nearest."""
     return np.clip(np.searchsorted(seconds, at), 1, len(seconds) - 1)
 
 
@@ -306,7 +305,7 @@ def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: floa
 
 
 def _vertex(offsets: Float64, score: Float64, best: int) -> float:
-    """Vertex of the parabola through the scores within half a frame interval of the best."""
+    """Vertex of a parabola through scores within half a frame interval of the best."""
     reach = min(max(limits.OFFSET_STEPS // 2, 2), best, len(score) - 1 - best)
     if reach == 0:
         return float(offsets[best])

@@ -1,4 +1,4 @@
-"""Results of `check`: the table of checks, findings, and obstacles to later commands."""
+"""Results of `check`: the table of checks, findings, obstacles to later commands."""
 
 import re
 from collections import Counter
@@ -25,7 +25,7 @@ ALL = ("ingest", *LATER)
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One kind of finding: meaning, severities, commands that its error blocks, and default remedy."""
+    """One kind of finding: meaning, severities, commands blocked by its error, default remedy."""
 
     code: str
     severities: tuple[Severity, ...]
@@ -153,9 +153,9 @@ CHECKS: Mapping[str, Check] = {check.code: check for check in _checks()}
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One finding: `code` names its entry in `CHECKS`, `where` the topic, camera or joint.
+    """One finding: `code` is its entry in `CHECKS`, `where` the topic, camera or joint.
 
-    value: the judged figure, in `unit`; stamp_ns: its first occurrence; None without one.
+    value: the figure, in `unit`; stamp_ns: first occurrence; or None.
     """
 
     severity: Severity
@@ -196,10 +196,9 @@ error, warning, note = (partial(_finding, severity) for severity in ORDER)
 
 @dataclass(frozen=True, kw_only=True)
 class Rate:
-    """A row of the table of rates.
+    """A row of the rates. is_read: by later commands; hz: median.
 
-    is_read: by later commands; hz: median; longest_s: interval between stamps; delay_s: median of log time minus
-    stamp.
+    longest_s: between stamps; delay_s: median log time minus stamp.
     """
 
     topic: str
@@ -222,7 +221,7 @@ class Need:
 class CheckReport:
     """A checked recording: findings, rates by topic, needs by command.
 
-    frames: reduced views, without colour, of every camera with poses.
+    frames: reduced views, without colour, of cameras with poses.
     """
 
     path: str
@@ -246,7 +245,7 @@ class CheckReport:
         return sorted(self.findings, key=lambda finding: ORDER.index(finding.severity))
 
     def lacks(self, need: Need) -> tuple[str, ...]:
-        """Obstacles to a command, including errors among the findings."""
+        """Obstacles to a command, with errors among findings."""
         return (*need.lacks, *(f"{f.where}: {f.what} [{f.code}]" for f in self.refusing(need)))
 
     def refusing(self, need: Need) -> list[Finding]:
@@ -260,7 +259,7 @@ class CheckReport:
         return {str(s): sum(f.severity is s for f in self.findings) for s in ORDER}
 
     def seconds(self, finding: Finding) -> float | None:
-        """Time of a finding's first occurrence, from the recording's start."""
+        """First occurrence, from the recording's start."""
         if finding.stamp_ns is None or self.start_ns is None:
             return None
         return round((finding.stamp_ns - self.start_ns) * 1e-9, 3)

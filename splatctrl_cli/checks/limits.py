@@ -1,6 +1,6 @@
 """Sample sizes and thresholds of `splatctrl check`.
 
-A unit stands in brackets before the meaning; without one, a number is a share, factor or count.
+A unit in brackets precedes the meaning; others are shares, factors or counts.
 """
 
 # Cameras: lenses, poses and pairs of images

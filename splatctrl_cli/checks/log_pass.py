@@ -1,4 +1,4 @@
-"""One pass over a log for `check`: messages observed while read, and a few frames per camera."""
+"""One pass over a log for `check`: observed messages, and a few frames per camera."""
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -37,9 +37,9 @@ _FIRST_FIELD = re.compile(r"^(?:std_msgs/(?:msg/)?)?Header\s+\w+")
 
 
 class LogWatch:
-    """A log that observes messages while another reads them, decoding images as needed.
+    """A log that observes messages read by another, decoding images as needed.
 
-    num_images: reading ends at this many images of a topic. files: first and last log time by file.
+    num_images: reading ends at this many of a topic. files: first and last log time.
     """
 
     def __init__(self, log: RawLog, options: SourceOptions, num_images: int | None = None) -> None:
@@ -143,7 +143,7 @@ class LogWatch:
 
 
 def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
-    """The camera as `ingest` builds it; None if it cannot (rig.missing says why)."""
+    """The camera as `ingest` builds it, or None (rig.missing says why)."""
     try:
         return build_cameras(log, found, replace(options, cameras=(topics.name,)))[0]
     except InputError:
@@ -158,9 +158,9 @@ def reduced_frames(
     options: SourceOptions,
     late_ns: Mapping[str, int],
 ) -> list[RgbdFrame]:
-    """Reduced frames of a camera over the log, with kept depth and known pose.
+    """Reduced frames of a camera, with kept depth and known pose.
 
-    color is black without one at depth's time. late_ns: by camera, the delay of frames' stamps against transforms.
+    color is black without one at depth's time. late_ns: delay of frames' stamps against transforms, by camera.
     """
     depths, colors = images.get(topics.depth), images.get(topics.color)
     kept_colors = {kept.stamp_ns: kept for kept in (colors.kept if colors is not None else ())}
@@ -177,7 +177,7 @@ def reduced_frames(
 
 
 def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Float64) -> RgbdFrame:
-    """Depth in the undistorted colour view, as from `ingest` but reduced."""
+    """Depth in the undistorted colour view, reduced."""
     assert kept.depth is not None
     depth: NDArray[Any] = kept.depth
     stride = kept.stride
@@ -228,7 +228,7 @@ def nearest(stamps: Sequence[int], stamp_ns: int) -> int | None:
 def image_motion(
     watch: LogWatch, cameras: Sequence[tuple[CameraTopics, Camera]], frames: Mapping[str, Sequence[RgbdFrame]]
 ) -> ImageMotion:
-    """The motion in each camera's first images. frames: from `reduced_frames`."""
+    """Motion in each camera's first images. frames: of `reduced_frames`."""
     motion = ImageMotion()
     for topics, camera in cameras:
         if frames[camera.name] and topics.color in watch.images:

@@ -1,4 +1,4 @@
-"""Two models of an active-stereo camera: measured depth from exact depth."""
+"""Two models of an active-stereo camera: measured from exact depth."""
 
 from dataclasses import dataclass
 
@@ -40,7 +40,7 @@ class StereoDepth:
     width: int | None = None
 
     def applied(self, depth: Float32, rng: np.random.Generator, *, focal: float = 0.0) -> Float32:
-        """Measured depth (H, W) [m] of exact `depth`, 0 = none; focal [px]: of the image (0: of the imagers)."""
+        """Measured depth (H, W) [m] of exact `depth`, 0 = none; focal [px]: the image's (0: the imagers')."""
         imager = FOCAL * (self.width or depth.shape[1]) / WIDTH
         scale = focal / imager if focal > 0 else 1.0  # pixels of the image in one of the imagers
         exact = np.where(depth > 0, imager * BASELINE / np.where(depth > 0, depth, 1.0), 0.0)
@@ -68,7 +68,7 @@ def _blurred(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> 
 def _is_hidden(depth: Float32, focal_baseline: float) -> Bool:
     """True where a pixel is occluded from the second imager, right of the first.
 
-    A pixel right of it is then shifted by disparity to the same place or farther left.
+    A pixel to its right is then shifted there, or farther left.
     """
     columns = np.arange(depth.shape[1])
     shifted = np.where(depth > 0, columns - focal_baseline / np.where(depth > 0, depth, 1.0), np.inf)
@@ -88,12 +88,12 @@ def _fattened(disparity: Float64, reach: np.ndarray) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthNoise:
-    """Error model of a depth camera, like a D435 with depth registered to colour.
+    """Errors of a depth camera, like a D435 with depth registered to colour.
 
-    spread [m]: sigma at 1 m, growing with depth squared (disparity error); step [m]: quantisation at 1 m, from fixed
-    disparity steps; patch [px]: matching window, over which errors agree; dropout: share of pixels lost at random, in
-    patch-sized blobs; edge [m]: depth step that loses both neighbours; max_range [m]: farther is lost; baseline [m]:
-    of the imagers, to lose what the second does not see (0: off).
+    spread [m]: sigma at 1 m, growing with depth squared (disparity error). step [m]: quantisation at 1 m (disparity
+    steps). patch [px]: matching window, over which errors agree. dropout: share of pixels lost, in patch-sized blobs.
+    edge [m]: depth step that loses both neighbours. max_range [m]: farther is lost. baseline [m]: of the imagers, to
+    lose what the second does not see (0: off).
     """
 
     spread: float = 0.0012
@@ -105,7 +105,7 @@ class DepthNoise:
     baseline: float = 0.0
 
     def applied(self, depth: Float32, rng: np.random.Generator, *, focal: float = 0.0) -> Float32:
-        """Noisy depth (H, W) [m] of exact `depth`, 0 = none; focal [px]: needed with a baseline."""
+        """Noisy depth (H, W) [m] of exact `depth`, 0 = none; focal [px]: for a baseline."""
         coarse = (depth.shape[0] // self.patch + 3, depth.shape[1] // self.patch + 3)
         error = _enlarged(rng.standard_normal(coarse), self.patch, depth.shape)
         lost = _enlarged(rng.standard_normal(coarse), self.patch, depth.shape)
@@ -119,7 +119,7 @@ class DepthNoise:
 
 
 def _enlarged(coarse: np.ndarray, factor: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Smooth unit-variance noise (H, W): coarse noise, blended bilinearly."""
+    """Unit-variance noise (H, W), blended bilinearly from coarse noise."""
     v, u = np.arange(shape[0]) / factor, np.arange(shape[1]) / factor
     i, j = v.astype(int), u.astype(int)
     a, b = (v - i)[:, None], (u - j)[None]
@@ -130,7 +130,7 @@ def _enlarged(coarse: np.ndarray, factor: int, shape: tuple[int, ...]) -> np.nda
 
 
 def _is_at_edge(depth: Float32, step: float) -> Bool:
-    """True at both pixels of neighbours whose depths differ by more than `step`."""
+    """True at both neighbours whose depths differ by over `step`."""
     across, down = (np.abs(np.diff(depth, axis=axis)) > step for axis in (1, 0))
     sides = [np.pad(across, ((0, 0), pad)) for pad in ((1, 0), (0, 1))]
     sides += [np.pad(down, (pad, (0, 0))) for pad in ((1, 0), (0, 1))]

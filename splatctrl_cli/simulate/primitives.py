@@ -1,7 +1,7 @@
-"""Textured boxes, cylinders, capsules and spheres: exact signed distance, surface points, ray hits, normals.
+"""Textured boxes, cylinders, capsules and spheres: exact distance, surface points, ray hits, normals.
 
-A primitive's frame has its origin in its middle; cylinders and capsules stand along z. R rays, Q points. Textures are
-solid, with features of a few centimetres, smooth enough for a few thousand splats.
+Frames have their origin in the middle; cylinders and capsules stand along z. R rays, Q points. Solid textures have
+features of a few centimetres, smooth enough for a few thousand splats.
 """
 
 from collections.abc import Sequence
@@ -19,10 +19,9 @@ ALWAYS = (-(2**62), 2**62)  # [ns] a span of time that holds every stamp
 
 @dataclass(frozen=True, kw_only=True)
 class Texture:
-    """A pattern between two colours in the solid's frame.
+    """A pattern of two colours, RGB in [0, 1], in the solid's frame.
 
-    pattern: `noise`, `stripes` or `checks`; feature [m]: noise cell, or width of a stripe or check; dark, bright: RGB
-    in [0, 1].
+    pattern: `noise`, `stripes` or `checks`; feature [m]: noise cell, or width of a stripe or check.
     """
 
     pattern: str
@@ -48,12 +47,12 @@ class Texture:
 
 
 def luminance_std(color: np.ndarray) -> float:
-    """Standard deviation of the luminance (0 to 1) of an 8-bit RGB image (H, W, 3)."""
+    """Standard deviation of luminance (0 to 1) of 8-bit RGB (H, W, 3)."""
     return float(np.std(color.astype(np.float64) @ LUMINANCE / 255))
 
 
 def _value_noise(p: Float64, seed: int) -> Float64:
-    """Smooth noise (R,) in [0, 1]: random lattice values, blended by smoothstep."""
+    """Smooth noise (R,) in [0, 1]: lattice values, blended by smoothstep."""
     cell = np.floor(p)
     t = p - cell
     t = t * t * (3 - 2 * t)
@@ -81,9 +80,9 @@ def _hash(lattice: np.ndarray, seed: int) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class Track:
-    """Poses (K, 4, 4) of a moving solid at increasing stamps (K,) int64 [ns]; at rest outside.
+    """Poses (K, 4, 4) of a solid at increasing stamps (K,) int64 [ns]; at rest outside.
 
-    Between stamps, the origin moves linearly and the solid rotates about one axis, both uniformly.
+    In between, the origin moves linearly and the solid rotates about one axis, uniformly.
     """
 
     stamp_ns: Stamps
@@ -109,10 +108,9 @@ class Track:
 
 @dataclass(frozen=True, kw_only=True)
 class Primitive:
-    """One solid: `box` (full x, y, z), `cylinder` (radius, height), `sphere` (radius) or `capsule` (radius, axis
-    length) [m].
+    """A `box` (full x, y, z), `cylinder` (radius, height), `sphere` (radius) or `capsule` (radius, axis length) [m].
 
-    T_world_shape (4, 4): its pose, the first if it moves (see `at`). It is present while from_ns <= stamp < to_ns.
+    T_world_shape (4, 4): its pose, the first if it moves. It is present while from_ns <= stamp < to_ns.
     """
 
     name: str
@@ -158,7 +156,7 @@ def box(name: str, size: tuple[float, ...], middle: Sequence[float], texture: Te
 
 
 def closest_point(primitive: Primitive, points_world: Float64) -> tuple[Float64, Float64]:
-    """Signed distance (Q,) [m], negative inside, and nearest surface point (Q, 3) of points (Q, 3), world."""
+    """Signed distance (Q,) [m], negative inside, and surface point (Q, 3) of points (Q, 3), world."""
     p = transform_points(invert_transform(primitive.T_world_shape), points_world)
     if primitive.kind == "sphere":
         surface = p / np.maximum(np.linalg.norm(p, axis=1, keepdims=True), 1e-300) * primitive.size[0]
@@ -208,7 +206,7 @@ def _capsule_closest(p: Float64, radius: float, half: float) -> tuple[Float64, F
 
 
 def hit(primitive: Primitive, origin_world: Float64, directions_world: Float64) -> Float64:
-    """Ray parameter t (R,) of the first hit of origin + t * directions (R, 3), inf for none."""
+    """Parameter t (R,) of the first hit of origin + t * directions (R, 3), or inf."""
     T_shape_world = invert_transform(primitive.T_world_shape)
     origin = T_shape_world[:3, :3] @ origin_world + T_shape_world[:3, 3]
     directions = directions_world @ T_shape_world[:3, :3].T
@@ -225,7 +223,7 @@ def hit(primitive: Primitive, origin_world: Float64, directions_world: Float64) 
 
 
 def normals(primitive: Primitive, points_shape: Float64) -> Float64:
-    """Outward unit normals (R, 3) at surface points (R, 3), both in the primitive's frame."""
+    """Outward unit normals (R, 3) at surface points (R, 3), own frame."""
     if primitive.kind == "sphere":
         return points_shape / primitive.size[0]
     if primitive.kind == "capsule":
@@ -252,7 +250,7 @@ def _cylinder_span(origin: Float64, directions: Float64, radius: float, half: fl
 
 
 def _capsule_span(origin: Float64, directions: Float64, radius: float, half: float) -> tuple[Float64, Float64]:
-    """Interval of t inside a capsule: the hull of its cylinder's and balls', as it is convex."""
+    """Interval of t inside a capsule: hull of its cylinder's and balls', by convexity."""
     end = np.array([0.0, 0.0, half])
     spans = [
         _cylinder_span(origin, directions, radius, half),
@@ -264,7 +262,7 @@ def _capsule_span(origin: Float64, directions: Float64, radius: float, half: flo
 
 
 def _round_span(origin: Float64, directions: Float64, radius: float) -> tuple[Float64, Float64]:
-    """Interval of t inside a circle or ball about 0 (rays 2-D or 3-D); NaN for misses."""
+    """Interval of t inside a circle or ball about 0; NaN for misses."""
     a = np.sum(directions**2, axis=1)
     b = directions @ origin
     root = np.sqrt(b**2 - a * (origin @ origin - radius**2))
@@ -274,7 +272,7 @@ def _round_span(origin: Float64, directions: Float64, radius: float) -> tuple[Fl
 
 
 def _slab_span(origin: Float64, directions: Float64, half: Float64) -> tuple[Float64, Float64]:
-    """Interval of t between the faces at -half and half of every axis."""
+    """Interval of t between -half and half of every axis."""
     near, far = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)
     for axis, size in enumerate(half):
         a, b = (-size - origin[axis]) / directions[:, axis], (size - origin[axis]) / directions[:, axis]

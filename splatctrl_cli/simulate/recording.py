@@ -1,4 +1,4 @@
-"""A simulated recording: a log's records in time order, and the truth."""
+"""A simulated recording: records in time order, and the truth."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -34,10 +34,10 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions:
-    """Options of a recording: duration [s], frames per second per camera, image size [px], depth noise, seed.
+    """Duration [s], frames per second per camera, image size [px], depth noise and seed.
 
-    with_person: a walking person with masks, instead of the standing cylinder. is_free: floor and walls alone.
-    visitor: x, y and radius [m] of the cylinder. color_rays: 0 to 4 rays per pixel's colour, besides depth's.
+    with_person: a walking person with masks, instead of the cylinder. is_free: floor and walls alone. visitor: x, y
+    and radius [m] of the cylinder. color_rays: 0 to 4 per pixel, besides depth's.
     """
 
     duration_s: float = 7.0
@@ -74,9 +74,9 @@ class RecordingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Solids (`primitives`, the last of them `temporary`), an arm's motion, and other cameras than the table's.
+    """Solids (`primitives`, ending with the `temporary`), an arm's motion, and cameras, else the table's.
 
-    has_people: images have masks of temporary solids.
+    has_people: images mask temporary solids.
     """
 
     primitives: tuple[Primitive, ...]
@@ -103,10 +103,9 @@ class Scene:
 
 
 class Recording:
-    """A recorded scene; equal options and scene give equal records.
+    """A recorded scene, reproducible by options and scene.
 
-    Images show the robot's visual geometry, if any. The arm respects its velocity limits: if time is short, the
-    recording ends on the way.
+    Images show the robot's visual geometry, if any. The arm respects velocity limits, even if time ends on the way.
     """
 
     def __init__(
@@ -116,7 +115,7 @@ class Recording:
         scene: Scene | None = None,
         unmodelled: tuple[str, ...] = (),
     ) -> None:
-        """scene: replaces that of the options; unmodelled: names of `UNMODELLED` parts on the arm."""
+        """scene: instead of the options'; unmodelled: `UNMODELLED` parts on the arm."""
         self.options, self.robot, self.unmodelled = options, robot, unmodelled
         parts = [(UNMODELLED[name][0], capsule) for name in unmodelled for capsule in UNMODELLED[name][1]]
         self._body = robot if not parts else _with_parts(robot, parts)
@@ -143,7 +142,7 @@ class Recording:
             yield from self.frames_at(index, self._motion.at(self._offset_ns(index) / 1e9)[0])
 
     def frames_at(self, index: int, q: Float64, cameras: Collection[str] | None = None) -> Iterator[RgbdFrame]:
-        """Images of some cameras (None: all) at frame `index`, with the arm at q (J,)."""
+        """Images of some cameras (None: all) at frame `index`, at q (J,)."""
         stamp_ns = self.start_ns + self._offset_ns(index)
         poses = self.link_poses(q)
         arm = tabletop.arm_solids(self._shapes, poses)
@@ -169,11 +168,11 @@ class Recording:
             )
 
     def records(self) -> Iterator[Record]:
-        """Joint states and images by stamp; joint states come first."""
+        """Joint states and images by stamp, states first."""
         return by_stamp(self.joint_states(), self.frames())
 
     def link_poses(self, q: Float64) -> dict[str, Float64]:
-        """T_world_link (4, 4) by link at joint positions q (J,)."""
+        """T_world_link (4, 4) by link at q (J,)."""
         return {link: self.robot.frame_pose(q, link) for link in self.robot.urdf.links}
 
     def static_transforms(self) -> list[Transform]:
@@ -186,7 +185,7 @@ class Recording:
         return transforms
 
     def link_transforms(self, q: Float64) -> list[Transform]:
-        """Parent link -> link, of all but the root, at joint positions q (J,)."""
+        """Parent link -> link, except the root, at q (J,)."""
         poses = self.link_poses(q)
         return [
             (parent, child, invert_transform(poses[parent]) @ poses[child])
@@ -194,10 +193,9 @@ class Recording:
         ]
 
     def clearances(self) -> tuple[np.ndarray, Float64]:
-        """Stamps (T,) int64 [ns] of the joint states, and the arm's true clearance (T,) [m].
+        """Stamps (T,) int64 [ns] of joint states, and the arm's true clearance (T,) [m].
 
-        The least exact distance of a moving collision sphere to the scene, minus its radius; of unmodelled parts to 1
-        mm.
+        Least exact distance of moving collision spheres to the scene; unmodelled parts to 1 mm.
         """
         states = list(self.joint_states())
         moving, spheres = self._body.moving_spheres, self._body.sphere_set
@@ -211,7 +209,6 @@ class Recording:
         return np.array([state.stamp_ns for state in states], dtype=np.int64), np.array(clearance)
 
     def _offset_ns(self, index: int) -> int:
-        """Time of frame `index` from the start [ns]."""
         return round(index * 1e9 / self.options.fps)
 
     @cached_property
@@ -235,5 +232,5 @@ def _with_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> Robo
 
 
 def _shown(depth: Float32, without: Float32) -> UInt8:
-    """(H, W) 1 where `depth` [m] shows an object absent in `without`, else 0."""
+    """(H, W) 1 where `depth` [m] shows an object that `without` does not, else 0."""
     return np.asarray((depth > 0) & ((without == 0) | (depth < without)), np.uint8)

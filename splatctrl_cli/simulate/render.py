@@ -20,7 +20,7 @@ FACES_AT_ONCE = 32_000  # of meshes: their numbers are 16 bits wide
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A fixed camera: T_world_camera (4, 4) of its optical frame; is_training False for scoring only."""
+    """A fixed camera: T_world_camera (4, 4), optical frame; is_training False for scoring only."""
 
     name: str
     intrinsics: Intrinsics
@@ -30,9 +30,9 @@ class Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class Meshes:
-    """Triangles (F, 3, 3) [m], counter-clockwise from outside, in link frames; T_world_link (L, 4, 4).
+    """Triangles (F, 3, 3) [m], counter-clockwise from outside, in link frames.
 
-    owners (F,): index into `links`, as are textures.
+    owners (F,): index into `links`; textures: by link; T_world_link (L, 4, 4).
     """
 
     links: tuple[str, ...]
@@ -49,8 +49,8 @@ class Meshes:
 class Renderer:
     """Renderer of one camera; static solids are cast once.
 
-    Rays are scaled to 1 m along the optical axis, so that their parameter is depth. `color_rays` rays give a pixel's
-    colour; with 0, depth's ray does.
+    Rays have unit length along the optical axis, so that t is depth [m]. `color_rays` rays give a pixel's colour;
+    with 0, depth's ray does.
     """
 
     def __init__(self, camera: Camera, static: Sequence[Primitive], *, color_rays: int = 4) -> None:
@@ -78,7 +78,7 @@ class Renderer:
         return np.rint(mean * 255).astype(np.uint8), at_center.astype(np.float32)
 
     def depth(self, moving: Sequence[Primitive], meshes: Meshes | None = None) -> Float32:
-        """The same depth alone, without work for colours."""
+        """The same depth, without colours."""
         depth = self._depth[:1].copy()
         self._nearest(moving, depth)
         for _ in self._nearest_faces(meshes, depth):
@@ -96,7 +96,7 @@ class Renderer:
                 color[mine] = shaded(primitive, points_world)
 
     def _nearest(self, primitives: Sequence[Primitive], depth: Float64) -> NDArray[np.int64]:
-        """Lower `depth` (K, H, W) of the first K rays per pixel; index of the nearest primitive, -1 for none."""
+        """Lower `depth` (K, H, W) of K rays per pixel; index of the nearest primitive, or -1."""
         origin = self.camera.T_world_camera[:3, 3]
         owner = np.full(depth.shape, -1)
         for index, primitive in enumerate(primitives):
@@ -111,7 +111,7 @@ class Renderer:
     def _nearest_faces(
         self, meshes: Meshes | None, depth: Float64
     ) -> Iterator[tuple[int, Bool, NDArray[np.integer]]]:
-        """Lower `depth` (K, H, W); per ray, the pixels (H, W) where a triangle is nearest, and its number."""
+        """Lower `depth` (K, H, W); per ray, pixels (H, W) where a triangle is nearest, and its number."""
         if meshes is None:
             return
         k = self.camera.intrinsics
@@ -136,7 +136,7 @@ class Renderer:
     def _shaded_faces(
         self, meshes: Meshes | None, depth: Float64, directions: Float64, faces: NDArray[np.integer]
     ) -> Float64:
-        """RGB (R, 3) of points at depths (R,) along directions (R, 3) on triangles (R,)."""
+        """RGB (R, 3) at depths (R,) along directions (R, 3), on triangles (R,)."""
         assert meshes is not None
         points_world = self.camera.T_world_camera[:3, 3] + depth[:, None] * directions
         a, b, c = np.moveaxis(meshes.triangles[faces], 1, 0)
@@ -176,7 +176,7 @@ def shaded(primitive: Primitive, points_world: Float64) -> Float64:
 
 
 def lit(texture: Texture, points_shape: Float64, normals_shape: Float64, T_shape_world: Float64) -> Float64:
-    """RGB (R, 3) in [0, 1]: a texture under a distant light, independent of the viewer."""
+    """RGB (R, 3) in [0, 1]: a texture under a distant light, for any viewer."""
     facing = normals_shape @ (T_shape_world[:3, :3] @ LIGHT)
     light = AMBIENT + (1 - AMBIENT) * np.maximum(facing, 0)
     return np.asarray(texture.color(points_shape) * light[:, None])

@@ -1,7 +1,7 @@
-"""The scene: a textured table with objects, an arm behind them, fixed cameras around.
+"""The scene: objects on a textured table, an arm behind, fixed cameras around.
 
-World frame: z up, the table's top at z = 0, the arm's base at the origin, x forward. Turntable views of the objects
-resemble a DTU scan.
+World frame: z up, the table's top at z = 0, the arm's base at the origin, x forward. Turntable views resemble a DTU
+scan.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,7 +43,7 @@ MIDDLE = (0.60, 0.02, 0.06)  # [m] the middle of the things
 
 
 def furniture() -> list[Primitive]:
-    """Table, floor and three walls: the room, obstacles like any other."""
+    """Table, floor and walls, obstacles like any other."""
     return [
         box("table", (1.70, 1.80, 0.05), (0.30, 0.0, -0.025), texture("noise", 0.10, "wood", 1)),
         box("floor", (4.0, 4.0, 0.05), (0.4, 0.0, -0.725), texture("noise", 0.15, "slate", 2)),
@@ -78,7 +78,7 @@ def visitor(from_ns: int, to_ns: int, place: Sequence[float] = VISITOR) -> Primi
 
 
 def person(from_ns: int, to_ns: int, num_steps: int) -> list[Primitive]:
-    """The person who walks along the table's near side, one solid per step."""
+    """The person along the table's near side, one solid per step."""
     stamps = [from_ns + (to_ns - from_ns) * step // num_steps for step in range(num_steps + 1)]
     grape = texture("noise", 0.05, "grape", 2)
     places = [(0.75 - 0.40 * step / max(num_steps - 1, 1), -0.50, 0.20) for step in range(num_steps)]
@@ -89,7 +89,7 @@ def person(from_ns: int, to_ns: int, num_steps: int) -> list[Primitive]:
 
 
 def cameras(width: int, height: int) -> tuple[Camera, ...]:
-    """Three training cameras, and a scoring one between the first two; focal length 0.92 image widths."""
+    """Three training cameras, and a scoring one between the first two; focal length 0.92 widths."""
     scale = width / 320
     intrinsics = Intrinsics(
         fx=295.0 * scale,
@@ -118,7 +118,7 @@ def arm_motion(duration_s: float) -> Motion:
 
 
 def arm_solids(shapes: Sequence[Shape], T_world_links: dict[str, Float64]) -> list[Primitive]:
-    """The arm's shapes as solids at one configuration; patterns are fixed to links."""
+    """The arm's shapes at one configuration; patterns are fixed to links."""
     return [
         Primitive(
             name=f"{shape.link}.{index}",
@@ -149,7 +149,7 @@ def texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:
 
 
 def turntable_views() -> Iterator[RgbdFrame]:
-    """Exact views of the objects from a 70-degree arc at two heights; the stamp is the number."""
+    """Exact views from a 70-degree arc at two heights; the stamp is the number."""
     width, height = 256, 208  # [px]
     intrinsics = Intrinsics(
         fx=1.15 * width,
@@ -179,7 +179,7 @@ def turntable_views() -> Iterator[RgbdFrame]:
 
 
 def object_mask(frame: RgbdFrame) -> Bool:
-    """(H, W) True where a view shows an object, not the furniture."""
+    """(H, W) True where a view shows an object."""
     camera = Camera(
         name=frame.camera, intrinsics=frame.intrinsics, T_world_camera=frame.T_world_camera, is_training=True
     )

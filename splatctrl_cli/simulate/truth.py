@@ -1,4 +1,4 @@
-"""The truth of a simulated log: solids over time, and the exact distance to them."""
+"""The truth of a simulated log: solids over time, and exact distance."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -20,10 +20,10 @@ NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """Obstacles over time, cameras and robot of a simulated log; world frame, metres, nanoseconds.
+    """Obstacles over time, cameras and robot of a simulated log; world frame, m, ns.
 
-    stamps (T,) int64 [ns] of the joint states; clearance (T,) [m] of the arm's moving collision spheres and
-    `unmodelled` parts; luminance_std: by camera, the least standard deviation of luminance (0 to 1) over its images.
+    clearance (T,) [m]: of moving collision spheres and `unmodelled` parts, at stamps (T,) int64 [ns] of joint states.
+    luminance_std: by camera, the least standard deviation of luminance (0 to 1).
     """
 
     path: Path
@@ -39,21 +39,21 @@ class Truth:
     unmodelled: tuple[str, ...] = ()
 
     def distance(self, points_world: Float64, stamp_ns: int) -> Float64:
-        """Signed distance (Q,) [m] of points (Q, 3) to all but the robot at `stamp_ns`."""
+        """Signed distance (Q,) [m] of points (Q, 3) to all but the robot."""
         return distance_to(self.primitives, points_world, stamp_ns)
 
     def closest(self, points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
-        """Signed distance (Q,) [m] and the surface point (Q, 3) that gives it."""
+        """Signed distance (Q,) [m], and its surface point (Q, 3)."""
         return closest_of(self.primitives, points_world, stamp_ns)
 
 
 def distance_to(primitives: Sequence[Primitive], points_world: Float64, stamp_ns: int) -> Float64:
-    """Signed distance (Q,) [m] of points (Q, 3) to the present solids' union; exact outside."""
+    """Signed distance (Q,) [m] of points (Q, 3) to the present solids; exact outside."""
     return closest_of(primitives, points_world, stamp_ns)[0]
 
 
 def closest_of(primitives: Sequence[Primitive], points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
-    """Signed distance (Q,) [m] and surface point (Q, 3) of the nearest present primitive (inf, NaN for none)."""
+    """Signed distance (Q,) [m] and surface point (Q, 3) of the nearest solid (inf, NaN for none)."""
     points = np.asarray(points_world, dtype=np.float64)
     distance = np.full(len(points), np.inf)
     surface = np.full((len(points), 3), np.nan)
@@ -101,7 +101,7 @@ def truth_document(truth: Truth) -> dict[str, Any]:
 
 
 def load_truth(path: Path) -> Truth:
-    """Read a truth file. Raises InputError if missing, another file, or incomplete."""
+    """Read a truth file. Raises InputError for another or damaged one."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
