@@ -139,7 +139,6 @@ _LOST = {
 
 
 class _CameraWatch:
-
     def __init__(self, lens: Intrinsics, where: str, unit: float | None) -> None:
         self.lens = lens
         self.images, self.colors = ImageWatch(where, unit), ImageWatch(where)
@@ -178,7 +177,6 @@ class _CameraWatch:
 
 
 class _SourceWatch:
-
     def __init__(self, num_joints: int) -> None:
         self.cameras: dict[str, _CameraWatch] = {}
         self.states = StateCollector(num_joints)

@@ -1,7 +1,7 @@
 """Fixed numbers of the method, deliberately no settings.
 
-Each was measured, or follows from the method or a comparison; another would make runs incomparable. A unit stands in
-brackets before the meaning; without one, a number is a share, factor or count.
+Each was measured, or follows from the method or a comparison; another would make runs incomparable. A unit in
+brackets precedes the meaning; others are shares, factors or counts.
 """
 
 # Reading a recording: poses, joint states and clocks

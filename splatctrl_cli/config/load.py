@@ -90,8 +90,8 @@ def check_voxel(scene: SceneConfig, occupancy: OccupancyConfig) -> None:
 def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
     """Defaults, then a preset (``preset=NAME`` assigned), the TOML file, each ``section.key=value``.
 
-    Raises UsageError for an unknown section or key (naming the nearest), a wrong type or range, contradictory values,
-    or invalid TOML; InputError for a missing file.
+    Raises UsageError for unknown sections or keys (naming the nearest), wrong types or ranges, contradictions, or
+    invalid TOML; InputError for a missing file.
     """
     given: dict[str, dict[str, Any]] = {}
     for where, section, values in _tables(path, assignments):
@@ -140,7 +140,7 @@ def _is_preset(assignment: str) -> bool:
 
 
 def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
-    """The values in their keys' types. Raises UsageError for unknown keys or types."""
+    """Typed values. Raises UsageError for unknown keys or types."""
     kind = type(getattr(Config(), section))
     assert issubclass(kind, Section)
     hints, declared = typing.get_type_hints(kind), kind.declared
@@ -181,7 +181,7 @@ def _parse_value(text: str) -> Any:
 
 
 def type_name(hint: Any) -> str:
-    """A key's type in words: int, float, str, or float or list of float."""
+    """A key's type in words, such as float or list of float."""
     names = ["list of float" if option == tuple[float, ...] else option.__name__ for option in _options(hint)]
     return " or ".join(names)
 
@@ -191,7 +191,7 @@ def _options(hint: Any) -> tuple[Any, ...]:
 
 
 def _of_type(value: Any, hint: Any) -> Any:
-    """The value; integers as floats, lists as tuples if the type asks."""
+    """The value; integers to floats, lists to tuples, by type."""
     options = _options(hint)
     if str in options and isinstance(value, float) and math.isnan(value):
         return "nan"  # a word here, which TOML takes for a number

@@ -32,7 +32,7 @@ class Within:
         return f"{span} {self.unit}" if self.unit else span
 
     def holds(self, value: Any) -> bool:
-        """True if a number, or each of a tuple, lies in the range; NaN never does."""
+        """True if a number, or each of a tuple, is in range; NaN never."""
         numbers = value if isinstance(value, tuple) else (value,)
         is_within = numbers != () and all(self.low <= number <= self.high for number in numbers)
         return is_within or (self.or_zero and value == 0)
@@ -66,7 +66,7 @@ class Section:
     declared: ClassVar[dict[str, Declared]]
 
     def __init_subclass__(cls, *, section: str) -> None:
-        """Raises TypeError for a key without a declared range."""
+        """Raises TypeError for a key without a range."""
         hints = typing.get_type_hints(cls, include_extras=True)
         cls.section, cls.declared = section, {key: _declared(hints[key]) for key in cls.__annotations__}
 

@@ -32,7 +32,7 @@ BAR, MARK = "#0072b2", "#d55e00"
 
 @dataclass(frozen=True, kw_only=True)
 class Cut:
-    """A plane of cells across `axis`, every `step`-th along its sides, with their coordinates [m]."""
+    """Every `step`-th cell of a plane across `axis`, with coordinates [m]."""
 
     axis: int
     index: int
@@ -42,14 +42,14 @@ class Cut:
     voxel: float
 
     def of(self, grid: DistanceGrid, channel: str) -> Float64:
-        """The channel in the plane, rows upwards along the later axis."""
+        """The channel in the plane, rows upwards."""
         where: list[Any] = [slice(None, None, self.step)] * 3
         where[self.axis] = self.index
         return np.asarray(np.swapaxes(grid.channels[channel][tuple(where)], 0, 1), np.float64)
 
 
 def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
-    """Write three slices of `sdf` through the cell nearest to `point` [m], across z, y and x.
+    """Write slices of `sdf` through the cell at `point` [m], across z, y and x.
 
     Contour lines at 0, 2, 5 and 10 cm; never-seen space is veiled and hatched.
     """
@@ -69,7 +69,7 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
 
 
 def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
-    """Write three slices of `probability` through the cell nearest to `point` [m]; the surface as a line."""
+    """Write slices of `probability` through the cell at `point` [m], with the surface as a line."""
     with _panels(grid, point) as (figure, panels):
         for axes, cut in panels:
             image = axes.imshow(
@@ -92,7 +92,7 @@ def gradient_picture(
 ) -> None:
     """Write the gradient's length in a slice across z, and its histogram over the grid.
 
-    histogram: cells by length, bin k about k times `bin_width`, the last with all longer. A distance has length 1
+    histogram: cells by length, bin k about k times `bin_width`, the last for all longer. A distance has length 1
     (Eikonal equation).
     """
     (cut,) = _cuts(grid, point, axes=(2,))
@@ -143,7 +143,7 @@ def _draw_histogram(axes: Any, histogram: Sequence[int], bin_width: float) -> No
 def _panels(
     grid: DistanceGrid, point: Sequence[float]
 ) -> Iterator[tuple["mpl.figure.Figure", list[tuple[Any, Cut]]]]:
-    """Axes for slices across z, y and x, side by side at one scale."""
+    """Axes for slices across z, y and x, at one scale."""
     cuts = _cuts(grid, point, axes=(2, 1, 0))
     sides = np.array([[float(np.ptp(c)) + cut.voxel for c in cut.coordinates] for cut in cuts])
     height = float(np.clip((WIDTH - 3.2) * sides[:, 1].max() / sides[:, 0].sum() + 1.5, 3.2, 9.0))
@@ -155,7 +155,6 @@ def _panels(
 
 
 def _cuts(grid: DistanceGrid, point: Sequence[float], *, axes: Sequence[int]) -> list[Cut]:
-    """Planes through the cell nearest to `point`."""
     shape = grid.channels["sdf"].shape
     cuts = []
     for axis in axes:
@@ -177,7 +176,7 @@ def _label(axes: Any, cut: Cut) -> None:
 
 
 def _knows_seen(grid: DistanceGrid) -> bool:
-    """True with an occupancy grid; without one, every cell counts as never seen."""
+    """True with an occupancy grid; else every cell is never seen."""
     return "observed" in grid.channels and "no occupancy" not in str(grid.header.get("observed"))
 
 
@@ -191,7 +190,7 @@ def _surface(axes: Any, cut: Cut, grid: DistanceGrid, color: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Reliability:
-    """B bins of predicted probability: edges (B + 1,), mean prediction, collided share (NaN if empty), count (B,).
+    """B bins of probability: edges (B + 1,), mean prediction, collided share (NaN if empty), count (B,).
 
     calibration_error: mean |predicted - observed|, weighted by count.
     """
@@ -204,7 +203,7 @@ class Reliability:
 
 
 def reliability(probability: Float64, is_colliding: Bool, bins: int = 10) -> Reliability:
-    """Collision rates of points (Q,) by predicted probability, in equal bins.
+    """Collision rates of points (Q,) by predicted probability.
 
     Raises NotEvaluableError without points, UsageError for a probability outside [0, 1].
     """
@@ -230,7 +229,7 @@ def reliability(probability: Float64, is_colliding: Bool, bins: int = 10) -> Rel
 
 
 def reliability_picture(path: Path, curves: Mapping[str, Reliability], title: str = "Reliability") -> None:
-    """Write collided share over predicted probability, a curve per form, and points per bin.
+    """Write collided share over predicted probability by form, and points per bin.
 
     A calibrated probability lies on the diagonal.
     """

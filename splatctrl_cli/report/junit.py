@@ -1,6 +1,6 @@
 """Reports for CI: JUnit XML (GitLab, Jenkins), and annotations and a table on GitHub.
 
-A suite per recording, a case per criterion and gate.
+Recordings are suites; criteria and gates are cases.
 """
 
 import os
@@ -38,7 +38,7 @@ WORDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One criterion or gate. group: recording and command; unique with the name.
+    """One criterion or gate. group: recording and command, unique with the name.
 
     sentence: the finding in one line; text: in full; seconds: 0 if not timed.
     """
@@ -53,7 +53,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """The cases of one recording. path: its file or folder; notes: decide nothing; started: ISO 8601."""
+    """A recording's cases. path: file or folder; notes: decide nothing; started: ISO 8601."""
 
     name: str
     cases: Sequence[Case]
@@ -71,7 +71,7 @@ class Suite:
 def cases_of(verdict: Mapping[str, Any], group: str, *, expected: str = "passed") -> list[Case]:
     """A case per criterion of a verdict (`Verdict.as_dict`, or a command's JSON).
 
-    expected: the right outcome. If it is not "passed" and occurs, every case passes.
+    expected: the right outcome; if it occurs and is not "passed", every case passes.
     """
     by_criterion: dict[str, list[Mapping[str, Any]]] = {}
     for reason in verdict["reasons"]:
@@ -89,7 +89,7 @@ def cases_of(verdict: Mapping[str, Any], group: str, *, expected: str = "passed"
 
 
 def damage_case(group: str) -> Case:
-    """The case of a damaged recording, which explains a nonzero exit code if all else passed."""
+    """The case of a damaged recording, to explain a nonzero exit code."""
     text = f"{DAMAGE} (exit code {DAMAGED}); splatctrl check says which"
     return Case(name="recording", group=group, kind=Kind.ERROR, sentence=text, text=text)
 
@@ -97,7 +97,7 @@ def damage_case(group: str) -> Case:
 def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[str] = ()) -> Case:
     """The only case of a command without verdict; exit_code None if killed.
 
-    `line` is its message, `lines` the end of its log.
+    line: its message; lines: the end of its log.
     """
     name = "killed" if exit_code is None else WORDS.get(exit_code, "error")
     text = "\n".join([line, *lines, *([] if exit_code is None else [f"exit code: {exit_code}"])])
@@ -110,18 +110,17 @@ def skipped_case(group: str, why: str) -> Case:
 
 
 def notes_of(verdict: Mapping[str, Any]) -> list[str]:
-    """The sentence of a verdict, and its notes."""
+    """A verdict's sentence and notes."""
     return [verdict["sentence"], *verdict["notes"]]
 
 
 def worst_first(suites: Iterable[Suite]) -> list[tuple[Suite, Case]]:
-    """Cases not passed, with suites: failures, errors, not evaluable, skipped."""
+    """Cases not passed, with suites: failed, error, not evaluable, skipped."""
     found = [(suite, case) for suite in suites for case in suite.cases if case.kind is not Kind.PASSED]
     return sorted(found, key=lambda pair: WORST_FIRST.index(pair[1].kind))
 
 
 def _case(name: str, group: str, reasons: Sequence[Mapping[str, Any]]) -> Case:
-    """One criterion's reasons as a case, worst first."""
     ordered = sorted(reasons, key=lambda reason: WORST_FIRST.index(Kind(reason["outcome"])))
     worst, more = ordered[0], sum(reason["outcome"] != Kind.PASSED for reason in ordered[1:])
     sentence = worst["sentence"] if worst["time_s"] is None else f"{worst['sentence']} at {worst['time_s']:.2f} s"
@@ -135,7 +134,6 @@ def _case(name: str, group: str, reasons: Sequence[Mapping[str, Any]]) -> Case:
 
 
 def _told(reason: Mapping[str, Any]) -> str:
-    """A reason's facts, a line each."""
     unit = f" {reason['unit']}" if reason["unit"] else ""
     place = reason["place"]
     facts = {
@@ -160,7 +158,7 @@ _NOT_XML = re.compile("[^\t\n\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 def write_junit(path: Path, suites: Sequence[Suite]) -> None:
     """Write the suites atomically to `path`, replacing a report.
 
-    Raises UsageError if `path` is another file or not writable, WriteError on a full disk.
+    Raises UsageError for another file or an unwritable path, WriteError on a full disk.
     """
     check_replaceable(path)
     with output_path(path, force=True, is_folder=False) as partial:
@@ -168,7 +166,7 @@ def write_junit(path: Path, suites: Sequence[Suite]) -> None:
 
 
 def check_replaceable(path: Path) -> None:
-    """Raise UsageError if `path` is neither our report nor empty."""
+    """Raise UsageError if `path` is neither ours nor empty."""
     try:
         with path.open("rb") as stream:
             start = stream.read(len(HEAD))
@@ -181,7 +179,7 @@ def check_replaceable(path: Path) -> None:
 
 
 def junit_text(suites: Sequence[Suite]) -> str:
-    """The suites as XML 1.0, reproducible; other characters are escaped."""
+    """The suites as reproducible XML 1.0; other characters are escaped."""
     seconds = _seconds(sum(suite.seconds for suite in suites))
     root = ElementTree.Element("testsuites", {"name": "splatctrl", **_counts(suites), "time": seconds})
     for suite in suites:
@@ -216,7 +214,7 @@ def _add_case(suite: ElementTree.Element, case: Case) -> None:
 
 
 def _counts(suites: Sequence[Suite]) -> dict[str, str]:
-    """Not evaluable counts as error: nothing was shown to be right."""
+    """Not evaluable counts as error: nothing was proven."""
     return {
         "tests": str(sum(len(suite.cases) for suite in suites)),
         "failures": str(sum(suite.count(Kind.FAILED) for suite in suites)),
@@ -229,7 +227,7 @@ def _seconds(value: float) -> str:
 
 
 def _clean(text: str) -> str:
-    """The text with escapes for characters that XML cannot hold."""
+    """The text, escaped where XML cannot hold it."""
     return _NOT_XML.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
@@ -240,10 +238,10 @@ MORE = "\n... and {} more that do not fit here\n"
 
 
 def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> None:
-    """Inside a GitHub Actions step: annotations to `stream`, and the table to the step's summary. Nothing elsewhere.
+    """In a GitHub Actions step only: annotations to `stream`, and the table to the step's summary.
 
-    stream: the process's stdout or stderr. is_fatal: the exit code is not 0; else annotations are warnings. Raises
-    OSError if the summary cannot be written.
+    stream: stdout or stderr. is_fatal: the exit code is not 0; else annotations are warnings. Raises OSError if the
+    summary cannot be written.
     """
     if os.environ.get("GITHUB_ACTIONS") != "true":
         return
@@ -256,7 +254,7 @@ def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> N
 
 
 def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping[str, str]) -> list[str]:
-    """A workflow command per most severe case; its file is the recording, if in the repository."""
+    """A workflow command per most severe case, on the recording if in the repository."""
     level = "error" if is_fatal else "warning"
     lines = []
     for suite, case in [pair for pair in worst_first(suites) if pair[1].kind is not Kind.SKIPPED][:MOST_ANNOTATIONS]:
@@ -270,7 +268,7 @@ def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping
 
 
 def summary(suites: Sequence[Suite], room: int) -> str:
-    """Markdown of at most `room` bytes: counts, and a row per case not passed, worst first."""
+    """Markdown of at most `room` bytes: counts, and cases not passed, worst first."""
     cases = worst_first(suites)
     total = sum(len(suite.cases) for suite in suites)
     of = suites[0].name if len(suites) == 1 else f"{len(suites)} recordings"
@@ -297,13 +295,13 @@ def summary(suites: Sequence[Suite], room: int) -> str:
 
 
 def _cell(text: str) -> str:
-    """Text in one line, escaped for Markdown and HTML."""
+    """Text in one line, escaped for Markdown."""
     escaped = "".join(f"&#{ord(mark)};" if mark in "&<>|`*_[]\\#~@" else mark for mark in text)
     return " ".join(escaped.split()).encode("utf-8", "backslashreplace").decode()
 
 
 def _in_repository(path: str, environment: Mapping[str, str]) -> str:
-    """The file's path in the repository; empty for a folder or outside."""
+    """The file's path in the repository, or ""."""
     workspace = environment.get("GITHUB_WORKSPACE", "")
     if not (path and workspace and Path(path).is_file()):
         return ""

@@ -1,8 +1,8 @@
 """One self-contained HTML file: verdict, timelines, pictures, tables, and 3-D scenes.
 
-A scene holds splats by time, a moving arm, and the deciding event. The viewer uses the three.js that trimesh brings.
-Packed, it is JSON ``{"header": {...}, "bytes": "..."}``: deflated base64 bytes, and in the header each array's type,
-first byte and count. Points are 16-bit integers within their box: 0.05 mm at three metres.
+A scene holds splats by time, a moving arm, and the deciding event; trimesh brings the viewer's three.js. Packed, it
+is JSON ``{"header": {...}, "bytes": "..."}``: deflated base64, and each array's type, first byte and count. Points
+are 16-bit integers within their box: 0.05 mm at three metres.
 """
 
 import base64
@@ -41,8 +41,7 @@ class Surface:
 class Motion:
     """An arm over T states: seconds (T,) since the first; poses (T, L, 4, 4), world.
 
-    bodies (L): by link, in its frame; path (T, 3) [m], world, of the end effector; clearance (T,) [m], NaN if
-    unknown.
+    bodies (L): by link, in its frame. path (T, 3) [m]: the end effector, world. clearance (T,) [m]: NaN if unknown.
     """
 
     seconds: Float64
@@ -55,9 +54,9 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class Deciding:
-    """The deciding event: sentence, time [s], place (3,) [m], world, and the arm's sphere there.
+    """The deciding event: sentence, time [s], place (3,) [m], world.
 
-    sphere: centre (3,) and radius [m], None without a robot.
+    sphere: the arm's there, centre (3,) and radius [m], or None.
     """
 
     sentence: str
@@ -68,10 +67,10 @@ class Deciding:
 
 @dataclass(frozen=True, kw_only=True)
 class Space:
-    """Content of a 3-D page, world frame [m].
+    """Content of a 3-D page, world [m].
 
-    splats: by motion time [s] from which they were known, the first from the start. unknown: centres (K, 3) of
-    never-seen cubes, and their edge. surface: where a baked distance is 0.
+    splats: by motion time [s] from which they were known, the first from the start. unknown: centres (K, 3) and edge
+    of never-seen cubes. surface: where a baked distance is 0.
     """
 
     splats: Mapping[float, SplatSet] = field(default_factory=dict)
@@ -81,7 +80,7 @@ class Space:
     deciding: Deciding | None = None
 
     def box(self) -> tuple[Float64, Float64]:
-        """Lower and upper corner (3,) of the visible content: 90 % of splats, path and surface."""
+        """Lower and upper corner (3,) of 90 % of splats, path and surface."""
         parts = [np.asarray(splats.centers, np.float64) for splats in self.splats.values()]
         if self.motion is not None:
             parts += [self.motion.path, self.motion.poses[:, :, :3, 3].reshape(-1, 3)]
@@ -95,7 +94,7 @@ class Space:
 
 
 def bodies_of(surface: RobotSurface) -> dict[str, Surface]:
-    """Collision geometry of a robot by link, as triangles in its frame."""
+    """A robot's collision geometry by link, as triangles in its frame."""
     parts: dict[str, list[trimesh.Trimesh]] = {}
     for kind, size, T, link in zip(
         surface.kinds, surface.sizes, surface.T_link_solid, surface.solid_links, strict=True
@@ -113,7 +112,7 @@ def bodies_of(surface: RobotSurface) -> dict[str, Surface]:
 
 
 def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
-    """size (3,): half edges of a box; radius and half length of a cylinder or capsule; radius of a ball."""
+    """size (3,): half edges; radius and half length of a cylinder or capsule; radius of a ball."""
     if kind == BOX:
         return trimesh.creation.box(extents=2 * size)
     if kind == BALL:
@@ -125,9 +124,9 @@ def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
 
 
 def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
-    """Centres (K, 3) [m] and edge [m] of at most `most` cubes for the border of unknown voxels (X, Y, Z).
+    """Centres (K, 3) [m] and edge [m] of at most `most` cubes on the border of unknown voxels (X, Y, Z).
 
-    The rest lies behind. Cubes have 2, 3, ... voxels a side, and are unknown by half or more.
+    Cubes of 2, 3, ... voxels a side are unknown by half or more.
     """
     factor = 1
     while True:
@@ -160,7 +159,7 @@ REMEDY = "pip install 'trimesh>=4.4,<6'"
 
 
 def three_js() -> str:
-    """The source of three.js, deflated, base64. Raises UsageError if trimesh no longer brings it."""
+    """The source of three.js, deflated, base64. Raises UsageError if trimesh has none."""
     try:
         archive = trimesh.util.decompress(trimesh.resources.get_bytes("templates/viewer.zip"), file_type="zip")
         page = archive["viewer.html.template"].read().decode("utf-8")
@@ -201,10 +200,7 @@ def packed(space: Space) -> str:
 
 
 def _add(block: bytearray, values: ArrayLike, kind: type[np.generic]) -> list[Any]:
-    """Append values to the block, padded to four bytes: [type, first byte, count].
-
-    Columns deflate better than rows.
-    """
+    """Append values to the block by column, which deflates best, padded to 4 bytes: [type, first byte, count]."""
     array, start = np.asarray(values, kind), len(block)
     block += np.ascontiguousarray(array.T).tobytes()
     block += bytes(-len(block) % 4)
@@ -262,7 +258,7 @@ QUALITY = 70  # of JPEG: WebP is a third smaller, and takes ten times as long
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A word in a state's colour; link: the section's anchor."""
+    """A word in a state's colour; link: a section's anchor."""
 
     text: str
     state: str = ""
@@ -275,7 +271,7 @@ Row = tuple[Sequence[object], str]
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Rows under a header, or a text, under a title; is_folded: shown on click."""
+    """Titled rows under a header, or text; is_folded: shown on click."""
 
     title: str = ""
     header: Sequence[str] = ()
@@ -296,7 +292,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSection:
-    """One run's section. space: name of its scene, or ""; no_space: why there is none."""
+    """A run's section. space: its scene's name, or ""; no_space: why none."""
 
     anchor: str
     title: str
@@ -314,7 +310,7 @@ class RunSection:
 
 @dataclass(frozen=True, kw_only=True)
 class Page:
-    """A report. pictures: of runs without a section; scenes: `packed`, by name; opens: the first at once."""
+    """A report. pictures: of runs without a section; scenes: `packed`; opens: the first at once."""
 
     title: str
     state: str

@@ -1,7 +1,7 @@
 """Pictures of renders against photos, slices of a distance field, and shared drawing.
 
-Drawn through Matplotlib's Figure: no global state. Colours are by Okabe and Ito, or maps readable without red and
-green. Error bars end at fixed values, so that views and methods compare by eye.
+Matplotlib's Figure keeps no global state. Colours are by Okabe and Ito, or maps readable without red and green. Error
+bars end at fixed values, comparable by eye.
 """
 
 from collections.abc import Iterator, Sequence
@@ -44,9 +44,9 @@ STYLE: Any = {  # matplotlib types its keys as one long literal
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonRow:
-    """One view: photo (H, W, 3) uint8, render (H, W, 3) in [0, 1], depths (H, W) [m], 0 = none.
+    """A view: photo (H, W, 3) uint8, render (H, W, 3) in [0, 1], depths (H, W) [m], 0 = none.
 
-    `title` names the view, `figures` the render's quality in words; mask (H, W): pixels that count, None for all.
+    `figures`: the render's quality in words; mask (H, W): pixels that count.
     """
 
     title: str
@@ -83,8 +83,8 @@ def field_slice_picture(
 ) -> None:
     """Write the slice of `sdf` across `axis` (0, 1, 2 = x, y, z) nearest to `value` [m].
 
-    Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] are
-    drawn as cut circles. Raises NotEvaluableError if the plane misses the grid.
+    Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] show
+    as cut circles. Raises NotEvaluableError outside the grid.
     """
     index = round((value - grid.origin[axis]) / grid.voxel)
     count = grid.channels["sdf"].shape[axis]
@@ -128,7 +128,7 @@ def drawn_figure(height: float) -> Iterator["mpl.figure.Figure"]:
 
 
 def save_figure(figure: "mpl.figure.Figure", path: Path, told: str = "") -> None:
-    """Write the figure without a date; told: its text description in the file."""
+    """Write the figure without a date; told: its description in the file."""
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
@@ -150,7 +150,7 @@ def _draw_comparison(figure: "mpl.figure.Figure", axes: Sequence[Any], row: Comp
 
 
 def _draw_depth_error(panel: Any, row: ComparisonRow) -> tuple[Any, str]:
-    """The image of |render - recorded depth| [cm], and its median in words."""
+    """Image of |render - recorded depth| [cm], and its median in words."""
     both = (row.photo_depth > 0) & (row.render_depth > 0)
     error = np.where(both, 100.0 * np.abs(row.render_depth - row.photo_depth), np.nan)
     panel.set_facecolor(UNRECORDED)
@@ -161,7 +161,7 @@ def _draw_depth_error(panel: Any, row: ComparisonRow) -> tuple[Any, str]:
 def draw_distance(
     axes: Any, coordinates: Sequence[Float64], distance: Float64, voxel: float, *, names_lines: bool = True
 ) -> Any:
-    """Draw a distance [cm] with contour lines; return the image, for a colour bar."""
+    """Draw a distance [cm] with contour lines; return the image."""
     finite = distance[np.isfinite(distance)]
     limit = 20.0  # [cm]
     image = axes.imshow(
@@ -191,7 +191,7 @@ def draw_distance(
 
 
 def draw_never_seen(axes: Any, coordinates: Sequence[Float64], never_seen: NDArray[np.bool_], voxel: float) -> None:
-    """Veil and hatch cells that no camera saw."""
+    """Veil and hatch never-seen cells."""
     if not never_seen.any():
         return
     veil = np.zeros((*never_seen.shape, 4))
@@ -215,7 +215,6 @@ def _explain(axes: Any, *, has_spheres: bool, has_observed: bool) -> None:
 
 
 def _draw_cut_spheres(axes: Any, spheres: tuple[Float64, Float64], axis: int, plane: float) -> None:
-    """Draw the circles that the plane cuts from spheres."""
     centers, radii = spheres
     first, second = (other for other in range(3) if other != axis)
     squared = np.square(radii) - np.square(centers[:, axis] - plane)
@@ -228,7 +227,7 @@ def _draw_cut_spheres(axes: Any, spheres: tuple[Float64, Float64], axis: int, pl
 
 
 def extent_of(coordinates: Sequence[Float64], voxel: float) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top [m] of cells with these centres."""
+    """Left, right, bottom, top [m] of cells with these centres."""
     (left, right), (bottom, top) = ((c[0] - voxel / 2, c[-1] + voxel / 2) for c in coordinates)
     return float(left), float(right), float(bottom), float(top)
 
@@ -240,7 +239,7 @@ OUTLINE = "#ffffff"
 
 
 def view_picture(path: Path, row: ComparisonRow) -> None:
-    """Write photo | render over colour error | depth error, with any mask's outline."""
+    """Write photo | render over colour error | depth error, with the mask's outline."""
     height, width = row.photo.shape[:2]
     render = np.clip(row.render, 0.0, 1.0)
     color_error = np.asarray(100.0 * np.abs(render - row.photo / 255.0).mean(axis=2))
@@ -278,7 +277,7 @@ def _outline(panels: Any, mask: NDArray[np.bool_]) -> None:
 
 
 def set_grid(axes: Any, axis: str = "y") -> None:
-    """Draw pale grid lines along an axis, or "both", without top and right frame."""
+    """Draw pale grid lines along an axis, or "both"; hide top and right frame."""
     axes.grid(axis=axis, color="#e4e4e4", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -301,9 +300,9 @@ EDGE = 0.02  # [m] of empty space around all
 
 
 def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, radii: Float64) -> None:
-    """Write three axis views: shaded shapes, their uncovered parts, and spheres as discs.
+    """Write three axis views: shaded shapes, uncovered parts, spheres as discs.
 
-    surfaces: triangles (F, 3, 3) [m]; centers (S, 3) [m], radii (S,) [m], all in one frame.
+    surfaces: triangles (F, 3, 3) [m]; centers (S, 3), radii (S,) [m], in one frame.
     """
     triangles = np.concatenate([refined(surface, 0.01)[0] for surface in surfaces])
     triangles = triangles[areas(triangles) > 0]
@@ -326,7 +325,7 @@ def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, rad
 
 
 def _draw_shapes(view: Any, triangles: Float64, is_bare: Bool, plane: tuple[int, int], viewer: Float64) -> None:
-    """Triangles painted from far to near, lit from the viewer."""
+    """Triangles from far to near, lit from the viewer."""
     order = np.argsort(triangles.mean(axis=1) @ viewer, kind="stable")
     seen = triangles[order]
     normal = face_normals(seen)

@@ -1,7 +1,6 @@
-"""Pictures of a replay: clearance and events over time, commands, and divergence.
+"""Pictures of a replay: clearance and events, commands, and divergence.
 
-Curves with more states than columns are drawn as their range per column, so that no extreme is lost and long logs
-draw as fast as short ones.
+Long curves are drawn as their range per column: no extreme is lost, and time stays constant.
 """
 
 from collections.abc import Mapping, Sequence
@@ -76,7 +75,7 @@ def clearance_picture(
 ) -> None:
     """Write clearance curves (T,) [m] over `seconds` (T,), in cm, with the margin [m] and event strips.
 
-    NaN leaves gaps; below the margin is shaded, and each minimum is marked.
+    NaN leaves gaps; below the margin is shaded, minima are marked.
     """
     shown = {kind: intervals for kind, intervals in events.items() if intervals}
     with drawn_figure(4.8 + _strip_height(shown)) as figure:
@@ -107,7 +106,7 @@ def clearance_picture(
 
 
 def evidence_picture(path: Path, seconds: Float64, shares: Float64) -> None:
-    """Write stacked shares (T, C) by `EvidenceClass` of the space within the arm's margin, over `seconds` (T,).
+    """Write stacked shares (T, C) by `EvidenceClass` of the space within the margin, over `seconds` (T,).
 
     Rows with NaN are left out.
     """
@@ -140,9 +139,9 @@ def commands_picture(
     interventions: Mapping[str, Intervals],
     logged: FloatRows | None = None,
 ) -> None:
-    """Write commanded velocities (T, J) [rad/s] with limits (J,), over a strip per kind of intervention.
+    """Write commanded velocities (T, J) [rad/s] with limits (J,), over strips of interventions.
 
-    Interventions are rows that shaped the command, or steps not plainly taken. logged (T, J): drawn behind.
+    These are rows that shaped the command, or steps not plainly taken. logged (T, J): drawn behind.
     """
     height = 0.78 * len(joints)
     with drawn_figure(height + 0.6 + _strip_height(interventions)) as figure:
@@ -168,7 +167,7 @@ def commands_picture(
 def open_loop_picture(
     path: Path, seconds: Float64, difference: FloatRows, joints: Sequence[str], margin: FloatRows, shaped: Intervals
 ) -> None:
-    """Write commanded minus logged velocity (T, J) [rad/s], over the room (T,) [m/s] that the logged one left.
+    """Write commanded minus logged velocity (T, J) [rad/s], over the logged one's margin (T,) [m/s].
 
     shaped: intervals [s] in which a row shaped the command, shaded.
     """
@@ -205,7 +204,7 @@ def open_loop_picture(
 def divergence_picture(
     path: Path, seconds: Float64, joints: FloatRows, position: FloatRows, rotation: FloatRows
 ) -> None:
-    """Write the arm's distance from the log (T,): joints [rad], its frame's position [m] and rotation [rad]."""
+    """Write distance from the log (T,): joints [rad], a frame's position [m] and rotation [rad]."""
     curves = (
         ("all joints [rad]", joints, 1.0),
         ("frame, position [cm]", position, 100.0),
@@ -227,7 +226,7 @@ def divergence_picture(
 def _curve(
     axes: Any, seconds: Float64, values: Float64, *, color: str, width: float, style: Any = "-", label: str = ""
 ) -> float:
-    """Draw a curve, or a long one's band (a line where thin); return its largest magnitude."""
+    """Draw a curve, or a long one's band; return its largest magnitude."""
     of = envelope(seconds, values)
     there = np.isfinite(of.lowest)
     height = float(np.max(of.highest[there]) - np.min(of.lowest[there])) if there.any() else 0.0
@@ -241,7 +240,7 @@ def _curve(
 
 
 def _clearance_curve(axes: Any, seconds: Float64, metres: FloatRows, name: str) -> float:
-    """Draw a curve and return its minimum [cm], inf for none."""
+    """Draw a curve; return its minimum [cm], or inf."""
     centimetres = 100.0 * np.asarray(metres, dtype=np.float64)
     color, style, width = FIELD_STYLES.get(name, (CURVE_COLORS[3], "-", 1.5))
     label = FIELD_NAMES.get(name, name)
@@ -256,7 +255,7 @@ def _clearance_curve(axes: Any, seconds: Float64, metres: FloatRows, name: str) 
 
 
 def _limit_axis(axes: Any, joint: str, limit: float, peak: float, beneath: float) -> None:
-    """Scale a joint's axis to its curves, with the limit as a line if visible, and as text."""
+    """Scale a joint's axis to its curves; the limit as text, and as a line if visible."""
     height = max(1.25 * max(peak, beneath), SMALLEST)
     axes.set_ylim(-height, height)
     for side in (-limit, limit):
@@ -281,7 +280,7 @@ def _strip_height(events: Mapping[str, Intervals]) -> float:
 
 
 def _draw_strip(axes: Any, above: Any, events: Mapping[str, Intervals], seconds: Float64) -> None:
-    """Draw a row per kind with its intervals, or "no event"."""
+    """Draw intervals by kind, or "no event"."""
     axes.set(xlabel="time [s]", xlim=span_of(seconds), ylim=(max(len(events), 1) - 0.4, -0.6))
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.set_yticks(range(len(events)), [f"{kind}  ({len(of)})" for kind, of in events.items()])
@@ -303,7 +302,7 @@ def _tidy(axes: Any, seconds: Float64) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Envelope:
-    """K columns: middle time (K,) [s], lowest and highest value (K,), NaN for an empty one."""
+    """K columns: middle time (K,) [s], lowest and highest value (K,), NaN if empty."""
 
     seconds: Float64
     lowest: Float64
@@ -316,10 +315,7 @@ class Envelope:
 
 
 def envelope(seconds: Float64, values: Float64, columns: int = 1000) -> Envelope:
-    """The range of values (T,) in each of `columns` equal parts of the time (T,).
-
-    Up to two states per column, the values themselves.
-    """
+    """Ranges of values (T,) in `columns` equal parts of time (T,), exact up to two states each."""
     values = np.asarray(values, dtype=np.float64)
     if len(values) <= 2 * columns:
         return Envelope(seconds=seconds, lowest=values, highest=values)
@@ -333,13 +329,13 @@ def envelope(seconds: Float64, values: Float64, columns: int = 1000) -> Envelope
 
 
 def column(rows: FloatRows, number: int) -> Float64:
-    """A column (T,) of rows (T, K), read in blocks."""
+    """A column (T,) of rows (T, K), in blocks."""
     parts = [rows[first : first + BLOCK][:, number] for first in range(0, len(rows), BLOCK)]
     return np.concatenate([np.zeros(0), *parts])
 
 
 def spans(intervals: Sequence[tuple[float, float]], span_s: tuple[float, float]) -> list[tuple[float, float]]:
-    """Start and length [s] of intervals as drawn on the axis `span_s`.
+    """Start and length [s] of intervals on the axis `span_s`.
 
     None is shorter than `SHORTEST`; touching ones are joined.
     """

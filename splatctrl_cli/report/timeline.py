@@ -1,7 +1,4 @@
-"""Inline SVG of clearance over time: measures, margin, events, and a controller's steps.
-
-Colours are those of the replay's pictures.
-"""
+"""Inline SVG of clearance over time, in the colours of the replay's pictures."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
@@ -36,9 +33,9 @@ def timeline(
     events: Mapping[str, Intervals],
     rungs: Sequence[str] = (),
 ) -> Markup:
-    """Clearance curves (T,) [m] over `seconds` (T,), in cm, with the margin [m] and strips below.
+    """Clearance curves (T,) [m] over `seconds` (T,), in cm, with the margin [m] and strips.
 
-    A strip per kind of event with its intervals [s], and one of a controller's `rungs` (T,), if any.
+    Strips show each kind of event by its intervals [s], and a controller's `rungs` (T,).
     """
     axis = _Axis(seconds, curves, margin)
     strips = {kind: [(*span, KIND_COLORS.get(kind.split(" (")[0], QUIET), kind) for span in spans(of, axis.span)]
@@ -60,7 +57,7 @@ def timeline(
 
 
 def runs_of(rungs: Sequence[str], seconds: Float64) -> list[tuple[str, float, float]]:
-    """Runs of equal rungs: rung, first time, and the next run's first time [s]."""
+    """Runs of equal rungs: rung, first time, next run's first time [s]."""
     found, first = [], 0
     for rung, group in groupby(rungs):
         behind = first + len(list(group))
@@ -113,7 +110,6 @@ class _Axis:
 
 
 def _steps(low: float, high: float, count: int) -> list[float]:
-    """About `count` round numbers between `low` and `high`."""
     rough = (high - low) / count
     power = 10.0 ** np.floor(np.log10(rough))
     step = power * min((1, 2, 5, 10), key=lambda factor: abs(factor * power - rough))
@@ -155,7 +151,7 @@ def _points(x: Float64, y: Float64) -> str:
 
 
 def _strips(axis: _Axis, strips: Mapping[str, Sequence[tuple[float, float, str, str]]]) -> Iterator[str]:
-    """A row per kind: name, and bars (start [s], length [s], colour, title)."""
+    """Rows by kind: name, and bars (start [s], length [s], colour, title)."""
     for row, (kind, bars) in enumerate(strips.items()):
         top = axis.bottom + 28 + STRIP * row
         yield f'<rect class="row" x="{LEFT}" y="{top}" width="{WIDTH - LEFT - RIGHT}" height="{STRIP - 6}"/>'
@@ -172,7 +168,7 @@ def _strips(axis: _Axis, strips: Mapping[str, Sequence[tuple[float, float, str, 
 
 
 def legend(curves: Mapping[str, Float64]) -> list[tuple[str, str, str]]:
-    """Colour, name and least value in words, per measure."""
+    """Colour, name and least value, per measure."""
     rows = []
     for name, metres in curves.items():
         known = metres[np.isfinite(metres)]
