@@ -19,7 +19,7 @@ ROBOT = "the robot"
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Residuals (M,) [m], with sigma (M,), of a pair of views, or of a frame and the robot.
+    """Residuals (M,) [m] and their sigma of two views, or of a frame and the robot.
 
     jacobian (M, 17): by the two cameras' unknowns and the clock, in `columns` (17,). clusters (M,): equal numbers of
     the same `alike` have correlated errors. num_laid: points that should lie on the other's surface, even beyond the
@@ -71,7 +71,7 @@ class Adjustment:
     def solved(
         self, estimate: Estimate, schedule: Sequence[Widths], rounds: int = fixed.CALIBRATION_ROUNDS
     ) -> Estimate:
-        """The estimate after a round per width, and up to `rounds` at the last until convergence."""
+        """The estimate after a round per width, and `rounds` more at most until convergence."""
         start, step = estimate, np.zeros(self.unknowns.size)
         for number, widths in enumerate((*schedule, *(schedule[-1],) * rounds)):
             normal = self.normal(estimate, widths)
@@ -93,7 +93,7 @@ class Adjustment:
         return np.asarray(np.clip(step, -fixed.CALIBRATION_STEP, fixed.CALIBRATION_STEP))
 
     def _prior(self, estimate: Estimate, start: Estimate) -> tuple[Float64, Float64]:
-        """Weight (P,) of a very wide prior at the start, and the offset from there (P,)."""
+        """Weight (P,) of a wide prior at the start, and offset from it (P,)."""
         sigma, offset = np.ones(self.unknowns.size), np.zeros(self.unknowns.size)
         for camera in self.unknowns.cameras:
             columns = self.unknowns.columns(camera)
@@ -284,7 +284,7 @@ def _cells(points_world: Float64, depth: float) -> Index:
 
 
 def _carried(twist: Float64, T: Float64) -> Float64:
-    """A frame's small motion (6,), in axes of a frame at T (4, 4) on it."""
+    """A frame's small motion (6,), in axes at T (4, 4) on it."""
     if not twist.any():
         return twist
     turn, move = twist[:3], twist[3:]

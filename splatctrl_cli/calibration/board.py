@@ -22,7 +22,7 @@ FEWEST_MARKERS = 4  # whose middles tell a homography
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A chessboard or ChArUco board: inner corners per row and column, edge of a square [m]."""
+    """A chessboard or ChArUco board: inner corners per row and column, square's edge [m]."""
 
     columns: int
     rows: int
@@ -33,7 +33,10 @@ class Board:
 
     @property
     def points(self) -> Float64:
-        """The inner corners (K, 3) [m] by row: x along rows, y along columns, z away from the viewer."""
+        """Inner corners (K, 3) [m], row by row.
+
+        x is along rows, y along columns, z away from the viewer.
+        """
         v, u = np.divmod(np.arange(self.columns * self.rows), self.columns)
         return self.square * np.column_stack([u, v, np.zeros(len(u))])
 
@@ -66,7 +69,7 @@ def board_of(text: str) -> Board:
 
 
 def sighting_of(board: Board, frame: RgbdFrame) -> Sighting | None:
-    """The board in a frame's colour image; None if not wholly visible, or no pose fits."""
+    """The board in a frame's image; None if partly hidden or without a pose."""
     gray: UInt8 = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.uint8)
     pixels = _marked_corners(board, gray)
     if pixels is None and board.is_one_way_up:
@@ -75,7 +78,7 @@ def sighting_of(board: Board, frame: RgbdFrame) -> Sighting | None:
 
 
 def other_size(frame: RgbdFrame) -> tuple[int, int] | None:
-    """Inner corners, larger number first, of any chessboard in view; None for none or a tiny one."""
+    """Inner corners, larger number first, of any chessboard in view; None for a tiny one."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     is_found, _, meta = cv2.findChessboardCornersSBWithMeta(gray, (3, 3), cv2.CALIB_CB_LARGER)
     return (max(meta.shape), min(meta.shape)) if is_found and meta.size >= LEAST else None
@@ -180,7 +183,7 @@ class Rig:
 
 @dataclass(frozen=True, kw_only=True)
 class HandEye:
-    """X (4, 4) with constant ``A X B``; stays, that constant; the median distance [m] from it."""
+    """X (4, 4), the constant ``A X B`` that `stays`, and median distance [m] from it."""
 
     X: Float64
     stays: Float64
@@ -293,7 +296,7 @@ def _check_fit(found: HandEye, what: str) -> None:
 
 
 def hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> HandEye:
-    """X (4, 4) such that ``A X B`` is the same for all pairs (A, B) of poses.
+    """X (4, 4) with the same ``A X B`` for all pairs (A, B).
 
     From ``(A_j^-1 A_i) X = X (B_j B_i^-1)``: X turns the right's rotation vectors into the left's, and its
     translation is linear (after Park and Martin, Robot sensor calibration, 1994). Outliers are dropped once. Raises

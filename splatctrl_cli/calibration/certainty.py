@@ -28,7 +28,7 @@ class Certainty:
         return np.zeros((POSE, POSE)) if columns[0] < 0 else self.covariance[np.ix_(columns, columns)]
 
     def displacement(self, camera: str) -> Float64:
-        """Covariance (6, 6) [m] of a rotation about the view's middle, at its rim, and of that middle."""
+        """Covariance (6, 6) [m] of the view's middle: rotation at the rim, then translation."""
         columns = self.unknowns.columns(camera)[:POSE]
         if columns[0] < 0:
             return np.zeros((POSE, POSE))
@@ -128,7 +128,7 @@ class Plane:
 
 
 def plane_of(view: DepthView, T_world_camera: Float64) -> Plane | None:
-    """The largest plane in a view; None if no direction has a quarter of the pixels."""
+    """The largest plane in a view, with a quarter of the pixels, or None."""
     normals = view.normals.reshape(-1, 3)
     normals = normals[np.any(normals != 0, axis=1)] @ T_world_camera[:3, :3].T
     if len(normals) < 100:

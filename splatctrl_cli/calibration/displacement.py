@@ -99,7 +99,7 @@ def _sees_links_in_place(arm: Arm, frames: Sequence[RgbdFrame]) -> bool:
 
 
 def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, Any], Float64] | None:
-    """One camera's pose error, and its correction T_recorded_camera (4, 4); None if too little robot shows.
+    """One camera's pose error and correction T_recorded_camera (4, 4); None if little robot shows.
 
     `distance_mm`, `sigma_mm`: root mean square motion of the robot's `num_pixels` visible points by the correction.
 

@@ -102,7 +102,7 @@ class Rows:
 
 
 def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
-    """Rows of every second point of view a on view b, at T (4, 4) from a."""
+    """Rows of every second point of view a on view b, T (4, 4) apart."""
     number = np.arange(0, len(a.depth.points), 2)
     there, lands, surface, normals, distance = on_surface(a, b, T, slice(None, None, 2))
     sigma = np.hypot(depth_sigma(there[:, 2]), depth_sigma(a.depth.points[number, 2]))
@@ -142,16 +142,16 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
 
 
 def _stretched(own: Float64, gradient: Float64, T: Float64) -> Float64:
-    """Derivatives by log-depth (K,) of a value with a gradient (K, 3), at T (4, 4)."""
+    """Derivatives by log-depth (K,) of a value with gradient (K, 3), at T (4, 4)."""
     return np.asarray(np.einsum("ki,ki->k", gradient @ T[:3, :3], own))
 
 
 def on_surface(
     a: GrayView, b: GrayView, T: Float64, which: slice = EVERY
 ) -> tuple[Float64, Bool, Float64, Float64, Float64]:
-    """View a's points in view b (K, 3), hits (K,), surface, normals, distances (K,); T (4, 4) from a.
+    """View a's points in view b, at T (4, 4): points, hits, surface, normals, distances.
 
-    A hit's surface faces like the point's own.
+    Arrays are (K, 3) or (K,). A hit's surface faces like the point's own.
     """
     there = transform_points(T, a.depth.points[which])
     lands, surface, normals = landed(there, b.depth)

@@ -48,7 +48,7 @@ def largest_share(grid: Float64, depth: float) -> float:
 
 
 def _weights(shape: tuple[int, ...]) -> csr_array:
-    """(H W, G) bilinear weights of the grid's nodes; outer nodes lie on the image's edges."""
+    """(H W, G) bilinear weights of grid nodes, the outer on the image's edges."""
     rows, columns = fixed.BEND_GRID
     at = [np.arange(size) * (nodes - 1) / size for size, nodes in zip(shape, (rows, columns), strict=True)]
     low = [x.astype(np.int64) for x in at]
@@ -161,7 +161,10 @@ class BentViews:
 
 @dataclass(frozen=True, kw_only=True)
 class BendEquations:
-    """The bends' normal equations: cross (P, C G) with poses, own (C G, C G), slope (C G,)."""
+    """The bends' part of the normal equations.
+
+    cross (P, C G): with poses; own (C G, C G), slope (C G,): alone.
+    """
 
     views: BentViews
     num_pairs: int

@@ -84,7 +84,7 @@ def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
 
 
 def surface_normals(surface: Float64, step: int = 1) -> Float64:
-    """Unit normals (h, w, 3) towards the camera of a surface (h, w, 3), camera frame.
+    """Unit normals (h, w, 3) towards the camera of a surface (h, w, 3).
 
     From points `step` pixels to either side; 0 along edges and without depth.
     """
@@ -125,7 +125,7 @@ class Surface(Protocol):
 
 
 def landed(points: Float64, view: Surface) -> tuple[Bool, Float64, Float64]:
-    """Project points (K, 3), camera frame, on a view: hits with depth (K,), surface, normals (K, 3)."""
+    """Hits (K,) of points (K, 3), camera frame, on depth; surface and normals there."""
     is_ahead = points[:, 2] > fixed.PLAUSIBLE_DEPTH[0]
     pixels = np.round(project(view.lens, np.where(is_ahead[:, None], points, 1.0)))
     lands = is_ahead & np.all((pixels >= 0) & (pixels < view.surface.shape[1::-1]), axis=1)
@@ -135,11 +135,11 @@ def landed(points: Float64, view: Surface) -> tuple[Bool, Float64, Float64]:
 
 
 def by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64) -> Float64:
-    """Derivatives (K, 12) of a value with gradient (K, 3) at `there` (K, 3) by two cameras' motions.
+    """Derivatives (K, 12) of a value at `there` (K, 3) by two cameras' motions.
 
-    The first camera has the point at `own` (K, 3), at T (4, 4); the second sees it. Motions are a rotation and
-    translation in own frames. T exp(x) moves points by ``x[:3] x p + x[3:]``, so ``g . T exp(x) p`` changes by ``(p x
-    R^T g) . x[:3] + R^T g . x[3:]``; the second camera's sign is opposite.
+    The first camera has the point at `own` (K, 3), at T (4, 4); the second sees it. gradient (K, 3): by the point.
+    Motions are a rotation and translation in own frames. T exp(x) moves points by ``x[:3] x p + x[3:]``, so ``g . T
+    exp(x) p`` changes by ``(p x R^T g) . x[:3] + R^T g . x[3:]``; the second camera's sign is opposite.
     """
     along = gradient @ T[:3, :3]
     return np.hstack([np.cross(own, along), along, -np.cross(there, gradient), -gradient])

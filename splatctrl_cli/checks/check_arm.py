@@ -145,7 +145,7 @@ def _exchanged(posture: Posture, i: int, j: int) -> Posture:
 
 
 def arm_finding(where: str, agreement: ArmAgreement, units: Iterable[float | None]) -> Finding:
-    """Finding of a camera that shows the arm in place, perhaps at another scale (units: `rescaled`)."""
+    """Finding of a camera that shows the arm in place or scaled (units: `rescaled`)."""
     share = f"{100 * agreement.seen_through:.0f} % of {agreement.num_pixels} pixels"
     seen = f"in {agreement.num_frames} depth images {share} show what is behind it"
     if agreement.is_good and agreement.scale is None:
@@ -227,7 +227,7 @@ def _arm_findings(
 def _own_offsets(
     timings: Mapping[str, tuple[float, float]], model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture
 ) -> dict[str, float]:
-    """Offsets of cameras that fit much better at their own than the median; else a pose may be off."""
+    """Offsets that fit much better than the median's; other differences have other causes."""
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
     kept = {}
     for camera, (offset_s, misfit) in timings.items():

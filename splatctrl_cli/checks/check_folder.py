@@ -118,7 +118,7 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
 
 
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
-    """Log brightness (N, B) by bands of rows, less a parabola; 0 if bands explain little.
+    """Log brightness (N, B) by bands of rows, less a parabola; 0 if unexplained.
 
     Shadows and pose errors do not follow rows; gloss and vignetting vary slowly, lamps on mains within 10 or 8 ms.
     """

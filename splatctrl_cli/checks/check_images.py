@@ -18,7 +18,7 @@ SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """Every `stride`-th pixel: depth (h, w) [m] or colour (h, w, 3); full width, height [px]."""
+    """Every `stride`-th pixel of depth (h, w) [m] or colour; full width, height [px]."""
 
     stamp_ns: int
     stride: int

@@ -21,7 +21,7 @@ FINE = np.linspace(0.92, 1.08, 17)
 
 @dataclass(frozen=True, kw_only=True)
 class _View:
-    """A reduced view: normals (h, w, 3), 0 if unknown, and points (K, 3), camera frame."""
+    """A reduced view: normals (h, w, 3), 0 if unknown; points (K, 3), camera frame."""
 
     frame: RgbdFrame
     surface: Float64
@@ -249,7 +249,7 @@ def _view(frame: RgbdFrame) -> _View:
 
 
 def _landed(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Bool, Float64, Float64]:
-    """View a's points (K, 3) in b's frame, hits on depth (K,), b's surface and normals (K, 3)."""
+    """View a's points (K, 3) in b's frame, hits (K,), b's surface and normals."""
     points = transform_points(_transform(a, b), a.points * scale_a)
     lands, surface, normals = landed(points, b)
     return points, lands, surface * scale_b, normals

@@ -1,4 +1,4 @@
-"""Ranges of configuration keys, declared beside their defaults; checks and docs follow."""
+"""Ranges of configuration keys, declared with their defaults; checks and docs follow."""
 
 import copy
 import typing

@@ -57,7 +57,10 @@ def conformal_bound(misses: Float64, confidence: float) -> ConformalBound | None
 
 
 def conformal_rank(num_scores: int, confidence: float) -> int:
-    """Rank, from 1, of the bounding score: ``ceil((n + 1) * confidence)``; n + 1 if none."""
+    """Rank of the bounding score, from 1: ``ceil((n + 1) * confidence)``.
+
+    n + 1 if none bounds.
+    """
     return math.ceil((num_scores + 1) * confidence - ROUNDING)
 
 

@@ -220,7 +220,7 @@ REACH = BANDS[-1][1]  # [m] of true distance that is compared
 
 @dataclass(frozen=True, kw_only=True)
 class TrueCells:
-    """Q sampled cells, world: centres, `FIELDS`, true distance (Q,) [m], and its surface point (Q, 3)."""
+    """Q sampled cells, world: centres, `FIELDS`, true distance (Q,) [m], nearest surface point."""
 
     points: Float64
     fields: Mapping[str, Float64]
@@ -233,10 +233,9 @@ class TruthComparison:
     """The accuracy against the truth, and its cell counts.
 
     num_drawn cells were sampled; num_blank have no distance (field.unknown = nan); num_near of the rest lie outside
-    the objects within 20 cm. A training camera saw the nearest surface point of num_seen, and of
-    num_outside_workspace where the scene keeps no splats. reliability: by probability form, at seen cells within 20
-    cm of a surface, either side. error_mean, error_sigma [m]: of sdf at seen cells within `PROBABILITY_NEAR`, or
-    None.
+    objects within 20 cm. A training camera saw the nearest surface point of num_seen, and of num_outside_workspace
+    where the scene keeps no splats. reliability: by probability form, at seen cells within 20 cm of a surface, either
+    side. error_mean, error_sigma [m]: of sdf at seen cells within `PROBABILITY_NEAR`, or None.
     """
 
     accuracy: FieldAccuracy
@@ -379,7 +378,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
 
 
 def _drawn_cells(grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int) -> tuple[Index, int]:
-    """Sampled cells (C, 3), in order, with centres in a box, and the count of all."""
+    """Sampled cells (C, 3), in order, of those in a box, and their number."""
     shape = np.array(grid.channels["sdf"].shape)
     first = np.maximum(np.ceil((lower - grid.origin) / grid.voxel).astype(np.int64), 0)
     last = np.minimum(np.floor((upper - grid.origin) / grid.voxel).astype(np.int64), shape - 1)

@@ -52,12 +52,12 @@ def cloud_score(
     unit: float = 1.0,
     threads: int = 1,
 ) -> dict[str, float]:
-    """Distances between the surface's points (P, 3) and the reference's (R, 3) [m], world; seen (R,).
+    """Distances [m] between points (P, 3) of a surface and a reference (R, 3), world.
 
     As DTU's evaluation and jzhangbs/DTUeval-python, eval.py: means of distances below `max_distance`; others count
-    only in the `*_beyond` shares. accuracy [m]: surface points, of counts (P,) or all, to the reference.
-    completeness: the whole reference to the surface. chamfer: the mean of both. completeness_seen: of points that a
-    training camera saw. nan without points. unit: metres per unit of the reference's file, for messages. Raises
+    only in the `*_beyond` shares. accuracy: surface points, of counts (P,) or all, to the reference. completeness:
+    the whole reference to the surface. chamfer: the mean of both. completeness_seen: of points that a training camera
+    saw (R,). nan without points. unit: metres per unit of the reference's file, for messages. Raises
     NotEvaluableError without near points, or if another unit fits.
     """
     if not max_distance > 0:
@@ -145,7 +145,10 @@ def spaced(points: Float64, spacing: float) -> Float64:
 
 
 def thinned(points: Float64, spacing: float) -> Float64:
-    """The first of the points (P, 3) per cube of edge `spacing` [m]; thinning parts before is harmless."""
+    """The first of points (P, 3) per cube of edge `spacing` [m].
+
+    Thinning parts before changes nothing.
+    """
     _check_spacing(spacing)
     if not len(points):
         return points
@@ -162,7 +165,7 @@ def _check_spacing(spacing: float) -> None:
 
 
 def points_on(mesh: TriangleMesh, spacing: float) -> Float64:
-    """Random points (P, 3) [m] by area: four per `spacing` [m] squared, at most 2 million."""
+    """Random points (P, 3) [m] by area, four per square, at most 2 million."""
     num = min(math.ceil(4 * 0.5 * np.linalg.norm(face_normals(mesh.corners), axis=1).sum() / spacing**2), MAX_POINTS)
     return drawn_on(mesh, num, np.random.default_rng(0))[0]
 
@@ -295,7 +298,7 @@ def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float
 
 
 def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: Box) -> tuple[Float64, Float64, int]:
-    """Surface points (M, 3) in a box, their eyes (M, 3), and the edges left out."""
+    """Surface points (M, 3) in a box, their eyes, and the edges left out."""
     if counted is not None and [mask.shape for mask in counted] != [frame.depth.shape for frame in frames]:
         raise InputError(
             f"counted: expected a mask of the size of each of {len(frames)} frames, got {len(counted)} masks"

@@ -59,7 +59,7 @@ LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
 
 @dataclass(frozen=True, kw_only=True)
 class Shown:
-    """The row of a state table for a figure: `column` at its "least", "largest", or word `pick`."""
+    """The row of a state table for a figure: `column` at "least", "largest", or `pick`."""
 
     column: str
     pick: str
@@ -93,7 +93,7 @@ class Metric(Generic[R]):
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """A column (T,) folded to a value; accumulate: up to each state from `start`, if defined."""
+    """A column (T,) folded to a value; accumulate: up to each state, if defined."""
 
     of: Callable[[Float64], float | None]
     start: float = np.nan
@@ -217,7 +217,7 @@ FIGURES = ("num_compared", "median", "p95", "largest", "largest_over", "toleranc
 def clearance_agreement(
     clearance: Float64, truth: Float64, is_seen: Bool, median_radius: float
 ) -> dict[str, float | None]:
-    """Agreement of clearance (T,) with truth (T,) [m], over states within 10 cm of a seen (T,) surface.
+    """Agreement of clearance with truth (T,) [m], within 10 cm of seen surface.
 
     By `FIGURES`: states compared; |clearance - truth| as median, 95 % and largest [m]; largest over-estimate [m];
     share within tolerance [m]. None without states.
@@ -238,9 +238,9 @@ def clearance_agreement(
 def mark_seen(
     seen: Bool, points_world: FloatRows, stamp_ns: Stamps, frame: RgbdFrame, *, has_clock: bool = True
 ) -> None:
-    """Set `seen` (T,) where `frame`, not later than the stamp (T,), saw the point (T, 3) [m].
+    """Set `seen` (T,) where `frame`, not later than the stamp, saw the point [m].
 
-    Points are read in blocks, and only those not yet seen.
+    points_world (T, 3) are read in blocks, only those not yet seen.
     """
     for first in range(0, len(seen), BLOCK):
         part = slice(first, first + BLOCK)

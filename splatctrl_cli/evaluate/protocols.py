@@ -186,7 +186,7 @@ def _ranges(numbers: Sequence[int]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservedSpace:
-    """Observed cells (X, Y, Z), `resolution` [m] wide, of a box from `low` to `high` (3,) [m].
+    """Observed cells (X, Y, Z), `resolution` [m] wide, of a box `low` to `high` [m].
 
     plane (4,): ``plane . (x, y, z, 1) > 0`` is above the ground [m].
     """

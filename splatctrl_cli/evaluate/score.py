@@ -189,7 +189,10 @@ def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float
 
 
 def in_front(depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool) -> float:
-    """Share of masked pixels with both depths [m] whose `depth` is nearer by IN_FRONT; nan without any."""
+    """Share of masked pixels whose `depth` is nearer than the reference by IN_FRONT.
+
+    nan without a pixel with both depths.
+    """
     both = mask & (depth > 0) & (reference > 0)
     return float(np.mean(depth[both] < reference[both] - IN_FRONT)) if both.any() else math.nan
 

@@ -177,7 +177,7 @@ def verdict_of(
     is_damaged: bool = False,
     counts: Mapping[str, int] | None = None,
 ) -> Verdict:
-    """The verdict on reasons: failed if any failed, else not evaluable if any is, else passed.
+    """The verdict: failed if any reason failed, else not evaluable if any is, else passed.
 
     No reason is not evaluable. passed: the label when passed; a failure takes the first `Reason.label`.
     """

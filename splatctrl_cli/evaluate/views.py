@@ -120,7 +120,7 @@ def _agrees(points_world: NDArray[np.floating], frame: RgbdFrame, tolerance: flo
 
 
 def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tuple[Index, Float64, Float32]:
-    """Indices (K,) of points (Q, 3) in the image, their depth (K,) [m], and the measured one."""
+    """Indices (K,) of points (Q, 3) in the image, their depth, and the measured."""
     points_camera = transform_points(invert_transform(frame.T_world_camera), points_world)
     landing = np.flatnonzero(points_camera[:, 2] > 1e-6)
     pixels = np.floor(project(frame.intrinsics, points_camera[landing]) + 0.5)
@@ -162,7 +162,7 @@ def psnr(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Boo
 def ssim_map(
     image: NDArray[np.floating], reference: NDArray[np.floating], *, is_zero_padded: bool = False
 ) -> Float64:
-    """Structural similarity (H, W, 3) of images (H, W, 3) in [0, 1] (Wang et al. 2004).
+    """Structural similarity (H, W, 3) of images in [0, 1] (Wang et al. 2004).
 
     Gaussian window 11×11, sigma 1.5, C1 = 0.01², C2 = 0.03², population moments. The border is mirrored with its edge
     pixel. Zero-padding, as in 3D Gaussian splatting (graphdeco-inria/gaussian-splatting, utils/loss_utils.py), hides
@@ -180,7 +180,7 @@ def ssim_map(
 
 
 def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool, fill: float) -> float:
-    """SSIM of images (H, W, 3) in [0, 1], `fill` outside the mask, as in NeRF's papers.
+    """SSIM of images in [0, 1], `fill` outside the mask, as in NeRF's papers.
 
     scikit-image's default (skimage/metrics/_structural_similarity.py before 0.20): box window of 7 pixels, sample
     moments, data range 2 for floats, 3 border pixels left out. That range lifts the figure: compare only within its

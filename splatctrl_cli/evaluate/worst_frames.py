@@ -71,7 +71,7 @@ def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> 
 
 
 def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Sight | None]:
-    """The newest image up to each moment, of the camera that sees its worst sphere best, or None.
+    """The newest image up to each moment that best shows its worst sphere, or None.
 
     One pass over frames (by stamp), one kept per camera.
     """
@@ -91,7 +91,7 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
 
 
 def draw_sight(path: Path, sight: Sight) -> None:
-    """Write the image with silhouettes of spheres, the worst bold, a line to its obstacle, and the caption."""
+    """Write the image with silhouettes, the worst bold, a line to its obstacle, and caption."""
     moment, frame = sight.moment, sight.frame
     zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
     image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)

@@ -69,7 +69,7 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
 
 
 def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
-    """Write slices of `probability` through the cell at `point` [m], with the surface as a line."""
+    """Write slices of `probability` through the cell at `point` [m], with the surface."""
     with _panels(grid, point) as (figure, panels):
         for axes, cut in panels:
             image = axes.imshow(
@@ -190,9 +190,9 @@ def _surface(axes: Any, cut: Cut, grid: DistanceGrid, color: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Reliability:
-    """B bins of probability: edges (B + 1,), mean prediction, collided share (NaN if empty), count (B,).
+    """B bins of probability: edges (B + 1,), mean prediction, collided share, count (B,).
 
-    calibration_error: mean |predicted - observed|, weighted by count.
+    Empty bins have NaN. calibration_error: mean |predicted - observed|, weighted by count.
     """
 
     edges: Float64

@@ -238,7 +238,7 @@ MORE = "\n... and {} more that do not fit here\n"
 
 
 def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> None:
-    """In a GitHub Actions step only: annotations to `stream`, and the table to the step's summary.
+    """Print annotations, and append a table to the step's summary, in GitHub Actions only.
 
     stream: stdout or stderr. is_fatal: the exit code is not 0; else annotations are warnings. Raises OSError if the
     summary cannot be written.

@@ -39,7 +39,7 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """An arm over T states: seconds (T,) since the first; poses (T, L, 4, 4), world.
+    """An arm over T states: seconds (T,) from the first; poses (T, L, 4, 4), world.
 
     bodies (L): by link, in its frame. path (T, 3) [m]: the end effector, world. clearance (T,) [m]: NaN if unknown.
     """
@@ -112,7 +112,7 @@ def bodies_of(surface: RobotSurface) -> dict[str, Surface]:
 
 
 def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
-    """size (3,): half edges; radius and half length of a cylinder or capsule; radius of a ball."""
+    """size (3,): half edges; radius, half length of a cylinder or capsule; radius of a ball."""
     if kind == BOX:
         return trimesh.creation.box(extents=2 * size)
     if kind == BALL:
@@ -124,7 +124,7 @@ def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
 
 
 def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
-    """Centres (K, 3) [m] and edge [m] of at most `most` cubes on the border of unknown voxels (X, Y, Z).
+    """Centres (K, 3) [m] and edge [m] of at most `most` cubes on unknown space's border.
 
     Cubes of 2, 3, ... voxels a side are unknown by half or more.
     """
@@ -200,7 +200,10 @@ def packed(space: Space) -> str:
 
 
 def _add(block: bytearray, values: ArrayLike, kind: type[np.generic]) -> list[Any]:
-    """Append values to the block by column, which deflates best, padded to 4 bytes: [type, first byte, count]."""
+    """Append values, padded to 4 bytes: [type, first byte, count].
+
+    Columns deflate better than rows.
+    """
     array, start = np.asarray(values, kind), len(block)
     block += np.ascontiguousarray(array.T).tobytes()
     block += bytes(-len(block) % 4)

@@ -44,9 +44,9 @@ STYLE: Any = {  # matplotlib types its keys as one long literal
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonRow:
-    """A view: photo (H, W, 3) uint8, render (H, W, 3) in [0, 1], depths (H, W) [m], 0 = none.
+    """A view's photo (H, W, 3) uint8, render in [0, 1], and depths (H, W) [m].
 
-    `figures`: the render's quality in words; mask (H, W): pixels that count.
+    Depth 0 is none. `figures`: the render's quality in words; mask (H, W): pixels that count.
     """
 
     title: str
@@ -81,7 +81,7 @@ def field_slice_picture(
     spheres: tuple[Float64, Float64] | None = None,
     title: str = "",
 ) -> None:
-    """Write the slice of `sdf` across `axis` (0, 1, 2 = x, y, z) nearest to `value` [m].
+    """Write the slice of `sdf` across `axis` (0, 1, 2) nearest to `value` [m].
 
     Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] show
     as cut circles. Raises NotEvaluableError outside the grid.

@@ -73,7 +73,7 @@ def clearance_picture(
     title: str,
     events: Mapping[str, Intervals],
 ) -> None:
-    """Write clearance curves (T,) [m] over `seconds` (T,), in cm, with the margin [m] and event strips.
+    """Write clearance curves (T,) [m] over `seconds` (T,), with margin [m] and event strips.
 
     NaN leaves gaps; below the margin is shaded, minima are marked.
     """
@@ -106,7 +106,7 @@ def clearance_picture(
 
 
 def evidence_picture(path: Path, seconds: Float64, shares: Float64) -> None:
-    """Write stacked shares (T, C) by `EvidenceClass` of the space within the margin, over `seconds` (T,).
+    """Write stacked shares (T, C) by `EvidenceClass` of the space within the margin.
 
     Rows with NaN are left out.
     """
@@ -255,7 +255,7 @@ def _clearance_curve(axes: Any, seconds: Float64, metres: FloatRows, name: str) 
 
 
 def _limit_axis(axes: Any, joint: str, limit: float, peak: float, beneath: float) -> None:
-    """Scale a joint's axis to its curves; the limit as text, and as a line if visible."""
+    """Scale a joint's axis to its curves, with its limit."""
     height = max(1.25 * max(peak, beneath), SMALLEST)
     axes.set_ylim(-height, height)
     for side in (-limit, limit):
@@ -315,7 +315,10 @@ class Envelope:
 
 
 def envelope(seconds: Float64, values: Float64, columns: int = 1000) -> Envelope:
-    """Ranges of values (T,) in `columns` equal parts of time (T,), exact up to two states each."""
+    """Ranges of values (T,) in `columns` equal parts of time (T,).
+
+    Up to two states per column, the values themselves.
+    """
     values = np.asarray(values, dtype=np.float64)
     if len(values) <= 2 * columns:
         return Envelope(seconds=seconds, lowest=values, highest=values)

@@ -227,9 +227,10 @@ def covering_spheres(shapes: tuple[Capsule | Block, ...]) -> list[tuple[Float64,
 
 
 def _spines(shape: Capsule | Block) -> list[tuple[Float64, Float64, float]]:
-    """Segments (start, end) and tube radii: a capsule's, or of a box's bars along the longest side.
+    """Segments (start, end) and tube radii, of a capsule or a box's bars.
 
-    Bar segments end half a step early: corners are as far from the last sphere as edges between spheres.
+    Bars lie along the longest side. They end half a step early: corners are as far from the last sphere as edges
+    between spheres.
     """
     if isinstance(shape, Capsule):
         return [(np.array(shape.start, dtype=float), np.array(shape.end, dtype=float), shape.radius)]

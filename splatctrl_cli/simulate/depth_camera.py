@@ -40,7 +40,10 @@ class StereoDepth:
     width: int | None = None
 
     def applied(self, depth: Float32, rng: np.random.Generator, *, focal: float = 0.0) -> Float32:
-        """Measured depth (H, W) [m] of exact `depth`, 0 = none; focal [px]: the image's (0: the imagers')."""
+        """Measured depth (H, W) [m] of exact `depth`, 0 = none.
+
+        focal [px]: the image's (0: the imagers').
+        """
         imager = FOCAL * (self.width or depth.shape[1]) / WIDTH
         scale = focal / imager if focal > 0 else 1.0  # pixels of the image in one of the imagers
         exact = np.where(depth > 0, imager * BASELINE / np.where(depth > 0, depth, 1.0), 0.0)
@@ -105,7 +108,10 @@ class DepthNoise:
     baseline: float = 0.0
 
     def applied(self, depth: Float32, rng: np.random.Generator, *, focal: float = 0.0) -> Float32:
-        """Noisy depth (H, W) [m] of exact `depth`, 0 = none; focal [px]: for a baseline."""
+        """Noisy depth (H, W) [m] of exact `depth`, 0 = none.
+
+        focal [px]: needed for a baseline.
+        """
         coarse = (depth.shape[0] // self.patch + 3, depth.shape[1] // self.patch + 3)
         error = _enlarged(rng.standard_normal(coarse), self.patch, depth.shape)
         lost = _enlarged(rng.standard_normal(coarse), self.patch, depth.shape)

@@ -80,7 +80,7 @@ def _hash(lattice: np.ndarray, seed: int) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class Track:
-    """Poses (K, 4, 4) of a solid at increasing stamps (K,) int64 [ns]; at rest outside.
+    """Poses (K, 4, 4) at increasing stamps (K,) int64 [ns]; at rest outside.
 
     In between, the origin moves linearly and the solid rotates about one axis, uniformly.
     """
@@ -108,9 +108,10 @@ class Track:
 
 @dataclass(frozen=True, kw_only=True)
 class Primitive:
-    """A `box` (full x, y, z), `cylinder` (radius, height), `sphere` (radius) or `capsule` (radius, axis length) [m].
+    """One solid: box, cylinder, sphere or capsule.
 
-    T_world_shape (4, 4): its pose, the first if it moves. It is present while from_ns <= stamp < to_ns.
+    size [m]: full x, y, z; radius, height; radius; or radius, axis length. T_world_shape (4, 4): its pose, the first
+    if it moves. It is present while from_ns <= stamp < to_ns.
     """
 
     name: str
@@ -156,7 +157,7 @@ def box(name: str, size: tuple[float, ...], middle: Sequence[float], texture: Te
 
 
 def closest_point(primitive: Primitive, points_world: Float64) -> tuple[Float64, Float64]:
-    """Signed distance (Q,) [m], negative inside, and surface point (Q, 3) of points (Q, 3), world."""
+    """Signed distance (Q,) [m], negative inside, and surface point of points (Q, 3), world."""
     p = transform_points(invert_transform(primitive.T_world_shape), points_world)
     if primitive.kind == "sphere":
         surface = p / np.maximum(np.linalg.norm(p, axis=1, keepdims=True), 1e-300) * primitive.size[0]
@@ -206,7 +207,7 @@ def _capsule_closest(p: Float64, radius: float, half: float) -> tuple[Float64, F
 
 
 def hit(primitive: Primitive, origin_world: Float64, directions_world: Float64) -> Float64:
-    """Parameter t (R,) of the first hit of origin + t * directions (R, 3), or inf."""
+    """Parameter (R,) of the first hit of origin + t * directions, or inf."""
     T_shape_world = invert_transform(primitive.T_world_shape)
     origin = T_shape_world[:3, :3] @ origin_world + T_shape_world[:3, 3]
     directions = directions_world @ T_shape_world[:3, :3].T

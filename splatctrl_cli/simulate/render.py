@@ -68,7 +68,7 @@ class Renderer:
         self._cast(static, self._depth, self._color)
 
     def image(self, moving: Sequence[Primitive], meshes: Meshes | None = None) -> tuple[UInt8, Float32]:
-        """color (H, W, 3) uint8 and depth (H, W) float32 [m], 0 = none, with `moving` and `meshes`."""
+        """Colour (H, W, 3) uint8 and depth (H, W) float32 [m], 0 = none."""
         depth, color = self._depth.copy(), self._color.copy()
         self._cast(moving, depth, color)
         for ray, mine, faces in self._nearest_faces(meshes, depth):
@@ -86,7 +86,7 @@ class Renderer:
         return np.where(np.isfinite(depth[0]), depth[0], 0).astype(np.float32)
 
     def _cast(self, primitives: Sequence[Primitive], depth: Float64, color: Float64) -> None:
-        """Lower `depth` (5, H, W) and set `color` (5, H, W, 3) where a primitive is nearest."""
+        """Lower `depth` (5, H, W) and set `color` where a primitive is nearest."""
         origin = self.camera.T_world_camera[:3, 3]
         owner = self._nearest(primitives, depth)
         for index, primitive in enumerate(primitives):
@@ -96,7 +96,7 @@ class Renderer:
                 color[mine] = shaded(primitive, points_world)
 
     def _nearest(self, primitives: Sequence[Primitive], depth: Float64) -> NDArray[np.int64]:
-        """Lower `depth` (K, H, W) of K rays per pixel; index of the nearest primitive, or -1."""
+        """Lower `depth` (K, H, W); index of the nearest primitive, or -1."""
         origin = self.camera.T_world_camera[:3, 3]
         owner = np.full(depth.shape, -1)
         for index, primitive in enumerate(primitives):
@@ -111,7 +111,7 @@ class Renderer:
     def _nearest_faces(
         self, meshes: Meshes | None, depth: Float64
     ) -> Iterator[tuple[int, Bool, NDArray[np.integer]]]:
-        """Lower `depth` (K, H, W); per ray, pixels (H, W) where a triangle is nearest, and its number."""
+        """Lower `depth` (K, H, W); per ray, pixels of nearer triangles, and their numbers."""
         if meshes is None:
             return
         k = self.camera.intrinsics

@@ -53,7 +53,7 @@ def distance_to(primitives: Sequence[Primitive], points_world: Float64, stamp_ns
 
 
 def closest_of(primitives: Sequence[Primitive], points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
-    """Signed distance (Q,) [m] and surface point (Q, 3) of the nearest solid (inf, NaN for none)."""
+    """Signed distance (Q,) [m] and surface point of the nearest solid (inf, NaN: none)."""
     points = np.asarray(points_world, dtype=np.float64)
     distance = np.full(len(points), np.inf)
     surface = np.full((len(points), 3), np.nan)
