@@ -200,7 +200,6 @@ class Adjustment:
         estimate: Estimate,
         reach: float,
     ) -> Rows:
-        """Rows of view a's points on view b's surface."""
         (scale_a, bias_a), (scale_b, bias_b) = estimate.depth_of(a.camera), estimate.depth_of(b.camera)
         points = a.points * (scale_a + bias_a / a.points[:, 2])[:, None]
         T = invert_transform(T_b) @ T_a
@@ -245,7 +244,6 @@ class Adjustment:
         )
 
     def _robot(self, frame: RgbdFrame, estimate: Estimate, reach: float) -> Rows | None:
-        """Rows of a frame's points on the robot's surface."""
         assert self.evidence.arm is not None
         scale, bias = estimate.depth_of(frame.camera)
         depth = np.where(frame.depth > 0, scale * frame.depth + bias, 0.0).astype(np.float32)

@@ -140,7 +140,6 @@ def _apart(solution: Solution, other: Estimate) -> float:
 
 
 def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
-    """Raise NotEvaluableError naming groups of cameras without shared surfaces."""
     evidence = adjustment.evidence
     group = {name: {name} for name in (*evidence.cameras, ROBOT)}
     for (a, b), count in adjustment.normal(estimate, WIDE[-1]).counts.items():
@@ -269,7 +268,6 @@ def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
 
 
 def _far(solution: Solution, camera: str) -> float:
-    """90th percentile of a camera's depths [m]; 0 without points."""
     seen = [view.points[:, 2] for view in solution.adjustment.evidence.views if view.camera == camera]
     depths = np.concatenate(seen)
     return float(np.percentile(depths, 90)) if len(depths) else 0.0

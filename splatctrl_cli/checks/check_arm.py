@@ -227,7 +227,7 @@ def _arm_findings(
 def _own_offsets(
     timings: Mapping[str, tuple[float, float]], model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture
 ) -> dict[str, float]:
-    """Offsets that fit much better than the median's; other differences have other causes."""
+    """Offsets that fit much better than the median's; others have other causes, as a misplaced camera."""
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
     kept = {}
     for camera, (offset_s, misfit) in timings.items():

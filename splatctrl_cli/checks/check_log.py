@@ -123,7 +123,6 @@ def _lacks(log: RawLog, found: Survey, options: SourceOptions) -> list[str]:
 
 
 def _parted(lack: str) -> tuple[str, str]:
-    """The lack and its remedy."""
     what, _, remedy = lack.rpartition("; ")
     return (what, remedy) if what else (remedy, "")
 

@@ -185,7 +185,6 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
 
 
 def _positions(states: Sequence[JointState]) -> Iterator[Float64]:
-    """(T, J), in blocks."""
     return (
         blocks_of(states.position)
         if isinstance(states, StateColumns)
@@ -194,7 +193,6 @@ def _positions(states: Sequence[JointState]) -> Iterator[Float64]:
 
 
 def _posed(states: Sequence[JointState]) -> Index:
-    """Indices of states with an end-effector pose."""
     if isinstance(states, StateColumns) and states.T_base_ee is None and states.T_world_ee is None:
         return np.zeros(0, dtype=np.int64)
     has_pose = (s.T_base_ee is not None or s.T_world_ee is not None for s in states)

@@ -212,7 +212,6 @@ def _pose_finding(move: Move, cameras: Sequence[str]) -> Finding:
 
 
 def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """Equally many frames per camera."""
     cameras = sorted({frame.camera for frame in frames})
     each = max(2, min(8, limits.VIEWS // max(len(cameras), 1)))
     of_cameras = [[frame for frame in frames if frame.camera == camera] for camera in cameras]
@@ -231,7 +230,6 @@ def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
 
 
 def _with(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str) -> list[tuple[int, int]]:
-    """Pairs with a view of `camera`."""
     return [(i, j) for i, j in pairs if camera in (views[i].frame.camera, views[j].frame.camera)]
 
 
@@ -256,7 +254,6 @@ def _landed(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> t
 
 
 def _transform(a: _View, b: _View) -> Float64:
-    """T_b_a (4, 4)."""
     return invert_transform(b.frame.T_world_camera) @ a.frame.T_world_camera
 
 
@@ -311,7 +308,6 @@ def _fitting(
 
 
 def _fitted(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str) -> Float64 | None:
-    """The better result of a near and a wide start."""
     is_far = _cost(views, _with(views, pairs, camera))[1] < limits.MOVE_GOOD_SHARE
     starts = [limits.MOVE_WIDTHS, (*limits.MOVE_WIDE, *limits.MOVE_WIDTHS)] if is_far else [limits.MOVE_WIDTHS]
     found = [T for widths in starts if (T := _descended(views, pairs, camera, widths)) is not None]

@@ -219,7 +219,6 @@ def _since(camera: CameraMotion, start: int) -> Float64:
 def _near(
     states: Sequence[JointState], robot: RobotPoints | None, cameras: Sequence[CameraMotion]
 ) -> tuple[list[JointState], RobotPoints | None]:
-    """States and robot points within `_span`."""
     first, last = _span(cameras)
     near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
     points = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)

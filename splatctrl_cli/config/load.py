@@ -110,7 +110,6 @@ def sources_of(path: Path | None, assignments: Sequence[str]) -> dict[str, str]:
 
 
 def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Source, section, and values by key."""
     presets = [text.partition("=")[2].strip() for text in assignments if _is_preset(text)]
     for name in presets:
         _check_known(name, PRESETS, "--preset", "")
@@ -172,7 +171,6 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _parse_value(text: str) -> Any:
-    """A TOML value, or else a word."""
     try:
         parsed = tomllib.loads(f"value = {text}")
     except ValueError:

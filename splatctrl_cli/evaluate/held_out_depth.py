@@ -147,7 +147,7 @@ def spaced(points: Float64, spacing: float) -> Float64:
 def thinned(points: Float64, spacing: float) -> Float64:
     """The first of points (P, 3) per cube of edge `spacing` [m].
 
-    Thinning parts before changes nothing.
+    Thinning parts beforehand changes nothing.
     """
     _check_spacing(spacing)
     if not len(points):
@@ -186,7 +186,6 @@ def _nearest(points: Float64, others: Float64, limit: float, threads: int) -> Fl
 
 
 def _mean_below(distances: NDArray[np.floating], limit: float) -> tuple[float, float]:
-    """Mean of distances below the limit, and the share of others."""
     if not len(distances):
         return math.nan, math.nan
     near = distances[distances < limit]

@@ -101,7 +101,6 @@ class Fold:
 
 
 def _of_known(fold: Callable[[Float64], np.floating], values: Float64) -> float | None:
-    """A fold without NaN; None for no value."""
     there = values[~np.isnan(values)]
     return float(fold(there)) if len(there) else None
 
@@ -118,7 +117,7 @@ def lowest(values: Float64) -> float | None:
 
 
 def largest(values: Float64) -> float | None:
-    """The largest value; None if any is infinite."""
+    """The largest value; None if one is infinite, or without any."""
     there = values[~np.isnan(values)]
     return float(np.max(there)) if len(there) and np.isfinite(there).all() else None
 

@@ -173,7 +173,6 @@ def _holdout(name: str) -> ScoreProtocol:
 
 
 def _ranges(numbers: Sequence[int]) -> str:
-    """``0-3, 7``: in order."""
     runs: list[list[int]] = []
     for number in sorted(set(numbers)):
         if runs and number == runs[-1][-1] + 1:

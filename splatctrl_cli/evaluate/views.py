@@ -62,7 +62,6 @@ def views_to_score(
 
 
 def _name(camera: str, number: int) -> str:
-    """``cam3-0000``, fit for a file name."""
     return f"{camera.strip('/').replace('/', '_')}-{number:04d}"
 
 
@@ -72,7 +71,6 @@ def frames_of(source: RecordSource) -> Iterator[RgbdFrame]:
 
 
 def _moments(source: RecordSource) -> Iterator[list[RgbdFrame]]:
-    """Frames grouped by stamp."""
     moment: list[RgbdFrame] = []
     for frame in frames_of(source):
         if moment and frame.stamp_ns != moment[0].stamp_ns:

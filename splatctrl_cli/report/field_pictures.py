@@ -181,7 +181,6 @@ def _knows_seen(grid: DistanceGrid) -> bool:
 
 
 def _surface(axes: Any, cut: Cut, grid: DistanceGrid, color: str) -> None:
-    """Draw the line where sdf is 0."""
     sdf = cut.of(grid, "sdf")
     known = sdf[np.isfinite(sdf)]
     if known.size and known.min() < 0 < known.max() and min(sdf.shape) > 1:

@@ -211,7 +211,6 @@ def _add(block: bytearray, values: ArrayLike, kind: type[np.generic]) -> list[An
 
 
 def _points(block: bytearray, points: NDArray[np.floating]) -> dict[str, Any]:
-    """Points (K, 3) within their box, by column."""
     values = np.asarray(points, np.float64).reshape(-1, 3)
     lower, upper = (values.min(axis=0), values.max(axis=0)) if len(values) else (np.zeros(3), np.zeros(3))
     step = np.where(upper > lower, (upper - lower) / STEPS, 1.0)

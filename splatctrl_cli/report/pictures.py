@@ -202,7 +202,6 @@ def draw_never_seen(axes: Any, coordinates: Sequence[Float64], never_seen: NDArr
 
 
 def _explain(axes: Any, *, has_spheres: bool, has_observed: bool) -> None:
-    """Draw a legend under the picture."""
     entries = []
     if has_spheres:
         entries.append(

@@ -140,7 +140,6 @@ def _curves(axis: _Axis, seconds: Float64, curves: Mapping[str, Float64]) -> Ite
 
 
 def _pieces(values: Float64) -> list[slice]:
-    """Runs of finite values."""
     there = np.concatenate([[False], np.isfinite(values), [False]])
     edges = np.flatnonzero(there[1:] != there[:-1])
     return [slice(first, last) for first, last in zip(edges[::2], edges[1::2], strict=True)]

@@ -66,7 +66,6 @@ def _value_noise(p: Float64, seed: int) -> Float64:
 
 
 def _hash(lattice: np.ndarray, seed: int) -> Float64:
-    """A pseudo-random value (R,) in [0, 1) per integer point (R, 3)."""
     x, y, z = (lattice[:, i].astype(np.uint64) for i in range(3))
     key = x * np.uint64(0x9E3779B97F4A7C15) ^ y * np.uint64(0xC2B2AE3D27D4EB4F) ^ z * np.uint64(0x165667B19E3779F9)
     key ^= np.uint64(seed * 0x27D4EB2F + 0x85EBCA6B)
@@ -244,7 +243,6 @@ def normals(primitive: Primitive, points_shape: Float64) -> Float64:
 
 
 def _cylinder_span(origin: Float64, directions: Float64, radius: float, half: float) -> tuple[Float64, Float64]:
-    """Interval of t inside a cylinder along z."""
     side = _round_span(origin[:2], directions[:, :2], radius)
     caps = _slab_span(origin[2:], directions[:, 2:], np.array([half]))
     return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])

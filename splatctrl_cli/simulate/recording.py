@@ -213,7 +213,6 @@ class Recording:
 
     @cached_property
     def _renderers(self) -> list[Renderer]:
-        """One per camera, with permanent solids cast."""
         static, rays = self.primitives[: len(self.primitives) - len(self._temporary)], self.options.color_rays
         return [Renderer(camera, static, color_rays=rays) for camera in self.cameras]
 
