@@ -96,7 +96,7 @@ def _plain_corners(board: Board, gray: UInt8) -> Float64 | None:
     if ax * by - ay * bx < 0:  # as in a mirror
         grid = grid[:, ::-1]
     first, second = _brightness(gray, grid[:2, :2]), _brightness(gray, grid[:2, 1:3])
-    if first > second:  # of the inner squares, that beside the first corner is as the corner of the board
+    if first > second:  # the inner square at the first corner has the colour of the board's corner
         grid = grid[::-1, ::-1]
     return grid.reshape(-1, 2)
 

@@ -26,7 +26,7 @@ class CalibratedCamera:
     T (4, 4): T_world_camera if stationary, T_recorded_camera if moving. recorded (4, 4): the recording's
     T_world_camera, None if moving. scale, bias [m]: the true depth is ``scale depth + bias``. sigma_position (3,)
     [m], sigma_rotation (3,) [rad]: in the world's axes, a moving camera's own. depth_noticed: the least |scale - 1|
-    and |bias| [m] to be solved for, inf if none. unobserved: directions kept as recorded.
+    and |bias| [m] to be solved for, inf if none. held: parts not solved for. unobserved: directions kept as recorded.
     """
 
     T: Float64

@@ -64,7 +64,7 @@ def solved(evidence: Evidence, start: Estimate, held: Sequence[str]) -> Solution
     best = _whole(adjustment, rough[order[0]], start)
     near = [rough[i] for i in order[1:] if costs[i] < fixed.CALIBRATION_RIVAL * costs[order[0]]]
     others = [one for one in near if _apart(best, one) > fixed.CALIBRATION_OTHER[0]]
-    if not others or not best.certainty.is_full:  # what is not observed is not told from another place
+    if not others or not best.certainty.is_full:  # unobserved directions allow other places
         return best
     other = _whole(adjustment, others[0], start)
     return best if _apart(best, other.estimate) < fixed.CALIBRATION_OTHER[0] else _better(best, other)

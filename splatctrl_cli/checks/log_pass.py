@@ -39,7 +39,7 @@ _FIRST_FIELD = re.compile(r"^(?:std_msgs/(?:msg/)?)?Header\s+\w+")
 class LogWatch:
     """A log that observes messages read by another, decoding images as needed.
 
-    num_images: reading ends at this many of a topic. files: first and last log time.
+    num_images: reading ends at this many of a topic. spans: first and last log time [ns] by file.
     """
 
     def __init__(self, log: RawLog, options: SourceOptions, num_images: int | None = None) -> None:

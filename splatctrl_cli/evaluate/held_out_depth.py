@@ -133,7 +133,7 @@ def spaced(points: Float64, spacing: float) -> Float64:
     some = some[np.random.default_rng(0).permutation(len(some))]
     low, high = (cKDTree(some).query_pairs(spacing, output_type="ndarray") if len(some) else NO_PAIRS).T
     is_open, kept = np.ones(len(some), np.bool_), np.zeros(len(some), np.bool_)
-    while is_open.any():  # who waits for no earlier one stays, and all near those go: what taking them in turn leaves
+    while is_open.any():  # points without an earlier open neighbour stay, their neighbours go: as if in turn
         first = is_open.copy()
         first[high] = False
         kept |= first
@@ -165,7 +165,7 @@ def _check_spacing(spacing: float) -> None:
 
 
 def points_on(mesh: TriangleMesh, spacing: float) -> Float64:
-    """Random points (P, 3) [m] by area, four per square, at most 2 million."""
+    """Random points (P, 3) [m] by area, four per squared `spacing`, at most 2 million."""
     num = min(math.ceil(4 * 0.5 * np.linalg.norm(face_normals(mesh.corners), axis=1).sum() / spacing**2), MAX_POINTS)
     return drawn_on(mesh, num, np.random.default_rng(0))[0]
 
@@ -208,9 +208,9 @@ class HeldOutComparison:
     """Errors [m] against held-out depth, and counts of points.
 
     on_surface: at measured points, whose distance is 0. before: on the rays in front; `seen` points have a ball, up
-    to the nearest measured point, seen free, so under-estimates count too. over_estimate is over all points.
-    num_edges pixels were left out at depth edges; num_outside points lie outside the grid, num_unknown at a corner
-    without distance.
+    to the nearest measured point, seen free, so under-estimates count too. over_estimate is over all points, as it is
+    sound everywhere. num_edges pixels were left out at depth edges; num_outside points lie outside the grid,
+    num_unknown at a corner without distance.
     """
 
     on_surface: dict[str, BandAccuracy]
@@ -317,7 +317,7 @@ def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: 
 
 
 def depth_edges(depth: NDArray[np.float32]) -> Bool:
-    """(H, W) True where a neighbour's depth differs by a share of the smaller."""
+    """(H, W) True where a neighbour's depth differs by more than a share of the smaller."""
     is_edge = np.zeros(depth.shape, dtype=np.bool_)
     for axis in (0, 1):
         here, there = [slice(None)] * 2, [slice(None)] * 2
