@@ -59,7 +59,10 @@ LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
 
 @dataclass(frozen=True, kw_only=True)
 class Shown:
-    """The row of a state table for a figure: `column` at "least", "largest", or `pick`."""
+    """The row of a state table that shows a figure: where `column` is `pick`.
+
+    pick: "least", "largest", or a word of the column.
+    """
 
     column: str
     pick: str

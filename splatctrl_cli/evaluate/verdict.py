@@ -179,7 +179,7 @@ def verdict_of(
 ) -> Verdict:
     """The verdict: failed if any reason failed, else not evaluable if any is, else passed.
 
-    No reason is not evaluable. passed: the label when passed; a failure takes the first `Reason.label`.
+    Without any reason it is not evaluable. passed: the label when passed; a failure takes the first `Reason.label`.
     """
     given = list(reasons)
     if not given:
