@@ -1,3 +1,1 @@
-"""Where cameras stand against each other and the robot, from what they see: residuals, their least squares, and how
-sure it is.
-"""
+"""Camera poses relative to each other and the robot: residuals, least squares and certainty."""

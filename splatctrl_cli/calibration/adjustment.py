@@ -1,6 +1,6 @@
-"""The least squares of a calibration: distances between what cameras see, and from the robot's surface.
+"""Least squares of a calibration, over distances between views and from the robot's surface.
 
-Gauss-Newton on all of them together in float64, weighed by Tukey's biweight whose width narrows from round to round.
+Gauss-Newton in float64; Tukey's biweight narrows from round to round.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,11 +19,11 @@ ROBOT = "the robot"
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Residuals (M,) [m] of one pair of views, or of one frame and the robot, with what each may err by, sigma (M,);
-    jacobian (M, 17) by the unknowns of the two cameras and the clock, which stand in `columns` (17,). between: whose
-    they are; clusters (M,): residuals of one number, of all rows of one word `alike`, err alike; num_laid: points
-    that should lie on what the other sees, those beyond the reach included; num_hidden: of these, those before which
-    something else stands.
+    """Residuals (M,) [m] and their sigma of two views, or of a frame and the robot.
+
+    jacobian (M, 17): by the two cameras' unknowns and the clock, in `columns` (17,). clusters (M,): equal numbers of
+    the same `alike` have correlated errors. num_laid: points that should lie on the other's surface, even beyond the
+    reach; num_hidden: the occluded of them.
     """
 
     between: tuple[str, str]
@@ -39,9 +39,7 @@ class Rows:
 
 @dataclass(frozen=True, kw_only=True)
 class Widths:
-    """How far residuals may be from 0 and count: reach [m], beyond which nothing is laid on each other, and cut, in
-    sigmas, None where the reach alone decides.
-    """
+    """Residuals that count: within reach [m] and cut [sigma]; None for the reach alone."""
 
     reach: float
     cut: float | None = None
@@ -49,9 +47,9 @@ class Widths:
 
 @dataclass(kw_only=True)
 class Normal:
-    """The normal equations at an estimate: H (P, P), g (P,), and of each cluster its part of g, scores (C, P).
+    """Normal equations H (P, P), g (P,); scores (C, P): g by cluster.
 
-    counts: residuals that count, by the two that they are between; spread: sigmas that the residuals err by (robust).
+    counts: residuals that count, by pair; spread: their robust standard deviation [sigma].
     """
 
     H: Float64
@@ -62,10 +60,10 @@ class Normal:
 
 
 class Adjustment:
-    """The residuals of some evidence, and the estimate that makes them least."""
+    """Residuals of evidence, and the estimate that minimises them."""
 
     def __init__(self, evidence: Evidence, unknowns: Unknowns, basis: Float64 | None = None) -> None:
-        """basis (P, K): the directions that steps are taken in, None for all."""
+        """basis (P, K): directions of steps, None for all."""
         self.evidence = evidence
         self.unknowns = unknowns
         self._basis = np.eye(unknowns.size) if basis is None else basis
@@ -73,9 +71,7 @@ class Adjustment:
     def solved(
         self, estimate: Estimate, schedule: Sequence[Widths], rounds: int = fixed.CALIBRATION_ROUNDS
     ) -> Estimate:
-        """The estimate after a round of each of the widths, and as many more of the last ones at most, until it stays
-        where it is.
-        """
+        """The estimate after a round per width, and `rounds` more at most until convergence."""
         start, step = estimate, np.zeros(self.unknowns.size)
         for number, widths in enumerate((*schedule, *(schedule[-1],) * rounds)):
             normal = self.normal(estimate, widths)
@@ -86,8 +82,9 @@ class Adjustment:
         return estimate
 
     def _step(self, normal: Normal, estimate: Estimate, start: Estimate, hold: float) -> Float64:
-        """Of Gauss-Newton; what nothing speaks of stays near where it began, and all else, too, by a share `hold` of
-        what the residuals weigh: while they still reach far, points laid on the wrong surface pull.
+        """The Gauss-Newton step; unobserved directions stay near the start.
+
+        So do all others by a share `hold` of the residuals' weight: at large reach, wrong surfaces pull.
         """
         weight, offset = self._prior(estimate, start)
         weight = weight + hold * float(np.trace(normal.H)) / len(weight)
@@ -96,7 +93,7 @@ class Adjustment:
         return np.asarray(np.clip(step, -fixed.CALIBRATION_STEP, fixed.CALIBRATION_STEP))
 
     def _prior(self, estimate: Estimate, start: Estimate) -> tuple[Float64, Float64]:
-        """Weight (P,) of a very wide prior about where the estimate began, and how far it is from there (P,)."""
+        """Weight (P,) of a wide prior at the start, and offset from it (P,)."""
         sigma, offset = np.ones(self.unknowns.size), np.zeros(self.unknowns.size)
         for camera in self.unknowns.cameras:
             columns = self.unknowns.columns(camera)
@@ -111,7 +108,7 @@ class Adjustment:
         return 1 / np.square(sigma), offset
 
     def normal(self, estimate: Estimate, widths: Widths, *, with_robot: bool = True) -> Normal:
-        """The normal equations; with_robot: also of the robot's surface."""
+        """The normal equations, optionally without the robot."""
         P = self.unknowns.size
         H, g = np.zeros((P, P)), np.zeros(P)
         scores: list[Float64] = []
@@ -147,8 +144,9 @@ class Adjustment:
         return Normal(H=H, g=g, scores=np.array(scores).reshape(-1, P), counts=counts, spread=spread)
 
     def cost(self, estimate: Estimate, reach: float) -> tuple[float, int]:
-        """How badly the estimate fits: the mean square of residuals in sigmas, each cut at `CALIBRATION_CUT`, of
-        those between each two, and the mean of these; and how many points could be compared.
+        """Misfit, and the number of points compared.
+
+        The misfit averages, over pairs, the mean squared residual [sigma], each cut at `CALIBRATION_CUT`.
         """
         sums: dict[tuple[str, str], float] = {}
         laid: dict[tuple[str, str], int] = {}
@@ -162,8 +160,9 @@ class Adjustment:
         return (float(np.mean(means)) if means else most), sum(laid.values())
 
     def distance(self, estimate: Estimate) -> float | None:
-        """How far [m] the points of a camera lie from what another, or the robot, shows there: the median of the
-        worst two, at most the first reach; None where nothing can be compared. What hides the robot does not count.
+        """Largest median distance [m] of a pair, cut at the first reach; None without points.
+
+        Points that occlude the robot do not count.
         """
         reach = fixed.CALIBRATION_REACHES[0]
         between: dict[tuple[str, str], list[Float64]] = {}
@@ -174,7 +173,7 @@ class Adjustment:
         return max((float(np.median(one)) for one in laid if len(one) >= fixed.CALIBRATION_FEWEST), default=None)
 
     def rows(self, estimate: Estimate, reach: float, *, with_robot: bool = True) -> Iterator[Rows]:
-        """Every residual that is no larger than `reach` [m]."""
+        """All residuals of at most `reach` [m]."""
         views = self.evidence.views
         placed = [self._placed(view, estimate) for view in views]
         for i, j in self.evidence.pairs:
@@ -185,7 +184,7 @@ class Adjustment:
                 yield rows
 
     def _placed(self, item: DepthView | RgbdFrame, estimate: Estimate) -> tuple[Float64, Float64]:
-        """T_world_camera of a view or a frame, and how it moves with the clock, in the camera's frame."""
+        """T_world_camera, and its motion with the clock, camera frame."""
         T, twist = self.evidence.recorded(item, estimate.clock)
         correction = estimate.corrections[item.camera]
         return T @ correction, _carried(twist, correction)
@@ -201,7 +200,6 @@ class Adjustment:
         estimate: Estimate,
         reach: float,
     ) -> Rows:
-        """The points of view a from the surface of view b."""
         (scale_a, bias_a), (scale_b, bias_b) = estimate.depth_of(a.camera), estimate.depth_of(b.camera)
         points = a.points * (scale_a + bias_a / a.points[:, 2])[:, None]
         T = invert_transform(T_b) @ T_a
@@ -246,7 +244,6 @@ class Adjustment:
         )
 
     def _robot(self, frame: RgbdFrame, estimate: Estimate, reach: float) -> Rows | None:
-        """The points of a frame from the robot's surface."""
         assert self.evidence.arm is not None
         scale, bias = estimate.depth_of(frame.camera)
         depth = np.where(frame.depth > 0, scale * frame.depth + bias, 0.0).astype(np.float32)
@@ -279,15 +276,13 @@ class Adjustment:
 
 
 def _cells(points_world: Float64, depth: float) -> Index:
-    """In which cube of the world each point (K, 3) lies: whatever cameras see it, they see the same errors of it.
-    depth [m]: that of most points.
-    """
+    """World cube of each point (K, 3), in which all cameras see the same errors. depth [m]: the median."""
     x, y, z = np.floor(points_world / (fixed.CALIBRATION_CELL * depth)).astype(np.int64).T
     return np.asarray((x * 1_000_003 + y) * 1_000_003 + z)
 
 
 def _carried(twist: Float64, T: Float64) -> Float64:
-    """A small motion (6,) of a frame, as that of a frame at T (4, 4) in it, in its own axes."""
+    """A frame's small motion (6,), in axes at T (4, 4) on it."""
     if not twist.any():
         return twist
     turn, move = twist[:3], twist[3:]

@@ -1,4 +1,4 @@
-"""A calibration board as cameras see it: corners, place, and a start without recorded poses."""
+"""Calibration boards: corners, board poses, and camera poses without recorded ones."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ FEWEST_MARKERS = 4  # whose middles tell a homography
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A chessboard or ChArUco board: its inner corners in a row and in a column, and the edge of a square [m]."""
+    """A chessboard or ChArUco board: inner corners per row and column, square's edge [m]."""
 
     columns: int
     rows: int
@@ -33,21 +33,22 @@ class Board:
 
     @property
     def points(self) -> Float64:
-        """The inner corners (K, 3) [m], row by row: x along a row, y along a column, z away from who looks at it."""
+        """Inner corners (K, 3) [m], row by row.
+
+        x is along rows, y along columns, z away from the viewer.
+        """
         v, u = np.divmod(np.arange(self.columns * self.rows), self.columns)
         return self.square * np.column_stack([u, v, np.zeros(len(u))])
 
     @property
     def is_one_way_up(self) -> bool:
-        """Whether a chessboard of this size looks different after half a turn."""
+        """True if half a turn changes the chessboard."""
         return (self.columns + self.rows) % 2 == 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sighting:
-    """A board seen in a frame: T_camera_board (4, 4), and how much farther the frame's depth has it, as a ratio; None
-    where it has no depth there.
-    """
+    """A board in a frame: T_camera_board (4, 4), and measured over expected depth, or None."""
 
     camera: str
     stamp_ns: int
@@ -56,7 +57,7 @@ class Sighting:
 
 
 def board_of(text: str) -> Board:
-    """The board of ``COLUMNSxROWS:SQUARE``. Raises UsageError for another form."""
+    """Parse ``COLUMNSxROWS:SQUARE``. Raises UsageError for another form."""
     match = re.fullmatch(r"(\d{1,2})x(\d{1,2}):(\d*\.?\d+)", text)
     columns, rows, square = (int(match[1]), int(match[2]), float(match[3])) if match else (0, 0, 0.0)
     if not (min(columns, rows) >= 3 and 0.002 <= square <= 1.0):
@@ -68,7 +69,7 @@ def board_of(text: str) -> Board:
 
 
 def sighting_of(board: Board, frame: RgbdFrame) -> Sighting | None:
-    """The board in a frame's colour image; None where it is not seen whole, or fits no pose."""
+    """The board in a frame's image; None if partly hidden or without a pose."""
     gray: UInt8 = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.uint8)
     pixels = _marked_corners(board, gray)
     if pixels is None and board.is_one_way_up:
@@ -77,16 +78,14 @@ def sighting_of(board: Board, frame: RgbdFrame) -> Sighting | None:
 
 
 def other_size(frame: RgbdFrame) -> tuple[int, int] | None:
-    """The inner corners, the larger number first, of whatever chessboard a frame shows; None where it shows none, or
-    one so small that much looks like it.
-    """
+    """Inner corners, larger number first, of any chessboard in view; None for a tiny one."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     is_found, _, meta = cv2.findChessboardCornersSBWithMeta(gray, (3, 3), cv2.CALIB_CB_LARGER)
     return (max(meta.shape), min(meta.shape)) if is_found and meta.size >= LEAST else None
 
 
 def _plain_corners(board: Board, gray: UInt8) -> Float64 | None:
-    """Pixels (K, 2) of a chessboard's inner corners in the order of `Board.points`, the first at a black square."""
+    """Pixels (K, 2) of a chessboard's corners, as `Board.points`, from a black square on."""
     is_found, corners = cv2.findChessboardCornersSB(
         gray, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
     )
@@ -97,21 +96,18 @@ def _plain_corners(board: Board, gray: UInt8) -> Float64 | None:
     if ax * by - ay * bx < 0:  # as in a mirror
         grid = grid[:, ::-1]
     first, second = _brightness(gray, grid[:2, :2]), _brightness(gray, grid[:2, 1:3])
-    if first > second:  # of the inner squares, that beside the first corner is as the corner of the board
+    if first > second:  # the inner square at the first corner has the colour of the board's corner
         grid = grid[::-1, ::-1]
     return grid.reshape(-1, 2)
 
 
 def _brightness(gray: UInt8, square: Float64) -> float:
-    """Of an image in the middle of a square, whose corners (2, 2, 2) are in pixels."""
     u, v = np.round(square.reshape(4, 2).mean(axis=0)).astype(int)
     return float(gray[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].mean())
 
 
 def _marked_corners(board: Board, gray: UInt8) -> Float64 | None:
-    """Pixels (K, 2) of a ChArUco board's inner corners, from the middles of its markers, which do not depend on how
-    large those are, and then from the corners themselves.
-    """
+    """Pixels (K, 2) of a ChArUco board's corners, from the markers' middles, whatever their size."""
     for name in MARKERS:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(gray)
@@ -143,7 +139,7 @@ def _marked_corners(board: Board, gray: UInt8) -> Float64 | None:
 
 
 def _sighting(board: Board, frame: RgbdFrame, pixels: Float64) -> Sighting | None:
-    """Where the board is, of the two poses that a plane may have by its corners, the one nearer to the depth."""
+    """The board's pose: a plane's corners allow two, and depth decides."""
     matrix = matrix_of(frame.intrinsics)
     _, turns, moves, errors = cv2.solvePnPGeneric(board.points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
     fits: list[tuple[float, Float64, float | None]] = []
@@ -161,7 +157,6 @@ def _sighting(board: Board, frame: RgbdFrame, pixels: Float64) -> Sighting | Non
 
 
 def _depth_ratios(depth: Float32, pixels: Float64, z: Float64) -> Float64:
-    """The depths at pixels (K, 2) in terms of what they should be, z (K,) [m], of those that have one."""
     height, width = depth.shape
     u, v = np.round(pixels).astype(int).T
     seen = depth[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)].astype(np.float64)
@@ -178,9 +173,7 @@ SHOW = "show the board to neighbouring cameras at the same moment, or keep some 
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
-    """The recorded T_world_camera (4, 4) of each camera by stamp [ns], which of them move, the robot, where it is
-    known, and what is held.
-    """
+    """Recorded T_world_camera (4, 4) by camera and stamp [ns], moving cameras, robot, held cameras."""
 
     recorded: Mapping[str, Mapping[int, Float64]]
     moving: frozenset[str]
@@ -190,7 +183,7 @@ class Rig:
 
 @dataclass(frozen=True, kw_only=True)
 class HandEye:
-    """X (4, 4) such that ``A X B`` stays the same, what stays, and how far [m] the A X B are from it (median)."""
+    """X (4, 4), the constant ``A X B`` that `stays`, and median distance [m] from it."""
 
     X: Float64
     stays: Float64
@@ -198,11 +191,11 @@ class HandEye:
 
 
 def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[str, Float64]:
-    """T_recorded_camera (4, 4) by camera.
+    """T_recorded_camera (4, 4) by camera, from sightings of a board.
 
-    Without a robot and a camera that moves, what is held stays and the others are tied to it by the board. Else a
-    camera that moves is placed by a board that stands still, or one that stands still by a board that a link carries
-    (hand-eye calibration), and the others are tied to those. Raises NotEvaluableError where that does not reach all.
+    Without a robot or a moving camera, the board ties all others to the `held` cameras. Otherwise hand-eye
+    calibration places a moving camera by a stationary board, or a stationary camera by a board on a link, first.
+    Raises NotEvaluableError if it cannot reach all.
     """
     by_camera = {camera: [s for s in sightings if s.camera == camera] for camera in rig.recorded}
     _check_seen(board, by_camera)
@@ -244,7 +237,6 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
 
 
 def _check_seen(board: Board, by_camera: Mapping[str, Sequence[Sighting]]) -> None:
-    """Raise NotEvaluableError for cameras that see too little of the board, and for a board of other squares."""
     fewest = fixed.CALIBRATION_BOARD_FEWEST
     few = [f"{camera} in {len(its)}" for camera, its in by_camera.items() if len(its) < fewest]
     if few:
@@ -268,7 +260,7 @@ def _check_seen(board: Board, by_camera: Mapping[str, Sequence[Sighting]]) -> No
 
 
 def _board_stands(by_camera: Mapping[str, Sequence[Sighting]], rig: Rig) -> bool:
-    """Whether no camera that stands still sees the board move; without one, it is taken to stand."""
+    """True unless a stationary camera sees the board move."""
     for camera, its in by_camera.items():
         places = np.array([s.T_camera_board[:3, 3] for s in its])
         if camera not in rig.moving and len(its) > 1:
@@ -279,7 +271,7 @@ def _board_stands(by_camera: Mapping[str, Sequence[Sighting]], rig: Rig) -> bool
 
 
 def _carried(arm: Arm, sightings: Sequence[Sighting]) -> HandEye:
-    """T_world_camera of a camera that sees the board on a link of the robot: the link that fits best."""
+    """T_world_camera of a camera that sees the board on the best-fitting link."""
     fits: list[HandEye] = []
     reasons = ["no joint states at its frames"]
     for link in arm.model.frame_names:
@@ -304,12 +296,11 @@ def _check_fit(found: HandEye, what: str) -> None:
 
 
 def hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> HandEye:
-    """X (4, 4) such that ``A X B`` is the same for all pairs (A, B) of poses.
+    """X (4, 4) with the same ``A X B`` for all pairs (A, B).
 
-    From ``(A_j^-1 A_i) X = X (B_j B_i^-1)``: the rotation vectors of the left are those of the right turned by X, and
-    with its rotation known the move is linear (after Park and Martin, Robot sensor calibration, 1994). Pairs of which
-    the board was misread are left out once. Raises NotEvaluableError where there are too few, or the poses do not
-    turn about two axes.
+    From ``(A_j^-1 A_i) X = X (B_j B_i^-1)``: X turns the right's rotation vectors into the left's, and its
+    translation is linear (after Park and Martin, Robot sensor calibration, 1994). Outliers are dropped once. Raises
+    NotEvaluableError for too few pairs, or rotation about fewer than two axes.
     """
     pairs = spread(pairs, fixed.CALIBRATION_FRAMES)
     if len(pairs) < fixed.CALIBRATION_BOARD_VIEWS:
@@ -362,9 +353,9 @@ def _votes(
     rig: Rig,
     stands: bool,
 ) -> list[Float64]:
-    """T_world_camera (4, 4) of a camera that stands still, by each sighting that a placed camera has, too.
+    """T_world_camera (4, 4) of a stationary camera, per sighting shared with a placed one.
 
-    placed: T_recorded_camera by camera; T_world_board: where a board that stands still is known to be.
+    placed: T_recorded_camera by camera; T_world_board: of a stationary board, or None.
     """
     votes = []
     if camera in rig.moving:
@@ -385,7 +376,7 @@ def _recorded(rig: Rig, sighting: Sighting) -> Float64:
 
 
 def middle_pose(poses: Sequence[Float64]) -> Float64:
-    """Of poses (4, 4), the one that the others are nearest to in the sum, a radian counted as 0.3 m."""
+    """The medoid of poses (4, 4); a radian counts as 0.3 m."""
     few = np.array(spread(poses, 100))
     moves = np.linalg.norm(few[:, None, :3, 3] - few[None, :, :3, 3], axis=2)
     cosines = (np.einsum("iab,jab->ij", few[:, :3, :3], few[:, :3, :3]) - 1) / 2

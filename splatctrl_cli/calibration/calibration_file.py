@@ -1,4 +1,4 @@
-"""``calibration.toml``: where cameras stand, what their depths and clocks are off by, and how sure that is."""
+"""``calibration.toml``: camera poses, depth and clock corrections, and their certainty."""
 
 import json
 import math
@@ -23,12 +23,10 @@ AGAIN = "write it again with `splatctrl calibrate`"
 class CalibratedCamera:
     """One camera of a rig.
 
-    T (4, 4): T_world_camera of one that stands still, T_recorded_camera of one that moves; recorded (4, 4):
-    T_world_camera as the calibrated recording has it, None of one that moves. scale, bias [m]: the true depth is
-    ``scale depth + bias``. sigma_position (3,) [m], sigma_rotation (3,) [rad]: along and about the
-    axes of the world, of a moving camera its own; sigma_depth: of scale and bias; depth_noticed: how far from 1 a
-    scale, and from 0 a bias [m], would have to be to be taken for one, inf where none was looked for. held: what was
-    taken as it is; unobserved: directions that the recording said nothing of, and that stayed as recorded.
+    T (4, 4): T_world_camera if stationary, T_recorded_camera if moving. recorded (4, 4): the recording's
+    T_world_camera, None if moving. scale, bias [m]: the true depth is ``scale depth + bias``. sigma_position (3,)
+    [m], sigma_rotation (3,) [rad]: in the world's axes, a moving camera's own. depth_noticed: the least |scale - 1|
+    and |bias| [m] to be solved for, inf if none. held: parts not solved for. unobserved: directions kept as recorded.
     """
 
     T: Float64
@@ -45,14 +43,16 @@ class CalibratedCamera:
 
     @property
     def moves(self) -> bool:
-        """Whether the camera moves."""
+        """True if the camera moves."""
         return self.recorded is None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """What was found of a recording; clock [s]: a frame's stamp less that of the joint state at that instant, None
-    where it was not looked for; digests: sha256 of the recording's files, by name.
+    """The calibration of a recording.
+
+    clock [s]: a frame's stamp minus the joint state's at that instant, None if not solved for; digests: sha256 by
+    file.
     """
 
     recording: str
@@ -64,12 +64,12 @@ class Calibration:
     sigma_clock: float = 0.0
 
     def is_held(self, camera: str) -> bool:
-        """Whether a camera's pose was taken as recorded."""
+        """True if the camera's pose stayed as recorded."""
         return f"camera {camera}" in self.held
 
 
 def calibration_text(calibration: Calibration) -> str:
-    """The TOML file of a calibration."""
+    """The TOML text of a calibration."""
     lines = [
         f"format = {_text(FORMAT)}",
         f"version = {VERSION}",
@@ -107,7 +107,7 @@ def calibration_text(calibration: Calibration) -> str:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """The calibration in a file. Raises InputError where it is none, or damaged."""
+    """Read a calibration. Raises InputError for another or a damaged file."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -126,13 +126,13 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def is_calibration(path: Path) -> bool:
-    """Whether a TOML file is one."""
+    """True if a file begins as a calibration."""
     with path.open("rb") as stream:
         return stream.read(64).startswith(f"format = {_text(FORMAT)}".encode())
 
 
 def describe_calibration(path: Path) -> Summary:
-    """What a file holds."""
+    """Summarise a calibration file."""
     calibration = read_calibration(path)
     rows = [
         [
@@ -221,5 +221,5 @@ def _list(texts: Any) -> str:
 
 
 def _text(text: str) -> str:
-    """A basic string of TOML, whose escapes are those of JSON."""
+    """A TOML basic string, whose escapes are JSON's."""
     return json.dumps(text, ensure_ascii=False)

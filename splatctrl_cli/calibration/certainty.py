@@ -1,4 +1,4 @@
-"""How sure a calibration is: its covariance, and the directions that a recording says nothing of, in words."""
+"""Certainty of a calibration: its covariance, and names of unobserved directions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,19 +16,19 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, kw_only=True)
 class Certainty:
-    """covariance (P, P) of the unknowns; reach (P, P) maps the unknowns to how far [m] what the cameras see moves."""
+    """Covariance (P, P) of the unknowns; reach (P, P): their displacements [m] of visible points."""
 
     unknowns: Unknowns
     covariance: Float64
     reach: Float64
 
     def of_camera(self, camera: str) -> Float64:
-        """Covariance (6, 6) of a camera's turn and move in its own frame; 0 of one that is held."""
+        """Covariance (6, 6) of a camera's rotation and translation, own frame; 0 if fixed."""
         columns = self.unknowns.columns(camera)[:POSE]
         return np.zeros((POSE, POSE)) if columns[0] < 0 else self.covariance[np.ix_(columns, columns)]
 
     def displacement(self, camera: str) -> Float64:
-        """The same of (turn about the middle of what it sees, as a length at its rim; move of that middle) (6, 6)."""
+        """Covariance (6, 6) [m] of the view's middle: rotation at the rim, then translation."""
         columns = self.unknowns.columns(camera)[:POSE]
         if columns[0] < 0:
             return np.zeros((POSE, POSE))
@@ -36,30 +36,29 @@ class Certainty:
         return np.asarray(block @ self.of_camera(camera) @ block.T)
 
     def sigma_depth(self, camera: str) -> tuple[float, float]:
-        """Of the scale and the bias [m] of its depths; 0 where they are held."""
+        """Sigma of scale and bias [m]; 0 if fixed."""
         columns = self.unknowns.columns(camera)[POSE:]
         scale, bias = (0.0 if at < 0 else float(np.sqrt(self.covariance[at, at])) for at in columns)
         return scale, bias
 
     @property
     def is_full(self) -> bool:
-        """Whether every direction of every camera is known within `CALIBRATION_SIGMA`."""
+        """True if all directions of all cameras are within `CALIBRATION_SIGMA`."""
         spreads = [np.linalg.eigvalsh(self.displacement(camera))[-1] for camera in self.unknowns.poses]
         return max(spreads, default=0.0) <= fixed.CALIBRATION_SIGMA**2
 
     @property
     def sigma_clock(self) -> float:
-        """[s]; 0 where the clock is held."""
+        """Sigma [s]; 0 if fixed."""
         return float(np.sqrt(self.covariance[-1, -1])) if self.unknowns.has_clock else 0.0
 
 
 def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> Certainty:
-    """Of an estimate that is solved.
+    """The certainty of a solved estimate.
 
-    ``A^-1 M A^-T`` (the sandwich of White, 1980): M sums the products of the gradients of clusters, whose residuals
-    err alike, so that their correlation is counted; A is how the gradient changes. Noise turns the normals of what
-    is flat, and the normal equations take that for shape; so the gradient between views is differentiated with its
-    points laid anew, where that cancels.
+    ``A^-1 M A^-T`` (the sandwich of White, 1980): M sums products of clusters' gradients, to count correlated errors;
+    A is the gradient's derivative. Noise tilts normals of flat surfaces, which the normal equations mistake for
+    shape. Between views, A therefore uses differences with points projected anew, where that cancels.
     """
     whole = adjustment.normal(estimate, widths)
     between = adjustment.normal(estimate, widths, with_robot=False)
@@ -111,7 +110,7 @@ def _reach(adjustment: Adjustment, estimate: Estimate) -> Float64:
 
 
 def middle_of(adjustment: Adjustment, camera: str) -> tuple[Float64, float]:
-    """The middle (3,) [m] of what a camera sees, in its frame, and how far [m] that reaches from there."""
+    """Middle (3,) [m] of a camera's points, in its frame, and their radius [m]."""
     points = [view.points for view in adjustment.evidence.views if view.camera == camera]
     cloud = np.concatenate([*points, np.zeros((0, 3))])
     if not len(cloud):
@@ -122,14 +121,14 @@ def middle_of(adjustment: Adjustment, camera: str) -> tuple[Float64, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class Plane:
-    """The largest plane that a camera sees: its unit normal (3,), world, and a name for it."""
+    """The largest plane in view: unit normal (3,), world, and a name."""
 
     normal: Float64
     name: str
 
 
 def plane_of(view: DepthView, T_world_camera: Float64) -> Plane | None:
-    """That of a view; None where no direction has a quarter of its pixels."""
+    """The largest plane in a view, with a quarter of the pixels, or None."""
     normals = view.normals.reshape(-1, 3)
     normals = normals[np.any(normals != 0, axis=1)] @ T_world_camera[:3, :3].T
     if len(normals) < 100:
@@ -145,7 +144,7 @@ def plane_of(view: DepthView, T_world_camera: Float64) -> Plane | None:
 
 
 def unobserved(certainty: Certainty, camera: str, T_world_camera: Float64, plane: Plane | None) -> tuple[str, ...]:
-    """The directions of a camera that are not known within `CALIBRATION_SIGMA`, in words."""
+    """Names of a camera's directions not known within `CALIBRATION_SIGMA`."""
     values, vectors = np.linalg.eigh(certainty.displacement(camera))
     unknown = vectors[:, values > fixed.CALIBRATION_SIGMA**2]
     if not unknown.shape[1]:
@@ -159,14 +158,14 @@ def unobserved(certainty: Certainty, camera: str, T_world_camera: Float64, plane
 
 
 def _share(unknown: Float64, direction: Float64, T_world_camera: Float64) -> float:
-    """How much of a direction (turn, move) (6,), world, lies in the unknown ones (6, K), of the camera's frame."""
+    """Share of a direction (6,), world, in the unknown ones (6, K), camera frame."""
     R = T_world_camera[:3, :3].T
     own = np.concatenate([R @ direction[:3], R @ direction[3:]])
     return float(np.sum(np.square(unknown.T @ own)))
 
 
 def _named_directions(plane: Plane | None) -> Sequence[tuple[str, tuple[Float64, Float64]]]:
-    """Turns and moves, world, with their names: along a plane's normal and in it, or along the axes of the world."""
+    """Named rotations and translations, world: of a plane, or the world's axes."""
     zero = np.zeros(3)
     if plane is None:
         return [

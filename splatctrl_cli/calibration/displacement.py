@@ -1,6 +1,6 @@
-"""How far each camera's pose is off, by the robot that it sees, and the pose that puts it right.
+"""Errors of cameras' poses against the visible robot, and corrections.
 
-Where all cameras say the same, it may be the robot that is off.
+If all cameras agree, the robot itself may be off.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,11 +29,11 @@ MEASURED = ("distance_mm", "sigma_mm", "num_pixels")
 
 
 def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[str, Any]]:
-    """How far each camera's pose is off, as `displacement_of`; without cameras that show too little of the robot.
+    """Rows of `displacement_of` by camera, without those that show too little of the robot.
 
-    frames: of all cameras. A camera is corrected if it stands still while the arm moves, and then sees each link in
-    its place. Its row has `T_recorded_camera`, the 16 numbers of the correction by row, and `left_mm`, the last step
-    of that. If one displaced camera cannot be corrected, none is: the robot itself may be off.
+    A stationary camera is corrected if the arm moves and the correction puts each link in place. Its row then has
+    `T_recorded_camera`, 16 numbers by row, and `left_mm`, the last step. If one displaced camera cannot be corrected,
+    none is: the robot may be off.
     """
     by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
     found = {camera: _corrected(arm, its) for camera, its in by_camera.items()}
@@ -44,17 +44,17 @@ def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[s
 
 
 def is_displaced(row: Mapping[str, Any]) -> bool:
-    """Whether a row of `displaced_cameras` says that a recorded pose is off: by `MISPLACED` and one sigma."""
+    """True if a row's distance minus sigma exceeds `MISPLACED`."""
     return bool(row["distance_mm"] - row["sigma_mm"] > 1e3 * MISPLACED)
 
 
 def is_corrected(row: Mapping[str, Any]) -> bool:
-    """Whether a row of `displaced_cameras` has a corrected pose."""
+    """True if a row has a corrected pose."""
     return "T_recorded_camera" in row
 
 
 def placed(frame: RgbdFrame, cameras: Mapping[str, Mapping[str, Any]]) -> RgbdFrame:
-    """The frame at the corrected pose of its camera; as it is where `cameras`, as `displaced_cameras`, has none."""
+    """The frame at its camera's corrected pose, if `cameras` has one."""
     row = cameras.get(frame.camera, {})
     return _moved(frame, np.reshape(row["T_recorded_camera"], (4, 4))) if is_corrected(row) else frame
 
@@ -64,7 +64,7 @@ def _moved(frame: RgbdFrame, T_recorded_camera: Float64) -> RgbdFrame:
 
 
 def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
-    """A row of `displaced_cameras`, by one camera's frames. Each correction is measured, and corrected in turn."""
+    """A camera's row; each correction is measured and corrected in turn."""
     found = displacement_of(arm, frames)
     if found is None:
         return None
@@ -86,9 +86,9 @@ def _corrected(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | None:
 
 
 def _sees_links_in_place(arm: Arm, frames: Sequence[RgbdFrame]) -> bool:
-    """Whether two links or more are seen well by one camera's frames, and each within half of `MISPLACED`.
+    """True if two links or more are clearly visible, each within half of `MISPLACED`.
 
-    Where a joint's zero is off, no pose of the camera puts the links before and behind the joint right.
+    With a wrong joint zero, no pose fits the links on both sides.
     """
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
     found = [rows for frame in shown if (rows := _rows(arm, frame, np.eye(4))) is not None]
@@ -99,15 +99,13 @@ def _sees_links_in_place(arm: Arm, frames: Sequence[RgbdFrame]) -> bool:
 
 
 def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, Any], Float64] | None:
-    """How far off one camera's pose is, and T_recorded_camera (4, 4), its correction; None if its frames show too
-    little of the robot.
+    """One camera's pose error and correction T_recorded_camera (4, 4); None if little robot shows.
 
-    The pose is corrected until depth lies on the robot's rendered surface. `distance_mm`: how far that moves the
-    points that the camera shows of the robot (root mean square); `sigma_mm` of it; `num_pixels`: how many points.
+    `distance_mm`, `sigma_mm`: root mean square motion of the robot's `num_pixels` visible points by the correction.
 
-    Two Gauss-Newton steps by the distances along the surface's normal; a residual beyond two sigma counts less
-    (Huber). Neighbouring pixels err alike, so `DISPLACED_ALIKE` of them count as one. The distance is
-    `DISPLACED_WIDTH` where fewer than `DISPLACED_SHARE` of the pixels that should show the robot do so within it.
+    Two Gauss-Newton steps on point-to-plane distances, with Huber's weight from two sigma. Neighbouring pixels err
+    alike: `DISPLACED_ALIKE` count as one. The distance is `DISPLACED_WIDTH` if fewer than `DISPLACED_SHARE` of the
+    pixels that should show the robot do so within it.
     """
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
     T, prior = np.eye(4), np.eye(POSE) / DISPLACED_PRIOR**2

@@ -1,4 +1,4 @@
-"""The evidence of a calibration: views laid over each other, where the arm says its links are; and its unknowns."""
+"""Evidence of a calibration: overlapping views and the arm's links; and its unknowns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,9 +29,10 @@ HELD = -1
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """T_recorded_camera (4, 4) by camera, so that ``T_world_camera = T_world_recorded @ T_recorded_camera``; scale
-    and bias [m] of its depths, so that the true one is ``scale depth + bias``; clock [s]: a frame's stamp less that
-    of the joint state at that instant.
+    """Poses, depth corrections and clock offset.
+
+    ``T_world_camera = T_world_recorded @ T_recorded_camera``, with corrections (4, 4). depth: scale and bias [m], the
+    true depth is ``scale depth + bias``. clock [s]: a frame's stamp minus the joint state's at that instant.
     """
 
     corrections: Mapping[str, Float64]
@@ -39,15 +40,13 @@ class Estimate:
     clock: float = 0.0
 
     def depth_of(self, camera: str) -> tuple[float, float]:
-        """Scale and bias."""
+        """Scale and bias [m]."""
         return self.depth.get(camera, (1.0, 0.0))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unknowns:
-    """The cameras, of which those in `poses` are moved, and the depths of those in `scales` and `biases` get one;
-    has_clock: the clock of the joint states is shifted, too. Everything else is held.
-    """
+    """Unknowns of a calibration: `poses`, depth `scales` and `biases` by camera, and the clock."""
 
     cameras: Sequence[str]
     poses: Sequence[str]
@@ -57,11 +56,11 @@ class Unknowns:
 
     @property
     def size(self) -> int:
-        """P."""
+        """The number P of unknowns."""
         return POSE * len(self.poses) + len(self.scales) + len(self.biases) + self.has_clock
 
     def columns(self, camera: str) -> Index:
-        """Where the unknowns of a camera (8,) stand, `HELD` for what is none."""
+        """The columns (8,) of a camera's unknowns, `HELD` if fixed."""
         at = np.full(OF_CAMERA, HELD)
         if camera in self.poses:
             at[:POSE] = POSE * self.poses.index(camera) + np.arange(POSE)
@@ -74,7 +73,7 @@ class Unknowns:
 
     @property
     def clock_column(self) -> int:
-        """Where the clock stands, `HELD` where it is none."""
+        """The clock's column, `HELD` if fixed."""
         return self.size - 1 if self.has_clock else HELD
 
     def moved(self, estimate: Estimate, step: Float64) -> Estimate:
@@ -91,17 +90,17 @@ class Unknowns:
 
 
 def transform_of(twist: Float64) -> Float64:
-    """T (4, 4) of a turn [rad] and a move [m] (6,)."""
+    """T (4, 4) of a rotation vector [rad] and a translation [m] (6,)."""
     return pose_at(twist[3:], cv2.Rodrigues(np.asarray(twist[:3], np.float64))[0])
 
 
 def twist_of(T: Float64) -> Float64:
-    """The turn [rad] and the move [m] (6,) of T (4, 4)."""
+    """The rotation vector [rad] and translation [m] (6,) of T (4, 4)."""
     return np.concatenate([cv2.Rodrigues(T[:3, :3])[0].ravel(), T[:3, 3]])
 
 
 def twist_between(T_before: Float64, T_after: Float64) -> Float64:
-    """The twist (6,) that follows a pose (4, 4) to become another."""
+    """The twist (6,) from one pose (4, 4) to another, applied on the right."""
     return twist_of(invert_transform(T_before) @ T_after)
 
 
@@ -111,10 +110,11 @@ STEP_NS = 10_000_000  # [ns] before and after, from which a velocity is taken: l
 
 @dataclass(frozen=True, kw_only=True)
 class ArmRows:
-    """Distances of M measured points from the robot's surface: residual (M,) [m], positive outside; jacobian (M, 6)
-    by a turn and a move of the camera in its own frame; clock (M,) [m/s], the derivative by the clock; points and
-    normals (M, 3), in the camera's frame; links, tiles (M,). num_seen: pixels that should show the robot's surface;
-    num_hidden: of these, those that show something by more than `width` before it.
+    """Distances of M points from the robot's surface: residual (M,) [m], positive outside.
+
+    jacobian (M, 6): by the camera's rotation and translation in its frame; clock (M,) [m/s]: by the clock. points,
+    normals (M, 3): camera frame. num_seen: pixels that should show the robot; num_hidden: those occluded by more than
+    `width`.
     """
 
     residual: Float64
@@ -129,7 +129,7 @@ class ArmRows:
 
 
 class Arm:
-    """A robot with the joint positions of a recording, in the model's order of joints."""
+    """A robot with a recording's joint positions, in model order."""
 
     def __init__(self, model: RobotModel, posture: Posture) -> None:
         self.model = model
@@ -139,16 +139,16 @@ class Arm:
         self.surface_poses = lru_cache(maxsize=REMEMBERED)(self._surface_poses)
 
     def is_posed(self, stamp_ns: int) -> bool:
-        """Whether joint states are near a time [ns]."""
+        """True if joint states are near a time [ns]."""
         return self._posture(stamp_ns) is not None
 
     def link_pose(self, link: str, stamp_ns: int) -> Float64 | None:
-        """T_world_link (4, 4) at a time of the joint states; None where they are too far away."""
+        """T_world_link (4, 4) at a joint state's time; None if no state is near."""
         q = self._posture(stamp_ns)
         return None if q is None else self.model.frame_pose(q, link)
 
     def _surface_poses(self, stamp_ns: int) -> Float64 | None:
-        """T_world_link (L, 4, 4) of the surface's links, likewise."""
+        """T_world_link (L, 4, 4) of the surface's links, or None."""
         q = self._posture(stamp_ns)
         if q is None:
             return None
@@ -163,11 +163,10 @@ class Arm:
         stamp_ns: int,
         width: float,
     ) -> ArmRows | None:
-        """Of the pixels (H, W) [m] that show the robot as it was at a time [ns] of the joint states, no farther than
-        `width` [m] from its rendered surface; None where its joints are not known then.
+        """Rows of pixels within `width` [m] of the robot's rendered surface; None without joint states.
 
-        camera_twist (6,) [1/s]: how the camera moves with the clock, in its own frame. Pixels at the border of a
-        link, and links that spheres or boxes stand for, do not count.
+        stamp_ns: of the joint states; camera_twist (6,) [1/s]: the camera's motion with the clock, own frame. Link
+        borders, and links modelled by spheres or boxes, do not count.
         """
         poses, before, after = (self.surface_poses(stamp_ns + step) for step in (0, -STEP_NS, STEP_NS))
         if poses is None:
@@ -204,9 +203,7 @@ class Arm:
         )
 
     def mount_of(self, poses: list[tuple[int, Float64]]) -> tuple[str, Float64] | None:
-        """The link that a camera with these stamps [ns] and recorded T_world_camera rides on, and T_link_camera; None
-        where it rides on none.
-        """
+        """The link that carries a camera with stamps [ns] and T_world_camera, and T_link_camera; or None."""
         for link in reversed(self.model.frame_names):
             mounted = [(self.link_pose(link, stamp), T) for stamp, T in poses]
             offsets = np.array([invert_transform(at) @ T for at, T in mounted if at is not None])
@@ -218,7 +215,7 @@ class Arm:
         return None
 
     def travel(self, stamps: list[int]) -> float:
-        """How far [m] any of the robot's links is from where it is first, at some of these times."""
+        """The largest distance [m] of any link from its first pose."""
         places = []
         for stamp in stamps:
             poses = self.surface_poses(stamp)
@@ -231,14 +228,14 @@ class Arm:
 
 
 def _velocities(before: Float64, after: Float64, poses: Float64, T_world_camera: Float64) -> Float64:
-    """(L, 4, 4): what a point fixed to a link moves by in a second, in the camera's frame."""
+    """(L, 4, 4) velocities [1/s] of points fixed to each link, camera frame."""
     T_camera_world = invert_transform(T_world_camera)
     moved = [T_camera_world @ at @ np.linalg.inv(poses) @ T_world_camera for at in (before, after)]
     return np.asarray((moved[1] - moved[0]) / (2e-9 * STEP_NS))
 
 
 def _around(shows: Bool) -> tuple[tuple[slice, slice], tuple[int, int]]:
-    """The part (rows, columns) of an image that shows something, with a border of one pixel, and its corner."""
+    """Bounding part (rows, columns) of `shows` with a one-pixel border, and its corner."""
     rows, columns = (np.flatnonzero(shows.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
         return (slice(0, 3), slice(0, 3)), (0, 0)
@@ -247,7 +244,7 @@ def _around(shows: Bool) -> tuple[tuple[slice, slice], tuple[int, int]]:
 
 
 def _inside_links(link: NDArray[np.int16], depth: Float32) -> Bool:
-    """Pixels whose four neighbours show the same link, and no edge of it between them."""
+    """Pixels whose neighbours show the same link, without a depth edge."""
     inside = np.zeros(link.shape, np.bool_)
     middle = link[1:-1, 1:-1]
     around = (link[1:-1, 2:], link[1:-1, :-2], link[2:, 1:-1], link[:-2, 1:-1])
@@ -257,10 +254,10 @@ def _inside_links(link: NDArray[np.int16], depth: Float32) -> Bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """views: of cameras that stand still one each (`still_frame`), of moving ones several; pairs (i, j) of them that
-    may see one surface, where the points of view i are laid on view j; frames: in which the robot is looked for; arm:
-    None where it is not known; mounts: the link that a moving camera rides on, and T_link_camera as recorded; moving:
-    the cameras that move.
+    """Views, frames and robot of a calibration.
+
+    views: one per stationary camera (`still_frame`), several per moving one. pairs (i, j): points of view i are
+    compared with view j. frames: searched for the robot. mounts: link of a moving camera, and recorded T_link_camera.
     """
 
     views: Sequence[DepthView]
@@ -272,18 +269,18 @@ class Evidence:
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """All that have a view or a frame."""
+        """All cameras with a view or frame."""
         return tuple(sorted({v.camera for v in self.views} | {f.camera for f in self.frames}))
 
     @cached_property
     def scale(self) -> float:
-        """The depth [m] of most points."""
+        """The median depth [m]."""
         return float(np.median(np.concatenate([view.points[:, 2] for view in self.views] + [np.ones(1)])))
 
     def recorded(self, item: DepthView | RgbdFrame, clock: float) -> tuple[Float64, Float64]:
-        """T_world_camera (4, 4) of a view or a frame without correction, and how it moves with the clock (6,) [1/s].
+        """Uncorrected T_world_camera (4, 4), and its motion with the clock (6,) [1/s].
 
-        A camera that rides on the robot is where the joint states have it at its stamp by their clock.
+        On the robot, the joint states place the camera, at its stamp by their clock.
         """
         if self.arm is None or item.camera not in self.mounts:
             return item.T_world_camera, np.zeros(POSE)
@@ -298,7 +295,7 @@ class Evidence:
         return now, twist_between(after, before) / (2e-9 * STEP_NS)  # a later clock takes an earlier pose
 
     def thinned(self) -> "Evidence":
-        """For a first look: with fewer frames that show the robot, as many of each camera, and fewer pairs."""
+        """Fewer pairs and robot frames, for a first look."""
         frames = [
             frame
             for camera in self.cameras
@@ -308,7 +305,7 @@ class Evidence:
 
 
 def evidence_of(frames: Sequence[RgbdFrame], arm: Arm | None) -> Evidence:
-    """That of some frames of each camera, by stamp, without people. arm: the robot, where it is known."""
+    """Evidence from frames without people, in order of stamp."""
     by_camera: dict[str, list[RgbdFrame]] = {}
     for frame in frames:
         by_camera.setdefault(frame.camera, []).append(strided(frame, fixed.CALIBRATION_ROWS))
@@ -341,7 +338,7 @@ def evidence_of(frames: Sequence[RgbdFrame], arm: Arm | None) -> Evidence:
 
 
 def moving_cameras(frames: Sequence[RgbdFrame]) -> frozenset[str]:
-    """Those whose recorded poses differ."""
+    """The cameras whose recorded poses differ."""
     first: dict[str, Float64] = {}
     moving = set()
     for frame in frames:
@@ -352,7 +349,7 @@ def moving_cameras(frames: Sequence[RgbdFrame]) -> frozenset[str]:
 
 
 def _step(frame: RgbdFrame, num_averaged: int) -> int:
-    """Pixels on either side that normals are taken from: so many that the noise of depth turns them little."""
+    """Baseline of normals [pixels], long against depth noise."""
     depth = frame.depth[frame.depth > 0]
     if not len(depth):
         return 1
@@ -363,7 +360,7 @@ def _step(frame: RgbdFrame, num_averaged: int) -> int:
 
 
 def _robot_near(frame: RgbdFrame, arm: Arm | None) -> Bool:
-    """Pixels (h, w) at which the robot may be seen, whatever the camera's pose is off by."""
+    """Pixels (h, w) where the robot may appear, despite pose errors."""
     poses = None if arm is None else arm.surface_poses(frame.stamp_ns)
     if arm is None or poses is None:
         return np.zeros(frame.depth.shape, np.bool_)
@@ -377,7 +374,7 @@ def _robot_near(frame: RgbdFrame, arm: Arm | None) -> Bool:
 
 
 def _pairs(views: Sequence[DepthView], moving: frozenset[str]) -> list[tuple[int, int]]:
-    """Ordered pairs of views of two cameras, or of one that moves, from different places."""
+    """Ordered pairs of views of two cameras, or of a moving one from different places."""
     still, others = [], []
     for i, a in enumerate(views):
         for j, b in enumerate(views):

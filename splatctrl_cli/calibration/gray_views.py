@@ -1,4 +1,4 @@
-"""Pairs of views of a still scene: how they differ in depth, grey value and exposure."""
+"""Pairs of views of a still scene: differences of depth, grey value and exposure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +16,9 @@ EVERY = slice(None)
 
 @dataclass(frozen=True, kw_only=True)
 class GrayView:
-    """A view whose lengths are divided by the recording's scale: grey values (h, w) in [0, 1], their slope (h, w, 2)
-    by pixel, and the grey values of the view's points (K,).
+    """A view with lengths divided by the recording's scale, and its grey values.
+
+    gray (h, w) in [0, 1]; slope (h, w, 2) per pixel; points_gray (K,): at the view's points.
     """
 
     depth: DepthView
@@ -27,7 +28,7 @@ class GrayView:
 
 
 def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
-    """The view of a frame at no more than about `REFINE_ROWS` rows."""
+    """The frame's view at about `REFINE_ROWS` rows."""
     stride = max(1, round(frame.depth.shape[0] / fixed.REFINE_ROWS))
     depth = cv2.medianBlur(np.ascontiguousarray(frame.depth / np.float32(scale)), 5)
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255)
@@ -50,7 +51,7 @@ def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
 
 
 def scaled(T: Float64, factor: float) -> Float64:
-    """A pose (4, 4) whose lengths are multiplied."""
+    """A pose (4, 4) with scaled lengths."""
     there = T.copy()
     there[:3, 3] *= factor
     return there
@@ -59,7 +60,7 @@ def scaled(T: Float64, factor: float) -> Float64:
 def overlapping(
     views: Sequence[GrayView], poses: Sequence[Float64], among: Bool, is_free: Bool
 ) -> list[tuple[int, int]]:
-    """Of each view among those that take part, those others that see most of its points; one of the two is free."""
+    """Pairs of views `among` (N,) that share most points, one of them free."""
     chosen = np.flatnonzero(among).tolist()
     middles = np.array([transform_points(poses[i], np.median(views[i].depth.points, axis=0)[None])[0]
                         if len(views[i].depth.points) else np.full(3, np.inf) for i in chosen])  # fmt: skip
@@ -76,7 +77,6 @@ def overlapping(
 
 
 def _share(a: GrayView, b: GrayView, T_a: Float64, T_b: Float64) -> float:
-    """Of some points of view a, how many land near the surface of view b."""
     points = transform_points(invert_transform(T_b) @ T_a, a.depth.points[::8])
     lands, surface, _ = landed(points, b.depth)
     return (
@@ -88,9 +88,9 @@ def _share(a: GrayView, b: GrayView, T_a: Float64, T_b: Float64) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Residuals (R,), in sigmas and weighed, and how they change with a turn and move of view a and of view b (R,
-    12), and with the logarithm of the depth of view a's point number `own` (R,) and of view b's pixel number
-    `other` (R,).
+    """Weighted residuals (R,) [sigma], and derivatives by views a's and b's motions (R, 12).
+
+    by_own, by_other (R,): by log-depth of view a's point `own` and view b's pixel `other`.
     """
 
     residuals: Float64
@@ -102,7 +102,7 @@ class Rows:
 
 
 def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
-    """Of every second point of view a that lands on view b, at T (4, 4) from there."""
+    """Rows of every second point of view a on view b, T (4, 4) apart."""
     number = np.arange(0, len(a.depth.points), 2)
     there, lands, surface, normals, distance = on_surface(a, b, T, slice(None, None, 2))
     sigma = np.hypot(depth_sigma(there[:, 2]), depth_sigma(a.depth.points[number, 2]))
@@ -142,15 +142,16 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
 
 
 def _stretched(own: Float64, gradient: Float64, T: Float64) -> Float64:
-    """How a value with a gradient (K, 3), T (4, 4) from there, changes with the logarithm of points' depth (K,)."""
+    """Derivatives by log-depth (K,) of a value with gradient (K, 3), at T (4, 4)."""
     return np.asarray(np.einsum("ki,ki->k", gradient @ T[:3, :3], own))
 
 
 def on_surface(
     a: GrayView, b: GrayView, T: Float64, which: slice = EVERY
 ) -> tuple[Float64, Bool, Float64, Float64, Float64]:
-    """Of some points of view a, at T (4, 4) from view b: where they are there (K, 3), which of them land on a surface
-    that faces as theirs (K,), its points and normals (K, 3), and their distances (K,) from it.
+    """View a's points in view b, at T (4, 4): points, hits, surface, normals, distances.
+
+    Arrays are (K, 3) or (K,). A hit's surface faces like the point's own.
     """
     there = transform_points(T, a.depth.points[which])
     lands, surface, normals = landed(there, b.depth)
@@ -159,7 +160,7 @@ def on_surface(
 
 
 def _alike(value: Float64, other: Float64) -> Float64:
-    """Differences (K,) of grey values, less a gain and an offset between the two images, found robustly."""
+    """Grey differences (K,), less a robust gain and offset."""
     gain, offset = 1.0, float(np.median(value - other))
     for _ in range(2):
         near = np.abs(value - gain * other - offset) < fixed.REFINE_CUT * fixed.REFINE_COLOR
@@ -173,10 +174,9 @@ def _alike(value: Float64, other: Float64) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class BandRatios:
-    """How much brighter B bands of rows of N images show the same surfaces than bands of others: E medians.
+    """E median brightness ratios of shared surfaces, between B bands of rows of N images.
 
-    channels (E,); pairs (E, 2): numbers of two bands, B times the image's and its own; ratios (E,): the logarithm of
-    the first over the second; weights (E,).
+    pairs (E, 2): bands, numbered B times the image plus their own; ratios (E,): log of first over second.
     """
 
     num_images: int
@@ -187,9 +187,9 @@ class BandRatios:
     weights: Float64
 
     def gains(self, is_free: Bool) -> Float64:
-        """Gains (N, B, 3) of red, green and blue that explain the ratios: least squares of the logarithms.
+        """Gains (N, B, 3) of red, green and blue, by least squares of logarithms.
 
-        A wide prior keeps them about 1; images that are not `is_free` (N,) keep gain 1.
+        A wide prior keeps them about 1; images not `is_free` (N,) keep 1.
         """
         num_gains, is_kept = self.num_bands * self.num_images, np.repeat(~is_free, self.num_bands)
         A = np.tile(np.eye(num_gains) / fixed.EXPOSURE_PRIOR**2, (3, 1, 1))
@@ -204,23 +204,23 @@ class BandRatios:
         return np.asarray(np.exp(logs).reshape(self.num_images, self.num_bands, 3))
 
     def misfit(self, gains: Float64) -> float:
-        """Median over the ratios of what gains (N, B or 1, 3) leave of their logarithms."""
+        """Median absolute residual of log ratios, for gains (N, B or 1, 3)."""
         logs = np.log(np.broadcast_to(gains, (self.num_images, self.num_bands, 3)).reshape(-1, 3))
         first, second = (logs[self.pairs[:, k], self.channels] for k in range(2))
         return float(np.median(np.abs(self.ratios - (first - second)))) if len(self.ratios) else 0.0
 
 
 def exposure_gains(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | None = None) -> Float64:
-    """Gains (N, 3) of red, green and blue, so that an image divided by its gain shows what the others show.
+    """Gains (N, 3) of red, green and blue; images divided by them match.
 
-    scale: of the recording's lengths; views that are not `free` (N,) keep gain 1.
+    scale: of the recording's lengths; views not `free` (N,) keep gain 1.
     """
     is_free = np.ones(len(frames), np.bool_) if free is None else free
     return band_ratios(frames, scale, is_free, 1).gains(is_free)[:, 0]
 
 
 def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_bands: int) -> BandRatios:
-    """Those of all pairs of views that see the same surfaces, one of them free; near black and white do not count."""
+    """Ratios of overlapping pairs with a free view, without near black and white."""
     views = [gray_view(frame, scale) for frame in frames]
     poses = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
     colors = [_small(frame, view.gray.shape[0]) for frame, view in zip(frames, views, strict=True)]
@@ -255,7 +255,6 @@ def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_ba
 
 
 def _median_ratio(ratios: Float64) -> tuple[float, float]:
-    """The median of logarithms, and its weight."""
     ratio = float(np.median(ratios))
     spread = 1.4826 * float(np.median(np.abs(ratios - ratio)))
     return ratio, 1 / (fixed.EXPOSURE_ERROR**2 + spread**2 / len(ratios))
@@ -268,7 +267,7 @@ def exposed(frame: RgbdFrame, gain: Float64) -> RgbdFrame:
 
 
 def _small(frame: RgbdFrame, rows: int) -> Float64:
-    """Smoothed levels (h, w, 3) at the pixels of a `GrayView` of so many rows."""
+    """Smoothed levels (h, w, 3) at a `GrayView`'s pixels."""
     stride = -(-frame.color.shape[0] // rows)
     smooth = cv2.GaussianBlur(frame.color, (0, 0), fixed.EXPOSURE_BLUR * stride)
     return np.asarray(smooth[::stride, ::stride], np.float64)

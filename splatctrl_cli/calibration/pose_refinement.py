@@ -1,15 +1,13 @@
-"""The poses of views of a still scene and the bends of their depths, put right by what the views see of each other.
+"""Joint refinement of view poses of a still scene, and of the bends of their depths.
 
-Gauss-Newton on all views at once, in float64, of depth and colour together: distances of the points of one view
-from the surface of another (Chen and Medioni, Object modelling by registration, 1992), and differences of their
-grey values (Park, Zhou and Koltun, Colored point cloud registration revisited, 2017), each weighed by Tukey's
-biweight.
+Gauss-Newton in float64, with Tukey's biweight, on point-to-plane distances and grey differences. Sources: Chen and
+Medioni, Object modelling by registration, 1992; Park, Zhou and Koltun, Colored point cloud registration revisited,
+2017.
 
-A camera that triangulates errs in disparity, by what its lenses were not calibrated for; surfaces come out bent,
-more so the farther they are. The offset of disparity is the same in all views of a camera, and smooth over the image.
-What it has in common with a plane of the image, (1, u, v), is no bend but a projective map of space, which poses
-would take up: it is left as recorded. After Zhou and Koltun, Simultaneous localization and calibration (2014), whose
-lattice stands in space instead.
+With imperfectly calibrated lenses, a triangulating camera errs in disparity: surfaces bend, more with distance. The
+offset of disparity is smooth and constant per camera. Its part in (1, u, v) is a projective map of space that poses
+would absorb; it stays. After Zhou and Koltun, Simultaneous localization and calibration (2014), whose lattice lies in
+space.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,8 +26,9 @@ from splatctrl_cli.records import Bool, Float64, Index, RgbdFrame
 
 
 def stretch(depth: Float64, offset: Float64) -> tuple[Float64, Float64]:
-    """By what factor depths (...) [m] change with an offset (...) of disparity [1/m], ``1 / z' = 1 / z - offset``,
-    the offset at most `BEND_MOST` of the disparity; and how the factor's logarithm changes with it [m].
+    """Factor on depths (...) [m] for disparity offsets (...) [1/m], and its log-derivative [m].
+
+    ``1 / z' = 1 / z - offset``, the offset cut at `BEND_MOST` of the disparity.
     """
     share = offset * depth
     factor = 1 / (1 - np.clip(share, -fixed.BEND_MOST, fixed.BEND_MOST))
@@ -37,19 +36,19 @@ def stretch(depth: Float64, offset: Float64) -> tuple[Float64, Float64]:
 
 
 def unbent(frame: RgbdFrame, grid: Float64) -> RgbdFrame:
-    """The frame with its depth freed of a bend: offsets of disparity (rows, columns) [1/m], bilinear between them."""
+    """The frame with disparity offsets (rows, columns) [1/m], bilinear, removed from depth."""
     offset = (_weights(frame.depth.shape) @ grid.ravel()).reshape(frame.depth.shape)
     factor, _ = stretch(frame.depth.astype(np.float64), offset)
     return replace(frame, depth=(frame.depth * factor).astype(np.float32))
 
 
 def largest_share(grid: Float64, depth: float) -> float:
-    """The largest correction by a grid, as a share of a depth [m]."""
+    """Largest correction, as a share of `depth` [m]."""
     return float(np.abs(stretch(np.full_like(grid, depth), grid)[0] - 1).max())
 
 
 def _weights(shape: tuple[int, ...]) -> csr_array:
-    """(H W, G): of the grid's G nodes at each pixel; the first and the last stand at the image's edges."""
+    """(H W, G) bilinear weights of grid nodes, the outer on the image's edges."""
     rows, columns = fixed.BEND_GRID
     at = [np.arange(size) * (nodes - 1) / size for size, nodes in zip(shape, (rows, columns), strict=True)]
     low = [x.astype(np.int64) for x in at]
@@ -68,7 +67,7 @@ def _weights(shape: tuple[int, ...]) -> csr_array:
 
 
 def _roughness() -> Float64:
-    """(G, G): the sum of squares of the second differences of a grid is ``c^T S c``."""
+    """(G, G) matrix S: ``c^T S c`` sums a grid's squared second differences."""
     rows, columns = fixed.BEND_GRID
     nodes = np.eye(rows * columns).reshape(rows, columns, -1)
     twist = nodes[1:, 1:] - nodes[1:, :-1] - nodes[:-1, 1:] + nodes[:-1, :-1]
@@ -78,15 +77,16 @@ def _roughness() -> Float64:
 
 
 def bends_alone() -> Float64:
-    """(G, G - 3): an orthonormal basis of grids without a part in (1, u, v)."""
+    """(G, G - 3) orthonormal basis of grids without a part in (1, u, v)."""
     v, u = np.indices(fixed.BEND_GRID).reshape(2, -1)
     return np.asarray(null_space(np.stack([np.ones(len(u)), u, v])))
 
 
 @dataclass(kw_only=True)
 class BentViews:
-    """Views, and the bends of their cameras (C, G), solved for: `cameras` (N,) numbers them, `HELD` for one whose
-    depth is taken as it is. now: the views freed of the bends as they are known.
+    """Views, and the bends (C, G) of their cameras to solve for.
+
+    `cameras` (N,): `HELD` where depth is exact. now: the views without current bends.
     """
 
     recorded: Sequence[GrayView]
@@ -104,17 +104,17 @@ class BentViews:
 
     @property
     def grids(self) -> Float64:
-        """Offsets of disparity (C, rows, columns), of the views' lengths."""
+        """Offsets of disparity (C, rows, columns)."""
         return (self._free @ self._basis.T).reshape(self._num, *fixed.BEND_GRID)
 
     def equations(self, size: int, num_pairs: int) -> "BendEquations":
-        """Those of one round, beside `size` unknowns of poses, that are to be filled by so many pairs of views."""
+        """Zero equations of one round with `size` pose unknowns."""
         num = self._num * len(self._basis)
         cross, own, slope = np.zeros((size, num)), np.zeros((num, num)), np.zeros(num)
         return BendEquations(views=self, num_pairs=num_pairs, cross=cross, own=own, slope=slope)
 
     def by_offsets(self, i: int, j: int, rows: Rows) -> csr_array:
-        """(R, C G): how the residuals of view i on view j change with the offsets at the nodes."""
+        """(R, C G) derivatives of view i's residuals on view j by offsets."""
         size, parts = len(self._basis), []
         own = self._pixels[i][rows.own]
         for k, pixels, by_stretch in ((i, own, rows.by_own), (j, rows.other, rows.by_other)):
@@ -128,7 +128,7 @@ class BentViews:
         return parts[0] + parts[1]
 
     def joined(self, H: Float64, g: Float64, bent: "BendEquations") -> tuple[Float64, Float64]:
-        """The normal equations of poses, H (P, P) and g (P,), with those of the bends in what is free of them."""
+        """Pose equations H (P, P), g (P,), extended by the bends' free coordinates."""
         Q = np.kron(np.eye(self._num), self._basis)
         R = bent.num_pairs * np.kron(np.eye(self._num), self._prior)
         cross = bent.cross @ Q
@@ -136,7 +136,7 @@ class BentViews:
         return whole, np.concatenate([g, Q.T @ bent.slope + R @ self._free.ravel()])
 
     def move(self, step: Float64) -> None:
-        """Take a step in the coordinates that are free."""
+        """Take a step in the free coordinates."""
         self._free += step.reshape(self._free.shape)
         self._bend()
 
@@ -161,8 +161,9 @@ class BentViews:
 
 @dataclass(frozen=True, kw_only=True)
 class BendEquations:
-    """The normal equations of one round: of poses and offsets together, cross (P, C G), and of offsets alone, own
-    (C G, C G) and slope (C G,).
+    """The bends' part of the normal equations.
+
+    cross (P, C G): with poses; own (C G, C G), slope (C G,): alone.
     """
 
     views: BentViews
@@ -172,7 +173,7 @@ class BendEquations:
     slope: Float64
 
     def add(self, i: int, j: int, rows: Rows, columns: Index, J: Float64) -> None:
-        """Those of view i on view j, whose derivatives J (R, F) by poses stand in `columns` (F,)."""
+        """Add view i on view j, with pose derivatives J (R, F) in `columns` (F,)."""
         by_offsets = self.views.by_offsets(i, j, rows)
         self.cross[columns] += (by_offsets.T @ J).T
         square = (by_offsets.T @ by_offsets).tocoo()
@@ -180,25 +181,21 @@ class BendEquations:
         self.slope[:] += by_offsets.T @ rows.residuals
 
     def joined(self, H: Float64, g: Float64) -> tuple[Float64, Float64]:
-        """The equations of poses H (P, P), g (P,), and these."""
+        """Pose equations H (P, P), g (P,), extended by these."""
         return self.views.joined(H, g, self)
 
 
 def _pixels(view: GrayView) -> Index:
-    """By number (K,), those that the view's points are at."""
     u, v = np.round(project(view.depth.lens, view.depth.points)).astype(np.int64).T
     return np.asarray(v * view.gray.shape[1] + u)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefinedPoses:
-    """T_world_camera (4, 4) of each frame, put right; moved [m] and turned [deg], by how much each was (N,).
+    """Refined T_world_camera (4, 4); how far each moved [m] and turned [deg], (N,).
 
-    before, after: the median distance [m] of the views' points from each other's surfaces, of points that were not
-    used.
-
-    is_held (N,): frames that stay as they were, since nothing ties them to another view or they would move too far.
-    is_better: False where the poses stay as they were since their change would gain nothing.
+    before, after: median distance [m] between views' surfaces, at points not used. is_held (N,): kept as recorded,
+    because untied or moved too far. is_better: False if all stayed, since a change gains nothing.
     """
 
     T_world_camera: tuple[Float64, ...]
@@ -211,10 +208,9 @@ class RefinedPoses:
 
 
 def refined_poses(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | None = None) -> RefinedPoses:
-    """Put the poses of the frames right; those that are not `free` (N,) stay. scale: of the recording's lengths.
+    """Refine the poses of `free` (N,) frames; scale: of the recording's lengths.
 
-    A wide prior keeps the views, as a whole, where they were recorded. What moves by more than `REFINE_FARTHEST` is
-    held where it was.
+    A wide prior anchors the whole. Frames that would move beyond `REFINE_FARTHEST` stay.
     """
     views = [gray_view(frame, scale) for frame in frames]
     recorded = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
@@ -248,10 +244,9 @@ def refined_poses(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundBends:
-    """By camera, the bend of its depth, offsets of disparity (rows, columns) [1/m]; none where it does not tell.
+    """Disparity offsets (rows, columns) [1/m] by camera, where observable.
 
-    gains: by how much, as shares, the bend that each half of the views tells brings the other half together. unlike:
-    the cameras of which the halves tell different ones.
+    gains: shares by which each half's bend reduces the other half's distances. unlike: cameras whose halves disagree.
     """
 
     grids: Mapping[str, Float64] = field(default_factory=dict)
@@ -260,12 +255,10 @@ class FoundBends:
 
 
 def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float = 1.0) -> FoundBends:
-    """The bends of the cameras' depths, solved for with the poses, once these are `refined`.
+    """The bends of the cameras' depths, solved with the `refined` poses.
 
-    A bend counts where it also holds for views that it was not found from: every second view of a camera tells one,
-    and the others must lie nearer each other by `BEND_GAIN` with it than with poses alone; and the other way round.
-    Cameras of fewer than `BEND_VIEWS` views, and those of which the halves tell bends less alike than `BEND_ALIKE`,
-    have none.
+    Each half (every second view) of a camera's views must yield a bend that reduces the other half's distances by
+    `BEND_GAIN` over poses alone. Cameras need `BEND_VIEWS` views, and halves that agree by `BEND_ALIKE`.
     """
     views = [replace(f, T_world_camera=T) for f, T in zip(frames, refined.T_world_camera, strict=True)]
     views = [view for view, held in zip(views, refined.is_held, strict=True) if not held]
@@ -291,12 +284,12 @@ def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float
 
 
 def freed(frames: Sequence[RgbdFrame], grids: Mapping[str, Float64]) -> list[RgbdFrame]:
-    """The frames, their depth freed of the bends of their cameras, where there is one."""
+    """The frames without the bends of their cameras."""
     return [unbent(frame, grids[frame.camera]) if frame.camera in grids else frame for frame in frames]
 
 
 def _joint(frames: Sequence[RgbdFrame], cameras: Sequence[str], scale: float) -> dict[str, Float64]:
-    """The bends (rows, columns) [1/m] of some cameras, with the poses of all frames solved for at once."""
+    """Bends [1/m] of `cameras`, solved with all poses."""
     views = [gray_view(frame, scale) for frame in frames]
     poses = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
     every = np.ones(len(views), np.bool_)
@@ -307,7 +300,6 @@ def _joint(frames: Sequence[RgbdFrame], cameras: Sequence[str], scale: float) ->
 
 
 def _likeness(a: Float64, b: Float64) -> float:
-    """The cosine between two grids."""
     return float(np.vdot(a, b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
 
 
@@ -318,9 +310,7 @@ def _solved(
     is_free: Bool,
     bends: BentViews | None = None,
 ) -> list[Float64]:
-    """The poses after rounds in which the residuals that count get smaller; of the views freed of `bends`, which are
-    solved with them.
-    """
+    """Poses after rounds of narrowing width; `bends` are solved in place."""
     poses, column = list(recorded), np.cumsum(is_free) - 1
     size = POSE * int(is_free.sum())
     prior = np.tile(np.repeat(1 / np.square(fixed.REFINE_PRIOR), 3), int(is_free.sum()))
@@ -357,7 +347,7 @@ def _solved(
 def _distances(
     views: Sequence[GrayView], poses: Sequence[Float64], pairs: Sequence[tuple[int, int]], *, odd: bool
 ) -> float:
-    """The median distance of points from the surfaces of other views: those that `rows_of` leaves out where `odd`."""
+    """Median distance of points from other surfaces; `odd`: those not in `rows_of`."""
     found = [np.zeros(0)]
     for i, j in pairs:
         T = invert_transform(poses[j]) @ poses[i]

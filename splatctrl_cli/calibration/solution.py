@@ -1,4 +1,4 @@
-"""From evidence to a calibration: where to start, what to solve for, and whether one solution stands out."""
+"""From evidence to a calibration: starts, unknowns, and uniqueness."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,8 +18,9 @@ FREED = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_FREED)
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """The estimate, how sure it is, and the residuals that it makes least, within `widths`. noticed, by camera: how
-    far a scale would have to be from 1, and a bias [m] from 0, to be taken for one.
+    """The estimate, its certainty, and its residuals within `widths`.
+
+    noticed: by camera, the least |scale - 1| and |bias| [m] to be solved for.
     """
 
     estimate: Estimate
@@ -29,7 +30,7 @@ class Solution:
     noticed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def within_observed(self, start: Estimate) -> "Solution":
-        """Solved anew from a start in the directions alone that are known within `CALIBRATION_SIGMA`."""
+        """Solve again from `start`, only in directions known within `CALIBRATION_SIGMA`."""
         adjustment, reach = self.adjustment, self.certainty.reach
         values, vectors = np.linalg.eigh(reach @ self.certainty.covariance @ reach.T)
         known = vectors[:, values <= fixed.CALIBRATION_SIGMA**2]
@@ -42,15 +43,15 @@ class Solution:
 
     @property
     def held(self) -> tuple[str, ...]:
-        """Cameras whose pose was taken as it is."""
+        """Cameras whose pose is fixed."""
         unknowns = self.adjustment.unknowns
         return tuple(camera for camera in unknowns.cameras if camera not in unknowns.poses)
 
 
 def solved(evidence: Evidence, start: Estimate, held: Sequence[str]) -> Solution:
-    """The calibration of all cameras but those that are held.
+    """Calibrate all cameras but `held`.
 
-    Raises NotEvaluableError where cameras cannot be tied to each other, and where two solutions fit alike.
+    Raises NotEvaluableError if cameras share no surface, or two solutions fit alike.
     """
     cameras = evidence.cameras
     free = [camera for camera in cameras if camera not in held]
@@ -63,14 +64,14 @@ def solved(evidence: Evidence, start: Estimate, held: Sequence[str]) -> Solution
     best = _whole(adjustment, rough[order[0]], start)
     near = [rough[i] for i in order[1:] if costs[i] < fixed.CALIBRATION_RIVAL * costs[order[0]]]
     others = [one for one in near if _apart(best, one) > fixed.CALIBRATION_OTHER[0]]
-    if not others or not best.certainty.is_full:  # what is not observed is not told from another place
+    if not others or not best.certainty.is_full:  # unobserved directions allow other places
         return best
     other = _whole(adjustment, others[0], start)
     return best if _apart(best, other.estimate) < fixed.CALIBRATION_OTHER[0] else _better(best, other)
 
 
 def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution:
-    """The solution near a rough one, with all that the evidence shows to be needed."""
+    """The solution near a rough one, with supported clock and depth corrections."""
     near = adjustment.solved(rough, [WIDE[-1]], rounds=2)
     solution = _solution(adjustment, adjustment.solved(near, [narrow(adjustment, near)]))
     unknowns = adjustment.unknowns
@@ -82,14 +83,14 @@ def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution
 
 
 def _costs(adjustment: Adjustment, estimates: Sequence[Estimate]) -> list[float]:
-    """How badly each estimate fits; where little can be compared, a good fit says nothing."""
+    """Misfits; inf with few comparable points, where a good fit means little."""
     fits = [adjustment.cost(one, WIDE[-1].reach) for one in estimates]
     most = max(num for _, num in fits)
     return [cost if 2 * num >= most else np.inf for cost, num in fits]
 
 
 def _better(a: Solution, b: Solution) -> Solution:
-    """Of two solutions that differ. Raises NotEvaluableError where they fit alike."""
+    """The better of two solutions. Raises NotEvaluableError if they fit alike."""
     (cost_a, num_a), (cost_b, num_b) = (one.adjustment.cost(one.estimate, WIDE[-1].reach) for one in (a, b))
     if 2 * num_a < num_b or 2 * num_b < num_a:
         return a if num_a > num_b else b
@@ -110,13 +111,12 @@ def _solution(adjustment: Adjustment, estimate: Estimate) -> Solution:
 
 
 def narrow(adjustment: Adjustment, estimate: Estimate) -> Widths:
-    """The last widths: Tukey's, in what the residuals really err by."""
+    """Final widths: Tukey's, by the residuals' actual spread."""
     spread = adjustment.normal(estimate, WIDE[-1]).spread
     return Widths(reach=WIDE[-1].reach, cut=fixed.CALIBRATION_TUKEY * max(spread, fixed.CALIBRATION_LEAST_SPREAD))
 
 
 def _starts(unknowns: Unknowns, start: Estimate) -> list[Estimate]:
-    """The start, and others about it."""
     rng = np.random.default_rng(0)
     starts, num = [start], POSE * len(unknowns.poses)
     for _ in range(fixed.CALIBRATION_STARTS if num else 0):
@@ -127,7 +127,7 @@ def _starts(unknowns: Unknowns, start: Estimate) -> list[Estimate]:
 
 
 def _apart(solution: Solution, other: Estimate) -> float:
-    """How far [m] another estimate places what a camera sees, in the middle and at the rim of it, the largest."""
+    """Largest displacement [m] of a camera's points by another estimate."""
     apart = [0.0]
     for camera in solution.adjustment.unknowns.poses:
         middle, radius = middle_of(solution.adjustment, camera)
@@ -140,7 +140,6 @@ def _apart(solution: Solution, other: Estimate) -> float:
 
 
 def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
-    """Raise NotEvaluableError naming cameras between which, and the robot, no surfaces are shared."""
     evidence = adjustment.evidence
     group = {name: {name} for name in (*evidence.cameras, ROBOT)}
     for (a, b), count in adjustment.normal(estimate, WIDE[-1]).counts.items():
@@ -164,10 +163,10 @@ def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
 
 
 def _with_depths(solution: Solution) -> Solution:
-    """With scales and biases of depths, where the recording shows clearly that some camera needs one.
+    """Solve again with clearly supported depth scales and biases.
 
-    All are tried together, for while one that is wrong is held, others make up for it. Those least sure to differ
-    from 1 or 0 are held again, one by one, until all that are left differ by `CALIBRATION_DEPTH_SURE[0]` sigmas.
+    All are tried together, as others compensate for a wrong fixed one. The least certain are fixed one by one, until
+    all left differ by `CALIBRATION_DEPTH_SURE[0]` sigmas.
     """
     unknowns = solution.adjustment.unknowns
     tried = _freed(solution, replace(unknowns, scales=unknowns.poses, biases=unknowns.cameras))
@@ -184,9 +183,9 @@ def _with_depths(solution: Solution) -> Solution:
 
 
 def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
-    """How far each unknown (P,) of depths is from 1 or 0, the covariance (P, P), and where those stand that are left
-    free once the others are held at that. Of a scale and a bias that explain the same, the likelier is left
-    (`CALIBRATION_DEPTH_USUAL`).
+    """Depth unknowns' offsets (P,) from 1 or 0, covariance (P, P), and free columns.
+
+    If a scale and a bias explain the same, the likelier stays (`CALIBRATION_DEPTH_USUAL`).
     """
     unknowns, covariance = tried.adjustment.unknowns, tried.certainty.covariance
     off, free, usual = np.zeros(unknowns.size), [], []
@@ -209,21 +208,19 @@ def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
 
 
 def _with_held(off: Float64, covariance: Float64, at: int) -> tuple[Float64, Float64]:
-    """What becomes of estimates (P,) and their covariance (P, P) when one of them is held at 0."""
+    """Estimates (P,) and covariance (P, P), with one fixed at 0."""
     gain = covariance[:, at] / max(covariance[at, at], np.finfo(float).tiny)
     return off - gain * off[at], _positive(covariance - np.outer(gain, covariance[at]))
 
 
 def _positive(covariance: Float64) -> Float64:
-    """A covariance (P, P) without variances that rounding has left at zero or below."""
+    """A covariance (P, P) with positive variances despite rounding."""
     np.fill_diagonal(covariance, np.maximum(np.diag(covariance), np.finfo(float).tiny))
     return covariance
 
 
 def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
-    """By camera, the scale (how far from 1) and the bias [m] that would have been taken, had it been so large; inf
-    where none is looked for.
-    """
+    """Least |scale - 1| and |bias| [m] to be noticed, by camera; inf if none."""
     unknowns = tried.adjustment.unknowns
     held = [at for at in range(POSE * len(unknowns.poses), unknowns.size - unknowns.has_clock) if at not in free]
     found = {}
@@ -243,7 +240,7 @@ def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, flo
 
 
 def _is_sure(tried: Solution, at: int, off: float, variance: float) -> bool:
-    """Whether a scale or a bias, at its place among the unknowns, is surely not 1 or 0, and changes the depths."""
+    """True if a scale or bias clearly differs from 1 or 0."""
     unknowns = tried.adjustment.unknowns
     camera = next(camera for camera in unknowns.cameras if at in unknowns.columns(camera))
     change = off if at == unknowns.columns(camera)[-1] else off * _far(tried, camera)
@@ -257,7 +254,7 @@ def _is_absurd(scale: float, bias: float) -> bool:
 
 
 def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
-    """Solved anew with scales and biases, from the best of what several scales lead to at a first look."""
+    """Solve again with scales and biases, from the best of several scales."""
     evidence = solution.adjustment.evidence
     adjustment, few = Adjustment(evidence, unknowns), Adjustment(evidence.thinned(), unknowns)
     estimates = []
@@ -271,7 +268,6 @@ def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
 
 
 def _far(solution: Solution, camera: str) -> float:
-    """The depth [m] that nine of ten points of a camera are nearer than; 0 where it has none."""
     seen = [view.points[:, 2] for view in solution.adjustment.evidence.views if view.camera == camera]
     depths = np.concatenate(seen)
     return float(np.percentile(depths, 90)) if len(depths) else 0.0

@@ -1,4 +1,4 @@
-"""Depth images made ready to be laid over each other: surfaces, their normals, and what lands on them."""
+"""Depth images for comparison: surfaces, normals, and points projected on them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,9 +18,8 @@ SMOOTH = 0.1  # of the depth, that a pixel and its four neighbours may differ by
 class DepthView:
     """One depth image, in its camera's optical frame [m].
 
-    surface, normals (h, w, 3): the point of every pixel, and the surface's unit normal there, towards the camera, 0
-    where it is not known. points, point_normals (K, 3): some of those with a normal, and the part of the image that
-    each lies in, tiles (K,). T_world_camera (4, 4): as recorded.
+    surface, normals (h, w, 3): per pixel, normals towards the camera, 0 if unknown. points, point_normals (K, 3): a
+    subset with normals, in image parts tiles (K,). T_world_camera (4, 4): as recorded.
     """
 
     camera: str
@@ -35,7 +34,7 @@ class DepthView:
 
     @classmethod
     def of(cls, frame: RgbdFrame, num_points: int, step: int = 1) -> "DepthView":
-        """The view of a frame, with at most so many points, spread over the image; step: of `surface_normals`."""
+        """A frame's view with at most `num_points` points; step: of `surface_normals`."""
         surface = back_project(frame.intrinsics, frame.depth)
         normals = surface_normals(surface, step)
         normals[bend(frame.depth, step) > fixed.CALIBRATION_CREASE * depth_sigma(frame.depth)] = 0.0
@@ -56,10 +55,10 @@ class DepthView:
 
 
 def _of_all_directions(normals: Float64, most: int) -> Index:
-    """At most so many of N normals (N, 3), by number in order, as many of each direction as there are: a table would
-    outnumber what stands on it, which alone says where along the table a camera is.
+    """Numbers, in order, of at most `most` normals (N, 3), balanced over directions.
 
-    Normal-space sampling after Rusinkiewicz and Levoy, Efficient variants of the ICP algorithm (2001).
+    A table outnumbers its objects, which alone constrain the camera along it. Normal-space sampling after
+    Rusinkiewicz and Levoy, Efficient variants of the ICP algorithm (2001).
     """
     side = np.argmax(np.abs(normals), axis=1)
     largest = np.take_along_axis(normals, side[:, None], axis=1)[:, 0]
@@ -75,7 +74,7 @@ def _of_all_directions(normals: Float64, most: int) -> Index:
 
 
 def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
-    """The frame of every n-th pixel, so that it has no more than about `rows` rows; without colour."""
+    """Every n-th pixel, for at most about `rows` rows; without colour."""
     stride = max(1, frame.depth.shape[0] // rows)
     depth = np.ascontiguousarray(frame.depth[::stride, ::stride])
     lens = strided_lens(frame.intrinsics, stride)
@@ -85,8 +84,9 @@ def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
 
 
 def surface_normals(surface: Float64, step: int = 1) -> Float64:
-    """Unit normals (h, w, 3) of a surface (h, w, 3) in a camera's frame, towards the camera, from the points `step`
-    pixels away on either side; 0 along edges and where depth is missing.
+    """Unit normals (h, w, 3) towards the camera of a surface (h, w, 3).
+
+    From points `step` pixels to either side; 0 along edges and without depth.
     """
     normals = np.zeros_like(surface)
     middle, low, high = slice(step, -step), slice(None, -2 * step), slice(2 * step, None)
@@ -102,7 +102,7 @@ def surface_normals(surface: Float64, step: int = 1) -> Float64:
 
 
 def bend(depth: Float32, step: int = 1) -> Float64:
-    """By how much (h, w) [m] a depth differs from the middle of those `step` pixels away on either side, at most."""
+    """Largest deviation (h, w) [m] of depth from the mean `step` pixels aside."""
     bent = np.zeros(depth.shape)
     middle, low, high = slice(step, -step), slice(None, -2 * step), slice(2 * step, None)
     z = depth.astype(np.float64)
@@ -114,7 +114,7 @@ def bend(depth: Float32, step: int = 1) -> Float64:
 
 
 class Surface(Protocol):
-    """What points are laid on: surface and normals (h, w, 3) of a lens."""
+    """Surface and normals (h, w, 3), with their lens."""
 
     @property
     def lens(self) -> Intrinsics: ...
@@ -125,9 +125,7 @@ class Surface(Protocol):
 
 
 def landed(points: Float64, view: Surface) -> tuple[Bool, Float64, Float64]:
-    """Of points (K, 3) in a view's camera frame: which land on a depth of it (K,), and its surface and normals (K, 3)
-    there.
-    """
+    """Hits (K,) of points (K, 3), camera frame, on depth; surface and normals there."""
     is_ahead = points[:, 2] > fixed.PLAUSIBLE_DEPTH[0]
     pixels = np.round(project(view.lens, np.where(is_ahead[:, None], points, 1.0)))
     lands = is_ahead & np.all((pixels >= 0) & (pixels < view.surface.shape[1::-1]), axis=1)
@@ -137,11 +135,11 @@ def landed(points: Float64, view: Surface) -> tuple[Bool, Float64, Float64]:
 
 
 def by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64) -> Float64:
-    """(K, 12): how a value with a gradient (K, 3) by the point `there` (K, 3) changes with a small turn and move of
-    the camera that has the point at `own` (K, 3), at T (4, 4), and of the one it is seen from, each in its own frame.
+    """Derivatives (K, 12) of a value at `there` (K, 3) by two cameras' motions.
 
-    T exp(x) moves points by ``x[:3] x p + x[3:]``, so that ``g . T exp(x) p`` changes by ``(p x R^T g) . x[:3] +
-    R^T g . x[3:]``; the other camera's move does the reverse.
+    The first camera has the point at `own` (K, 3), at T (4, 4); the second sees it. gradient (K, 3): by the point.
+    Motions are a rotation and translation in own frames. T exp(x) moves points by ``x[:3] x p + x[3:]``, so ``g . T
+    exp(x) p`` changes by ``(p x R^T g) . x[:3] + R^T g . x[3:]``; the second camera's sign is opposite.
     """
     along = gradient @ T[:3, :3]
     return np.hstack([np.cross(own, along), along, -np.cross(there, gradient), -gradient])
@@ -150,8 +148,9 @@ def by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64) -> Fl
 def overlap_rows(
     points: Float64, T: Float64, which: Bool, surface: Float64, normals: Float64
 ) -> tuple[Float64, Float64]:
-    """Of points (K, 3) of another view that land (`landed`) on a view at T (4, 4) from there, those of `which` (K,):
-    the residual, their distance (M,) [m] from the plane of its surface, and its derivatives (M, 12), `by_twists`.
+    """Distances (M,) [m] of points from a view's surface planes, and derivatives (M, 12), `by_twists`.
+
+    points (K, 3): of the other view, at T (4, 4); which (K,): those that land (`landed`).
     """
     there, normal = transform_points(T, points[which]), normals[which]
     residual = np.einsum("ki,ki->k", there - surface[which], normal)
@@ -159,10 +158,9 @@ def overlap_rows(
 
 
 def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
-    """What a camera that stands still sees in most of its frames: the mean of the inverse depths near their median.
+    """A stationary camera's frame: the mean of inverse depths near their median.
 
-    A sensor errs in disparity, which is in proportion to inverse depth. A pixel counts where half of the frames agree
-    within three times `depth_sigma`.
+    Sensors err in disparity, proportional to inverse depth. Half of the frames must agree within three `depth_sigma`.
     """
     if len(frames) == 1:
         return frames[0]
@@ -181,14 +179,12 @@ def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
 
 
 def depth_sigma(depth: NDArray[np.floating]) -> Float64:
-    """What a depth (...) [m] may err by [m], as the residuals are weighed by: an error of disparity grows with the
-    square, and what every sensor has. The solution's own residuals say how much it really is.
-    """
+    """Assumed sigma [m] of depths (...) [m]: constant plus quadratic, as disparity errs."""
     return np.asarray(fixed.CALIBRATION_NOISE[0] + fixed.CALIBRATION_NOISE[1] * np.square(depth), np.float64)
 
 
 def tiles_of(pixels: Index, shape: tuple[int, ...]) -> Index:
-    """In which part of an image, of `CALIBRATION_TILES` rows and columns of them, each pixel (K,) lies."""
+    """Each pixel's tile (K,), of `CALIBRATION_TILES` rows and columns."""
     rows, columns = fixed.CALIBRATION_TILES
     v, u = np.divmod(pixels, shape[1])
     return np.asarray((v * rows // shape[0]) * columns + u * columns // shape[1], dtype=np.int64)

@@ -1,1 +1,1 @@
-"""What is wrong with a recording."""
+"""Checks of recordings."""

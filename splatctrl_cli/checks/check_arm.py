@@ -1,7 +1,4 @@
-"""Whether the robot's motion fits what the cameras see, and if not, what would put it right.
-
-Depth images show the arm where forward kinematics puts it, at the time of the joint states, or with two exchanged.
-"""
+"""The robot's motion against depth images, and corrections of clocks or joint order."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,12 +20,12 @@ LATE = "synchronise the clocks, or shift the stamps: robot labels and replay com
 
 @dataclass(frozen=True, kw_only=True)
 class ArmAgreement:
-    """Depth minus the rendered depth of the robot's surface, over the pixels that it covers, of one camera's frames.
+    """Measured minus rendered depth on the robot's pixels, in one camera's frames.
 
-    median [m] of those within `ARM_NEAR`, positive where the robot is measured behind its surface; misfit [m]: mean
-    distance from it (from 0 where it is negative, from `ARM_COVER` where it is more), each cut at `ARM_NEAR`;
-    seen_through: share of the pixels whose depth lies more than `ARM_NEAR` behind; num_pixels with depth; num_frames
-    with joint states; scale: depth over predicted depth where it is one factor for most pixels.
+    median [m]: within `ARM_NEAR`, positive if measured behind the surface. misfit [m]: mean distance from it (from 0
+    if negative, from `ARM_COVER` if more), each cut at `ARM_NEAR`. seen_through: share more than `ARM_NEAR` behind.
+    num_pixels: with depth; num_frames: with joint states. scale: measured over rendered depth, if one factor fits
+    most pixels.
     """
 
     median: float
@@ -40,7 +37,7 @@ class ArmAgreement:
 
     @property
     def is_good(self) -> bool:
-        """Whether the arm is where the joints say."""
+        """True if the arm is where the joints say."""
         is_there = self.seen_through <= limits.ARM_SEEN_THROUGH and abs(self.median) <= limits.ARM_OFFSET
         return is_there and self.misfit <= limits.ARM_MISFIT
 
@@ -57,7 +54,10 @@ def reduced(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
 def arm_agreement(
     model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture, *, offset_s: float = 0.0
 ) -> ArmAgreement | None:
-    """Of one camera's frames; None where too little of the arm is seen. offset_s: its clock against the joints'."""
+    """One camera's agreement; None if too little of the arm shows.
+
+    offset_s: the camera's clock minus the joints'.
+    """
     parts: list[Float64] = []
     for frame in frames:
         q = posture(frame.stamp_ns - round(offset_s * 1e9))
@@ -91,8 +91,9 @@ def arm_agreement(
 
 
 def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[float, float] | None:
-    """One camera's clock [s] against that of the joint states at which its depth images show the arm best, and the
-    misfit [m] with it; None where no offset shows the arm much better than another, or the best is at the edge.
+    """Best clock offset [s] of a camera against the joint states, and its misfit [m].
+
+    None if others fit about as well, or it lies at the edge.
     """
 
     def misfit(offset: float) -> float:
@@ -118,7 +119,7 @@ def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture)
 
 
 def swapped_joints(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[int, int] | None:
-    """Two joints that, exchanged, put the arm where the depth images show it; None where no such pair exists."""
+    """Two joints whose exchange fits depth, or None."""
     few = spread(frames, limits.SWAPPED_FRAMES)
     plain = arm_agreement(model, few, posture)
     best: tuple[float, tuple[int, int]] | None = None
@@ -144,7 +145,7 @@ def _exchanged(posture: Posture, i: int, j: int) -> Posture:
 
 
 def arm_finding(where: str, agreement: ArmAgreement, units: Iterable[float | None]) -> Finding:
-    """One sentence on a camera that shows the arm where the joints say, but for its scale (units: `rescaled`)."""
+    """Finding of a camera that shows the arm in place or scaled (units: `rescaled`)."""
     share = f"{100 * agreement.seen_through:.0f} % of {agreement.num_pixels} pixels"
     seen = f"in {agreement.num_frames} depth images {share} show what is behind it"
     if agreement.is_good and agreement.scale is None:
@@ -157,7 +158,7 @@ def arm_finding(where: str, agreement: ArmAgreement, units: Iterable[float | Non
 
 
 def misplaced_finding(bad: Mapping[str, ArmAgreement], cause: str) -> Finding:
-    """Of cameras that show the arm elsewhere; cause: what would put it right, if known."""
+    """Finding of cameras that show the arm elsewhere; cause: the correction, or ""."""
     where = f"camera{'s' if len(bad) > 1 else ''} {', '.join(bad)}"
     off = ", ".join(f"{1e3 * agreement.misfit:.0f}" for agreement in bad.values())
     through = ", ".join(f"{100 * agreement.seen_through:.0f}" for agreement in bad.values())
@@ -175,9 +176,9 @@ def motion_findings(
     model: RobotModel | None,
     units: Iterable[float | None] = (None,),
 ) -> list[Finding]:
-    """What the cameras say of the joint states (in the model's order where there is one).
+    """Findings on joint states (in the model's order, if any) by the cameras.
 
-    frames: reduced, a few of each camera; motion: of the first images of each; units: of depth, as of `rescaled`.
+    frames: reduced, a few per camera; motion: of each camera's first images; units: as for `rescaled`.
     """
     found: list[Finding] = []
     offsets: dict[str, float] = {}
@@ -198,7 +199,7 @@ def motion_findings(
 def _arm_findings(
     model: RobotModel, frames: Sequence[RgbdFrame], states: StateColumns, units: Iterable[float | None]
 ) -> tuple[dict[str, float], list[Finding]]:
-    """The offsets [s] of the clocks of cameras that show the arm better with one, and what depth says of the arm."""
+    """Clock offsets [s] that improve cameras, and findings on the arm."""
     posture = states.postures(limits.ARM_CLOSE_NS)
     found: list[Finding] = []
     timings: dict[str, tuple[float, float]] = {}
@@ -226,9 +227,7 @@ def _arm_findings(
 def _own_offsets(
     timings: Mapping[str, tuple[float, float]], model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture
 ) -> dict[str, float]:
-    """Those of cameras that show the arm much better at their own offset than at that of most: another has other
-    causes, as a camera that stands elsewhere.
-    """
+    """Offsets that fit much better than the median's; others have other causes, as a misplaced camera."""
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
     kept = {}
     for camera, (offset_s, misfit) in timings.items():
@@ -249,7 +248,7 @@ def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> s
 
 
 def _timing_findings(offsets: Mapping[str, float]) -> list[Finding]:
-    """One finding for all cameras of one clock, and one for each that has another."""
+    """A finding for the common clock, and one per other camera."""
     middle = float(np.median(list(offsets.values())))
     apart = limits.TIME_OFFSET + limits.TIME_ERROR
     others = {c: offset for c, offset in offsets.items() if abs(offset - middle) > apart and len(offsets) > 2}
@@ -271,7 +270,7 @@ def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:
 
 
 def _clock_finding(where: str, text: str, offset_s: float, least_s: float) -> Finding:
-    """A warning where the offset [s] is more than `least_s`, else a note."""
+    """A warning beyond `least_s` [s], else a note."""
     is_off = abs(offset_s) > least_s
     make = warning if is_off else note
     remedy = LATE.format("late" if offset_s > 0 else "early") if is_off else ""

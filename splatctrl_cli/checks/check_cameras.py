@@ -1,4 +1,4 @@
-"""Whether colour and depth pair, intrinsics fit the images, distortion is known, and tf places every frame."""
+"""Checks of cameras: colour-depth pairs, intrinsics, distortion and poses."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ NUM_DISTORTION = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equi
 
 
 def lens_findings(where: str, lens: Intrinsics, source: str = "") -> list[Finding]:
-    """Focal lengths and principal point against the image's size; source: what says them."""
+    """Findings on intrinsics by image size; source: their origin."""
     found: list[Finding] = []
     says = f"{source}: " if source else ""
     remedy = "calibrate again, or give the CameraInfo of this very stream (a crop or another size has its own)"
@@ -58,7 +58,7 @@ def lens_findings(where: str, lens: Intrinsics, source: str = "") -> list[Findin
 
 
 def calibration_findings(found: Survey, cameras: Sequence[CameraTopics], changed: dict[str, int]) -> list[Finding]:
-    """CameraInfo topics of the log; `changed`: stamps at which one first differs from its first message."""
+    """Findings on CameraInfo; `changed`: stamps of first changes."""
     findings: list[Finding] = []
     for entry in found.of_type(CAMERA_INFO):
         name, calibration = entry.topic.name, entry.calibration
@@ -118,7 +118,7 @@ def _sizes(found: Survey, camera: CameraTopics) -> list[Finding]:
 
 
 def _rivals(found: Survey, camera: CameraTopics) -> list[Finding]:
-    """Other CameraInfo topics of the colour image's frame and size that say something else."""
+    """Other CameraInfo with the colour image's frame and size, but another K."""
     chosen = found.topics[camera.info].calibration if camera.info else None
     if chosen is None:
         return []
@@ -164,7 +164,7 @@ def _frame(found: Survey, topic: str) -> str:
 
 
 def pose_findings(where: str, stamps_ns: Sequence[int], poses: Sequence[Float64 | None]) -> list[Finding]:
-    """Frames that nothing places, and jumps; stamps in order."""
+    """Images without pose, and jumps; stamps in order."""
     findings: list[Finding] = []
     lost = [stamp for stamp, T in zip(stamps_ns, poses, strict=True) if T is None]
     if lost:
@@ -227,7 +227,7 @@ def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> lis
 
 
 def _lens(found: Survey, topics: CameraTopics, options: SourceOptions) -> list[Finding]:
-    """Of the lens that is used: the one given, else the CameraInfo's; and of depth's own."""
+    """Findings on the lens in use, and on depth's own."""
     where, image = f"camera {topics.name}", found.topics[topics.color].first_image
     given = options.intrinsics.get(topics.name)
     if given is not None and image is not None:

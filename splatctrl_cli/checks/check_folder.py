@@ -1,4 +1,4 @@
-"""Everything that is wrong with a capture or an image folder, from one pass; the judgement is that of logs too."""
+"""Checks of a capture or image folder in one pass, judged as logs are."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -41,11 +41,11 @@ from splatctrl_cli.scene.scale import RecordedDepth
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What is kept of a recording, in bounded memory.
+    """Bounded data of a recording.
 
-    frames: reduced, a few of each camera whose poses are known; depth_units: [m] per count by camera, None where
-    depth is stored as floats; motion: of the first images. states: joint states to compare, in the model's order
-    where there is one. cut: says that not all was read. is_guessed: the unit of its lengths.
+    frames: reduced, a few per camera with known poses. depth_units: [m] per count by camera, None for floats. motion:
+    of the first images. states: in the model's order, if any. cut: says that not all was read. is_guessed: the unit
+    of lengths is.
     """
 
     frames: Sequence[RgbdFrame]
@@ -59,9 +59,9 @@ class Evidence:
 def judged(
     report: CheckReport, evidence: Evidence, model: RobotModel | None, *, only_errors: bool = False
 ) -> CheckReport:
-    """Add to a report what frames and states say of each other, and the frames.
+    """Add findings on frames, and on frames against states, to a report.
 
-    only_errors: leave out checks that give notes and warnings alone, four fifths of the work.
+    only_errors: skip checks that yield only notes and warnings, four fifths of the work.
     """
     findings = [*report.findings, *alignment_findings(evidence.frames)]
     frames, is_still = usable_frames(evidence.frames, findings), report.start_ns is None
@@ -77,13 +77,13 @@ def judged(
 
 
 def usable_frames(frames: Sequence[RgbdFrame], findings: Sequence[Finding]) -> list[RgbdFrame]:
-    """The frames of cameras whose own lens and depth are right: of others a comparison would blame the pose."""
+    """Frames of cameras with correct lens and depth; others would seem misplaced."""
     wrong = {f.where for f in findings if f.severity is Severity.ERROR and f.code in {"alignment", "principal-point"}}
     return [frame for frame in frames if f"camera {frame.camera}" not in wrong]
 
 
 def exposure_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
-    """By camera, the ratio of its brightest to its darkest image of what both show, and of rows within an image."""
+    """Brightness ratios per camera: between images of a surface, and between rows of an image."""
     cameras = sorted({frame.camera for frame in frames})
     whole = [frame for frame in frames if frame.depth.shape == frame.color.shape[:2]]
     chosen = [f for c in cameras for f in spread([f for f in whole if f.camera == c], limits.EXPOSURE_FRAMES)]
@@ -118,10 +118,9 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
 
 
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
-    """Logarithms (N, B) of the brightness of an image's bands of rows, less a parabola; 0 where bands explain little.
+    """Log brightness (N, B) by bands of rows, less a parabola; 0 if unexplained.
 
-    Shadows and poses that are off make bands differ, too, but do not follow the rows; gloss and a lens that is darker
-    at its edge change slowly over an image, and the light of a lamp on mains in 10 or 8 ms.
+    Shadows and pose errors do not follow rows; gloss and vignetting vary slowly, lamps on mains within 10 or 8 ms.
     """
     found = bands.gains(np.ones(bands.num_images, np.bool_))
     logs = np.log(found).mean(axis=2)
@@ -140,8 +139,6 @@ _LOST = {
 
 
 class _CameraWatch:
-    """What is kept of one camera's frames."""
-
     def __init__(self, lens: Intrinsics, where: str, unit: float | None) -> None:
         self.lens = lens
         self.images, self.colors = ImageWatch(where, unit), ImageWatch(where)
@@ -150,7 +147,7 @@ class _CameraWatch:
         self.poses: list[Float64] = []
 
     def add(self, stored: StoredFrame, motion: ImageMotion) -> None:
-        """Take a frame; its images are decoded where they are wanted."""
+        """Take a frame, decoding images if wanted."""
         self.times.add(stored.stamp_ns, stored.stamp_ns)
         self.stamps.append(stored.stamp_ns)
         self.poses.append(stored.T_world_camera)
@@ -163,7 +160,7 @@ class _CameraWatch:
             self.images.add_undecoded(encoding, self.lens.width, self.lens.height)
 
     def frames(self, camera: str) -> list[RgbdFrame]:
-        """The kept images with their poses; by number, for views of a folder may have no clock."""
+        """Kept images with poses, paired by number, as a folder may have no clock."""
         poses = dict(zip(self.stamps, self.poses, strict=True))
         return [
             RgbdFrame(
@@ -180,8 +177,6 @@ class _CameraWatch:
 
 
 class _SourceWatch:
-    """What is kept of a source's frames and joint states."""
-
     def __init__(self, num_joints: int) -> None:
         self.cameras: dict[str, _CameraWatch] = {}
         self.states = StateCollector(num_joints)
@@ -189,7 +184,7 @@ class _SourceWatch:
         self.is_whole = True
 
     def read(self, source: FrameSource, num_images: int | None) -> None:
-        """Take all; with `num_images` up to as many of a camera."""
+        """Take all, or at most `num_images` per camera."""
         for item in source.stored():
             if isinstance(item, JointState):
                 self.states.add(item)
@@ -210,7 +205,7 @@ def check_folder(
     num_images: int | None = None,
     only_errors: bool = False,
 ) -> CheckReport:
-    """Read the frames of `path` once; with `num_images` up to as many of a camera."""
+    """Check `path` in one pass; at most `num_images` frames per camera."""
     kind = "capture" if is_capture(path) else "image folder"
     try:
         source = open_source(path, options)

@@ -1,7 +1,4 @@
-"""What images hold: encodings, sizes, how much depth and how far, and whether the edges of colour and depth meet.
-
-Where they do not, depth is of another camera, or not registered.
-"""
+"""Checks of images: encodings, sizes, depth, and registration of depth to colour by edges."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,7 +18,7 @@ SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """Every `stride`-th pixel of an image: depth (h, w) [m] or colour (h, w, 3); width, height [px] of all of it."""
+    """Every `stride`-th pixel of depth (h, w) [m] or colour; full width, height [px]."""
 
     stamp_ns: int
     stride: int
@@ -41,9 +38,9 @@ class Thumbnail:
 
 
 class ImageWatch:
-    """Watches the images of one topic or camera in bounded memory.
+    """Statistics of a topic's or camera's images, in bounded memory.
 
-    All of the first `limits.DECODED_IMAGES` images are to be decoded, then every second, fourth, ... (`is_wanted`).
+    The first `limits.DECODED_IMAGES` are decoded, then every second, fourth, ... (`is_wanted`).
     """
 
     def __init__(self, where: str, scale: float | None = None) -> None:
@@ -62,21 +59,21 @@ class ImageWatch:
         self._wanted: Thinned[None] = Thinned(limits.DECODED_IMAGES)
 
     def is_wanted(self) -> bool:
-        """Whether the image that comes now is to be decoded; to be asked once for each."""
+        """True if the next image is to be decoded; call once each."""
         is_next = self._wanted.is_next()
         if is_next:
             self._wanted.add(None)
         return is_next
 
     def add_bad(self, stamp_ns: int, reason: str) -> None:
-        """An image that does not decode."""
+        """Count an undecodable image."""
         self.count += 1
         self.num_bad += 1
         if self.first_bad_ns is None:
             self.first_bad_ns, self.first_bad = stamp_ns, reason
 
     def add_color(self, stamp_ns: int, color: UInt8, encoding: str) -> None:
-        """A colour image (H, W, 3)."""
+        """Take a colour image (H, W, 3)."""
         height, width = color.shape[:2]
         self.add_undecoded(encoding, width, height)
         self.num_decoded += 1
@@ -90,7 +87,7 @@ class ImageWatch:
             self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, color=kept))
 
     def add_depth(self, stamp_ns: int, depth: Float32, encoding: str, num_invalid: int = 0) -> None:
-        """A depth image (H, W) [m], 0 = none."""
+        """Take a depth image (H, W) [m], 0 = none."""
         height, width = depth.shape
         self.add_undecoded(encoding, width, height)
         self.num_decoded += 1
@@ -114,7 +111,7 @@ class ImageWatch:
             self.thumbnails.append(Thumbnail(stamp_ns=stamp_ns, depth=thumbnail))
 
     def rescale(self, scale: float) -> None:
-        """Take [m per count] for what the depths were read with; for a log that says its unit."""
+        """Set the scale [m per count] of a log that names it."""
         factor = np.float32(scale / (self.unit or 1.0))
         self.scale = scale
         if factor != 1.0:
@@ -125,23 +122,23 @@ class ImageWatch:
 
     @property
     def is_float(self) -> bool:
-        """Whether most images are 32FC1."""
+        """True if most images are 32FC1."""
         return [name for name, _ in self.encodings.most_common(1)] == ["32FC1"]
 
     @property
     def unit(self) -> float | None:
-        """Metres per count of depth; None for metres."""
+        """Metres per count; None for metres."""
         return self.scale if self.scale is not None else None if self.is_float else MILLIMETRE
 
     def add_undecoded(self, encoding: str, width: int, height: int) -> None:
-        """An image of an encoding that is not read, or of which only the head is."""
+        """Count an image without its pixels."""
         self.count += 1
         self.encodings[encoding] += 1
         self.sizes[width, height] += 1
 
 
 def _constant(depth: Float32) -> list[float]:
-    """The largest of some depths [m] where many have it exactly and it stands apart, as a code for no return does."""
+    """The largest depth [m], if frequent and isolated like a no-return code."""
     values, counts = np.unique(depth, return_counts=True)
     if len(values) < 2 or counts[-1] < limits.CONSTANT_SHARE * depth.size:
         return []
@@ -151,7 +148,7 @@ def _constant(depth: Float32) -> list[float]:
 
 
 def stride_of(height: int) -> int:
-    """The rows from one kept row to the next."""
+    """Rows per kept row."""
     return max(1, -(-height // limits.KEPT_ROWS))
 
 
@@ -170,7 +167,7 @@ def thumbnail_lens(lens: Intrinsics) -> Intrinsics:
 
 
 def image_findings(images: ImageWatch) -> list[Finding]:
-    """What is wrong with the images, depth apart."""
+    """Findings on the images, except depth."""
     where, found = images.where, []
     if images.num_bad:
         text = f"{images.num_bad} of {images.count} images do not decode; the first: {images.first_bad}"
@@ -187,7 +184,7 @@ def image_findings(images: ImageWatch) -> list[Finding]:
 
 
 def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
-    """That not every image was decoded, where that is so."""
+    """A note on images not decoded."""
     few = [images for images in topics if images.num_decoded + images.num_bad < images.count and images.num_decoded]
     if not few:
         return []
@@ -198,7 +195,7 @@ def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
 
 
 def depth_findings(images: ImageWatch) -> list[Finding]:
-    """Whether depth is there, and at a plausible distance."""
+    """Findings on missing or implausible depth."""
     where, found = images.where, []
     if images.num_without_depth:
         every = images.num_without_depth == images.num_decoded
@@ -254,7 +251,7 @@ def _scale(images: ImageWatch) -> list[Finding]:
 
 
 def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
-    """Of every camera whose frames have colour."""
+    """Findings on colour-depth registration, by camera."""
     edges = {
         camera: [_spectra(f) for f in its[:: max(1, len(its) // limits.EDGE_FRAMES)][: limits.EDGE_FRAMES]]
         for camera in sorted({frame.camera for frame in frames})
@@ -283,7 +280,7 @@ def _shifted(where: str, du: int, dv: int, width: int, peak: float) -> Finding:
 
 
 def _exchanged(camera: str, other: tuple[str, float, float], *, is_mutual: bool) -> Finding:
-    """An error only where the other camera's colour fits a foreign depth as well: an exchange has two sides."""
+    """An error only if mutual: an exchange has two sides."""
     name, own, peak = other
     text = f"its colour edges meet the depth edges of camera {name} (correlation {peak:.2f}), not its own ({own:.2f})"
     severity = error if is_mutual else warning
@@ -294,7 +291,7 @@ def _exchanged(camera: str, other: tuple[str, float, float], *, is_mutual: bool)
 def _other(
     camera: str, edges: dict[str, list[tuple[Float64, Float64]]], own: float
 ) -> tuple[str, float, float] | None:
-    """The camera whose depth fits this one's colour clearly, its own score, and the other's."""
+    """The camera whose depth clearly fits this one's colour, and both scores (own first)."""
     pairs = {name: list(zip(edges[camera], its, strict=False)) for name, its in edges.items() if name != camera}
     scores = {
         name: _at_zero(np.mean([_correlation(a[0], b[1]) for a, b in its], axis=0))
@@ -307,7 +304,7 @@ def _other(
 
 
 def _spectra(frame: RgbdFrame) -> tuple[Float64, Float64]:
-    """Transforms of where colour and where depth change, each of mean 0 and length 1."""
+    """Spectra of colour and depth edges, of mean 0 and length 1."""
     gray = cv2.GaussianBlur(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
     slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
     slope = np.minimum(slope, np.percentile(slope, 95))
@@ -328,12 +325,12 @@ def _transformed(image: Float32) -> Float64:
 
 
 def _correlation(color: Float64, depth: Float64) -> Float64:
-    """(h, w) by shift of the colour edges against the depth edges, no shift in the middle."""
+    """(h, w) by shift of colour against depth edges, zero in the middle."""
     return np.fft.fftshift(np.fft.irfft2(color * np.conj(depth)))
 
 
 def _peak(surface: Float64) -> tuple[int, int, float, float]:
-    """Rows and columns of the best shift, its correlation, and the best one apart from it."""
+    """Rows and columns of the best shift, its correlation, and the next best."""
     height, width = surface.shape
     rows, columns = height // limits.EDGE_SEARCHED, width // limits.EDGE_SEARCHED
     near = surface[

@@ -1,4 +1,4 @@
-"""Everything that is wrong with a log, from one pass over it."""
+"""Checks of a log in one pass."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -42,9 +42,9 @@ def check_log(
     num_images: int | None = None,
     only_errors: bool = False,
 ) -> CheckReport:
-    """Read `log` once, in bounded memory; with `num_images` up to as many of a topic.
+    """Check `log` in one pass and bounded memory; at most `num_images` per topic.
 
-    Raises InputError for options that do not fit the log.
+    Raises InputError for unfitting options.
     """
     options.refuse(("root", "holdout"), "a log", log.path)
     watch = LogWatch(log, options, num_images)
@@ -104,7 +104,7 @@ def check_log(
 
 
 def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    """The cameras that the options leave. Raises InputError for one that the log does not have."""
+    """The selected cameras. Raises InputError for unknown ones."""
     cameras = camera_topics(log, found, options)
     names = tuple(camera.name for camera in cameras)
     if not names:
@@ -115,7 +115,7 @@ def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraT
 
 
 def _lacks(log: RawLog, found: Survey, options: SourceOptions) -> list[str]:
-    """What keeps `ingest` from the log and no other finding says."""
+    """Obstacles to `ingest` that no other finding names."""
     if not found.num_messages:
         damage = "nothing usable before the damage" if found.damage.count else "the log holds no messages"
         return [f"{damage}; record it again, or give another file"]
@@ -123,7 +123,6 @@ def _lacks(log: RawLog, found: Survey, options: SourceOptions) -> list[str]:
 
 
 def _parted(lack: str) -> tuple[str, str]:
-    """What is lacking, and what to do."""
     what, _, remedy = lack.rpartition("; ")
     return (what, remedy) if what else (remedy, "")
 
@@ -157,14 +156,12 @@ def _time_findings(watch: LogWatch, found: Survey, cameras: Sequence[CameraTopic
 
 
 def _is_beside(watch: LogWatch, name: str, cameras: Sequence[CameraTopics]) -> bool:
-    """Whether a topic holds images that none of the cameras is made of."""
+    """True if no camera uses a topic's images."""
     return bool(cameras) and name in watch.images and not any(name in (c.color, c.depth) for c in cameras)
 
 
 def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics], unlike: Collection[str]) -> list[Finding]:
-    """Those of topics that no camera is made of are notes: nothing reads them. unlike: topics that are no depth,
-    though their encoding is.
-    """
+    """Findings on image topics; notes if no camera uses them. unlike: topics with only depth's encoding."""
     findings = []
     for name, images in sorted(watch.images.items()):
         its = image_findings(images)

@@ -1,5 +1,4 @@
-"""Whether joint states are there, finite, in radians, with velocities, and fit a robot: angles against its limits,
-end-effector poses against its kinematics."""
+"""Checks of joint states: values, units, velocities, limits and end-effector poses."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +29,7 @@ PoseVerdict = Literal["agree", "tool", "base", "disagree", "still"]  # of logged
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """Median and largest difference of poses, in position [m] and rotation [rad]."""
+    """Median and largest pose difference, in position [m] and rotation [rad]."""
 
     median_position: float
     max_position: float
@@ -39,12 +38,12 @@ class Spread:
 
     @property
     def is_small(self) -> bool:
-        """Whether the poses are the same."""
+        """True if the poses are the same."""
         return self.max_position < limits.POSES_POSITION and self.max_rotation < limits.POSES_ROTATION
 
     @property
     def words(self) -> str:
-        """For a sentence."""
+        """Text for a sentence."""
         return (
             f"median {1e3 * self.median_position:.2f} mm and {np.degrees(self.median_rotation):.2f} deg, "
             f"largest {1e3 * self.max_position:.2f} mm and {np.degrees(self.max_rotation):.2f} deg"
@@ -53,10 +52,10 @@ class Spread:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseAgreement:
-    """Logged end-effector poses beside forward kinematics.
+    """Logged end-effector poses against forward kinematics.
 
-    difference: of the poses and those of `link`, the nearest; offset (4, 4): the one transform that explains most of
-    it, T_link_ee of a tool or T_logged_base of a wrong base; rest: the difference that remains with it.
+    difference: from `link`, the nearest. offset (4, 4): the constant transform that explains most, T_link_ee of a
+    tool or T_logged_base of a wrong base. rest: what remains.
     """
 
     verdict: PoseVerdict
@@ -87,9 +86,7 @@ class PoseAgreement:
 
 
 def check_states(states: StateColumns, joints: Sequence[str]) -> None:
-    """Raise InputError where there are no states (model order), a stamp goes back, or leaps farther than a pause can,
-    or a position is not finite.
-    """
+    """Raise InputError for no states, decreasing stamps, too long a pause, or non-finite positions."""
     stamps = states.stamp_ns
     if not len(stamps):
         raise InputError("joint states: expected at least one, got none", remedy="check the log's /joint_states")
@@ -118,7 +115,7 @@ def check_states(states: StateColumns, joints: Sequence[str]) -> None:
 
 
 def check_angles(model: RobotModel, states: Sequence[JointState], name: str) -> None:
-    """Raise InputError where the positions (model order) are far beyond the limits and would fit as degrees."""
+    """Raise InputError for positions (model order) far beyond limits that fit as degrees."""
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     if not len(states) or not limited.any():
         return
@@ -154,10 +151,10 @@ def _unit_remedy(names: Sequence[str]) -> str:
 
 
 def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgreement | None:
-    """How the poses logged in `states` (model order) agree with the robot's links; None where none is logged.
+    """Agreement of logged poses in `states` (model order) with the best link; None without poses.
 
-    Every link is tried. Poses that differ by a transform that does not change in a link's frame are a tool on it, by
-    one that does not change in the world a wrong base; anything else grows with the motion, and is another robot.
+    A constant difference in a link's frame is a tool, in the world a wrong base. Any other grows with motion: another
+    robot.
     """
     posed = _posed(states)
     if not len(posed):
@@ -188,7 +185,6 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
 
 
 def _positions(states: Sequence[JointState]) -> Iterator[Float64]:
-    """(T, J), a block at a time."""
     return (
         blocks_of(states.position)
         if isinstance(states, StateColumns)
@@ -197,7 +193,6 @@ def _positions(states: Sequence[JointState]) -> Iterator[Float64]:
 
 
 def _posed(states: Sequence[JointState]) -> Index:
-    """The states that have an end-effector pose."""
     if isinstance(states, StateColumns) and states.T_base_ee is None and states.T_world_ee is None:
         return np.zeros(0, dtype=np.int64)
     has_pose = (s.T_base_ee is not None or s.T_world_ee is not None for s in states)
@@ -218,7 +213,7 @@ def _world(model: RobotModel, state: JointState) -> Float64:
 
 
 def _explained(poses: Float64, logged: Float64) -> tuple[Float64, Spread]:
-    """The constant X (4, 4) of logged = poses X, by the mean rotation and median position, and what remains."""
+    """X (4, 4) of logged = poses X, by mean rotation and median position, and rest."""
     relative = _inverse(poses) @ logged
     U, _, Vt = np.linalg.svd(relative[:, :3, :3].sum(axis=0))
     X = pose_at(np.median(relative[:, :3, 3], axis=0), U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
@@ -242,7 +237,7 @@ def _spread(poses: Float64, logged: Float64) -> Spread:
 
 
 def _angle(R: Float64) -> float:
-    """Angle [rad] of a rotation, exact near zero too."""
+    """Angle [rad] of a rotation, exact near zero."""
     axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     return float(np.arctan2(np.linalg.norm(axis), np.trace(R) - 1.0))
 
@@ -253,8 +248,9 @@ def _cost(spread: Spread) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotStates:
-    """Joint states, in the order of `model` where there is one (None: `lack` says why there are none), and what is
-    wrong with them; the model is as the states move it.
+    """Joint states, in the model's order if any, and findings.
+
+    Without states, `lack` says why. The model is as the states move it.
     """
 
     model: RobotModel | None
@@ -264,7 +260,7 @@ class RobotStates:
 
 
 def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) -> RobotStates:
-    """The joint states of a log, and what is wrong with them."""
+    """The joint states of a log, with findings."""
     findings: list[Finding] = []
     for topic in found.of_type(*STATE_TYPES):
         if options.joint_topic in (None, topic.topic.name):
@@ -290,7 +286,7 @@ def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) 
 
 
 def robot_states(model: RobotModel | None, names: Sequence[str], states: StateColumns) -> RobotStates:
-    """States of joints `names` as `log_states` gives them."""
+    """States of joints `names`, like `log_states`."""
     if model is None:
         return RobotStates(model=None, states=states)
     model = model.moved_by(names)
@@ -306,7 +302,7 @@ def robot_states(model: RobotModel | None, names: Sequence[str], states: StateCo
 
 
 def stream_findings(where: str, stream: JointStream) -> list[Finding]:
-    """What is wrong with the states of a topic that name the same joints, as they were recorded."""
+    """Findings on a topic's states of the same joints, as recorded."""
     found: list[Finding] = []
     position = stream.columns().get("position")
     if position is None:
@@ -349,7 +345,7 @@ def _velocities(where: str, stream: JointStream, is_moving: bool) -> list[Findin
 
 
 def robot_findings(model: RobotModel, states: Sequence[JointState], where: str) -> list[Finding]:
-    """The states (model order) against the robot's limits and, where logged, end-effector poses against its FK."""
+    """Findings of states (model order) against limits, and of logged poses against FK."""
     try:
         check_angles(model, states, where)
     except InputError as wrong:

@@ -1,4 +1,4 @@
-"""When the messages of a topic came: rate, gaps, stamps that repeat or go back, header stamps against log times."""
+"""Timing of topics: rate, gaps, repeated or decreasing stamps, clocks."""
 
 import heapq
 from collections.abc import Callable, Iterator, Mapping
@@ -19,27 +19,27 @@ T = TypeVar("T")
 
 
 class Thinned(Generic[T]):
-    """Every k-th of a long row of values, at most `limit` of them; k doubles where they would be more."""
+    """Every k-th of a series; k doubles beyond `limit` values."""
 
     def __init__(self, limit: int) -> None:
         self._limit, self._step, self._num = limit, 1, 0
         self._kept: list[T] = []
 
     def is_next(self) -> bool:
-        """Whether the value that comes now is kept; to be asked once for each value, before `add`."""
+        """True if the next value is kept; call once each, before `add`."""
         is_kept = self._num % self._step == 0
         self._num += 1
         return is_kept
 
     def add(self, value: T) -> None:
-        """Keep it."""
+        """Keep a value."""
         self._kept.append(value)
         if len(self._kept) > self._limit:
             self._kept = self._kept[::2]
             self._step *= 2
 
     def change(self, by: Callable[[T], T]) -> None:
-        """Put something else in the place of each value."""
+        """Replace each value."""
         self._kept = [by(value) for value in self._kept]
 
     def __iter__(self) -> Iterator[T]:
@@ -50,7 +50,7 @@ class Thinned(Generic[T]):
 
 
 class TimesWatch:
-    """Watches one topic in bounded memory; stamps are those of headers where messages have one, else log times."""
+    """Bounded timing of one topic, by header stamps, else log times."""
 
     def __init__(self, topic: str, *, has_stamps: bool) -> None:
         self.topic, self.has_stamps = topic, has_stamps
@@ -64,7 +64,7 @@ class TimesWatch:
         self._latest_ns = 0
 
     def add(self, stamp_ns: int, log_ns: int) -> None:
-        """The next message of the file."""
+        """Take the next message."""
         self.count += 1
         self.num_zero += self.has_stamps and stamp_ns == 0
         if self.count == 1:
@@ -96,27 +96,27 @@ class TimesWatch:
 
     @property
     def median_interval(self) -> float | None:
-        """[s]; None for less than two messages of different times."""
+        """[s]; None for fewer than two times."""
         return float(np.median(list(self._intervals))) if len(self._intervals) else None
 
     @property
     def is_regular(self) -> bool:
-        """Whether the messages have a rate at all."""
+        """True if messages have a steady rate."""
         median = self.median_interval
         return median is not None and float(np.quantile(list(self._intervals), 0.9)) <= limits.REGULAR * median
 
     @property
     def delays(self) -> Float64:
-        """Rows (K, 2) [s] of log time and log time minus stamp."""
+        """Rows (K, 2) [s]: log time, log time minus stamp."""
         return np.array(list(self._delays), dtype=np.float64).reshape(-1, 2)
 
     @property
     def delay(self) -> float | None:
-        """Median of log time minus stamp [s]."""
+        """Median log time minus stamp [s]."""
         return float(np.median(self.delays[:, 1])) if len(self._delays) and not self.num_zero else None
 
     def gaps(self) -> list[tuple[float, int]]:
-        """Intervals [s] far above the median, and the stamp before each, by time; none where there is no rate."""
+        """Intervals [s] far above the median, with the stamp before each; none without a rate."""
         median = self.median_interval
         if median is None or not self.is_regular:
             return []
@@ -137,7 +137,7 @@ class TimesWatch:
 
 
 def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
-    """What is wrong with the times of one topic."""
+    """Findings on one topic's times."""
     found: list[Finding] = []
     where = times.topic
     if times.num_zero:
@@ -165,7 +165,7 @@ def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
 
 
 def joined_gaps(findings: list[Finding]) -> list[Finding]:
-    """With one finding for all topics and transforms that pause together."""
+    """Findings, with common pauses of topics and transforms joined."""
     kept = [f for f in findings if f.code not in {"gap", "tf-gap"}]
     groups: list[list[Finding]] = []
     for finding in (f for f in findings if f.code in {"gap", "tf-gap"}):
@@ -178,7 +178,7 @@ def joined_gaps(findings: list[Finding]) -> list[Finding]:
 
 
 def _overlap(a: Finding, b: Finding) -> bool:
-    """Whether the longest pauses of two topics are the same."""
+    """True if the longest pauses coincide."""
     (a0, a1), (b0, b1) = (((f.stamp_ns or 0) * _NS, (f.stamp_ns or 0) * _NS + (f.value or 0.0)) for f in (a, b))
     return min(a1, b1) - max(a0, b0) > limits.PAUSED_TOGETHER * min(a1 - a0, b1 - b0)
 
@@ -191,7 +191,7 @@ def _joined(group: list[Finding]) -> Finding:
 
 
 def file_findings(spans: Mapping[str, tuple[int, int]]) -> list[Finding]:
-    """Files of one recording that were logged far apart; spans: first and last log time [ns] by file."""
+    """Files logged far apart; spans: first and last log time [ns]."""
     ordered = sorted((span, name) for name, span in spans.items() if name)
     found = []
     for (before, name), (after, other) in pairwise(ordered):
@@ -218,7 +218,7 @@ def ending_findings(edges: list[TimesWatch], last_ns: int) -> list[Finding]:
 
 
 def part_findings(topics: list[TimesWatch]) -> list[Finding]:
-    """Topics that begin long after the others, or end long before them."""
+    """Topics that start long after others, or end long before."""
     several = [t for t in topics if t.count > 2 and t.median_interval is not None]
     found = []
     first, last = (min((t.first_ns for t in several), default=0), max((t.last_ns for t in several), default=0))
@@ -235,7 +235,7 @@ def part_findings(topics: list[TimesWatch]) -> list[Finding]:
 
 
 def peer_findings(topics: list[TimesWatch]) -> list[Finding]:
-    """Topics of one kind of different cameras: one whose stamps are otherwise against the log than all others'."""
+    """Topics whose log delay differs from the other cameras'."""
     stamped = [t for t in topics if t.delay is not None and t.count > 1]
     if len(stamped) < 3:
         return []
@@ -255,7 +255,7 @@ def peer_findings(topics: list[TimesWatch]) -> list[Finding]:
 
 
 def clock_findings(topics: list[TimesWatch]) -> list[Finding]:
-    """What header stamps say beside log times: another clock, an offset, a drift."""
+    """Header stamps against log times: another clock, offset, drift."""
     stamped = [t for t in topics if t.delay is not None and t.count > 1]
     if not stamped:
         return []
@@ -301,7 +301,7 @@ def _drift(times: TimesWatch) -> Finding | None:
 
 
 def _slope(at: Float64, delay: Float64) -> float:
-    """Median slope between the first and the second half (a few late messages do not turn it)."""
+    """Median slope between the halves, robust to late messages."""
     half = len(at) // 2
     rise = delay[-half:] - delay[:half]
     run = at[-half:] - at[:half]

@@ -1,4 +1,4 @@
-"""Whether views of one scene fit together: by which depth scale, and by which move of one camera, they would."""
+"""Consistency of views of one scene, and the depth scales and camera moves it needs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ FINE = np.linspace(0.92, 1.08, 17)
 
 @dataclass(frozen=True, kw_only=True)
 class _View:
-    """A reduced view: normals (h, w, 3) of its points (0 where unknown), some of the points (K, 3), camera frame."""
+    """A reduced view: normals (h, w, 3), 0 if unknown; points (K, 3), camera frame."""
 
     frame: RgbdFrame
     surface: Float64
@@ -36,9 +36,7 @@ class _View:
 
 @dataclass(frozen=True, kw_only=True)
 class Move:
-    """What brings a camera's views to those of the others: T_camera_corrected, its length [m] and angle [deg], and
-    the mean cut residual [m] before and after.
-    """
+    """Correction T_camera_corrected, its length [m], angle [deg], and mean cut residual [m] before and after."""
 
     camera: str
     T_camera_corrected: Float64
@@ -55,11 +53,11 @@ def check_views(
     is_sure: bool = True,
     only_errors: bool = False,
 ) -> tuple[list[Finding], list[RgbdFrame], list[RgbdFrame]]:
-    """Compare views from different places, of one moment or a still scene; `only_errors` skips wrong poses, which are
-    warnings. Returns what is wrong, the frames with the scale that fits, and with the poses that fit, too.
+    """Compare views from different places, of one moment or a static scene.
 
-    used: metres per count of each camera's depth, None where it is stored as floats. is_sure: False where something
-    speaks for another unit: then views must meet.
+    Returns the findings, the frames at fitting scales, and those at fitting poses too. used: metres per count of
+    depth by camera, None for floats. is_sure: False if the unit is doubtful; views must then meet. only_errors skips
+    wrong poses.
     """
     views = [_view(frame) for frame in _chosen(frames)]
     pairs = _pairs(views)
@@ -82,7 +80,7 @@ def check_views(
 
 
 def are_far(frames: Sequence[RgbdFrame]) -> bool:
-    """Whether cameras are so far apart, for what they see, that their places may be in another unit than depth."""
+    """True if camera distances, against depth, suggest another unit."""
     medians = [float(np.median(seen)) for frame in frames if (seen := frame.depth[frame.depth > 0]).size]
     places = np.array([frame.T_world_camera[:3, 3] for frame in frames])
     return bool(medians) and float(np.linalg.norm(np.ptp(places, axis=0))) > limits.VIEWS_FAR * float(
@@ -91,9 +89,9 @@ def are_far(frames: Sequence[RgbdFrame]) -> bool:
 
 
 def wrong_scales(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> dict[str, float]:
-    """By camera, the factor by which its depths fit the other views; empty where they fit as they are.
+    """Depth factor by camera that makes views fit, if any.
 
-    First one factor for all cameras is tried, then one for each alone.
+    A common factor is tried first, then one per camera.
     """
     cameras = sorted({view.frame.camera for view in views})
     together = _best_scale(views, pairs, cameras)
@@ -111,7 +109,7 @@ def wrong_scales(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> di
 
 
 def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> list[Move]:
-    """The cameras whose views fit the others much better after a small move, the one that saves most first."""
+    """Cameras that fit the others much better after a small move, largest gain first."""
     cameras = sorted({view.frame.camera for view in views})
     moves: list[Move] = []
     for _ in range(max(1, len(cameras) // 2)):
@@ -147,8 +145,9 @@ def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> lis
 def _overlap_findings(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], used: Mapping[str, float | None], *, is_sure: bool
 ) -> list[Finding]:
-    """Of depths that are unusual, and with which views that would meet at a tenth or at ten times do not; where
-    nothing is sure, at any other scale.
+    """Findings of unusual depths at which views would meet at a tenth or ten times.
+
+    If the unit is not sure, any scale counts.
     """
     low, high = limits.TABLE_DEPTH[0], limits.VIEWS_UNUSUAL * limits.TABLE_DEPTH[1]
     depths = np.concatenate([view.points[:, 2] for view in views])
@@ -170,8 +169,9 @@ def _scaled(frames: Sequence[RgbdFrame], scales: Mapping[str, float]) -> list[Rg
 
 
 def rescaled(units: Iterable[float | None], factor: float) -> str:
-    """Name the --depth-scale by which depths are `factor` times as large as they are by `units` [m] per count, None
-    for floats in metres.
+    """Remedy: the --depth-scale for depths `factor` times as large.
+
+    units: [m] per count, None for floats in metres.
     """
     read = sorted({unit or 1.0 for unit in units})
     if len(read) != 1:
@@ -212,7 +212,6 @@ def _pose_finding(move: Move, cameras: Sequence[str]) -> Finding:
 
 
 def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """As many of each camera, spread over its frames."""
     cameras = sorted({frame.camera for frame in frames})
     each = max(2, min(8, limits.VIEWS // max(len(cameras), 1)))
     of_cameras = [[frame for frame in frames if frame.camera == camera] for camera in cameras]
@@ -220,7 +219,6 @@ def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
 
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
-    """Ordered pairs of views from different places."""
     places = [view.frame.T_world_camera[:3, 3] for view in views]
     pairs = [
         (i, j)
@@ -232,7 +230,6 @@ def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
 
 
 def _with(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str) -> list[tuple[int, int]]:
-    """The pairs of which one view or both are of a camera."""
     return [(i, j) for i, j in pairs if camera in (views[i].frame.camera, views[j].frame.camera)]
 
 
@@ -250,28 +247,25 @@ def _view(frame: RgbdFrame) -> _View:
 
 
 def _landed(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Bool, Float64, Float64]:
-    """Points (K, 3) of view a in b's camera frame, which of them land on a depth of b (K,), and b's surface and
-    normals (K, 3) there.
-    """
+    """View a's points (K, 3) in b's frame, hits (K,), b's surface and normals."""
     points = transform_points(_transform(a, b), a.points * scale_a)
     lands, surface, normals = landed(points, b)
     return points, lands, surface * scale_b, normals
 
 
 def _transform(a: _View, b: _View) -> Float64:
-    """T_b_a (4, 4), from camera a to camera b."""
     return invert_transform(b.frame.T_world_camera) @ a.frame.T_world_camera
 
 
 def _distances(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Float64]:
-    """Distance [m] of the points of view a from the planes of view b's surface that they land on, and their depth."""
+    """Distances [m] of view a's points from view b's planes, and depth."""
     points, lands, surface, normals = _landed(a, b, scale_a, scale_b)
     lands &= np.any(normals != 0, axis=1)
     return np.abs(np.einsum("ki,ki->k", points - surface, normals))[lands], points[lands, 2]
 
 
 def _best_scale(views: Sequence[_View], pairs: Sequence[tuple[int, int]], cameras: Sequence[str]) -> float | None:
-    """The factor on these cameras' depths with which far more points fit than without; None where there is none."""
+    """Factor on these cameras' depths that fits far more points, or None."""
     medians = [float(np.median(v.points[:, 2])) for v in views if v.frame.camera in cameras and len(v.points)]
     if not medians:
         return None
@@ -302,7 +296,7 @@ def _best_scale(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera
 def _fitting(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], cameras: Sequence[str], scale: float, share: float = 1.0
 ) -> tuple[int, int]:
-    """Points that land within `share` of `VIEWS_FIT` where these cameras' depths are scaled, and all that land."""
+    """Points within `share` of `VIEWS_FIT` at a scale, and all that land."""
     num_fit = num = 0
     for i, j in pairs:
         a, b = views[i], views[j]
@@ -314,7 +308,6 @@ def _fitting(
 
 
 def _fitted(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str) -> Float64 | None:
-    """The better of two starts, near and wide."""
     is_far = _cost(views, _with(views, pairs, camera))[1] < limits.MOVE_GOOD_SHARE
     starts = [limits.MOVE_WIDTHS, (*limits.MOVE_WIDE, *limits.MOVE_WIDTHS)] if is_far else [limits.MOVE_WIDTHS]
     found = [T for widths in starts if (T := _descended(views, pairs, camera, widths)) is not None]
@@ -324,7 +317,7 @@ def _fitted(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: st
 def _descended(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str, widths: Sequence[float]
 ) -> Float64 | None:
-    """T_camera_corrected: Gauss-Newton on point-to-plane residuals, each weighed by Tukey's biweight of its width."""
+    """T_camera_corrected by Gauss-Newton on point-to-plane residuals, with Tukey's biweight."""
     its = _with(views, pairs, camera)
     T = np.eye(4)
     for width in widths:
@@ -345,9 +338,7 @@ def _descended(
 
 
 def _rows(a: _View, b: _View, camera: str) -> tuple[Float64, Float64]:
-    """Derivative (K, 6) by a small turn and move in the camera's own frame, and residual (K,) [m], of the points of
-    view a that land on a surface of view b.
-    """
+    """Derivatives (K, 6) by the camera's motion in its frame, and residuals (K,) [m]."""
     points, lands, surface, normals = _landed(a, b)
     lands &= np.any(normals != 0, axis=1) & (np.abs(points[:, 2] - surface[:, 2]) < 3 * limits.MOVE_WIDE[0])
     residual, derivatives = overlap_rows(a.points, _transform(a, b), lands, surface, normals)
@@ -356,7 +347,7 @@ def _rows(a: _View, b: _View, camera: str) -> tuple[Float64, Float64]:
 
 
 def _cost(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
-    """Mean distance from surfaces [m], each cut at `limits.MOVE_CUT`, and the share of points that fit."""
+    """Mean distance [m], cut at `limits.MOVE_CUT`, and share of fitting points."""
     total = num = num_good = 0.0
     for i, j in pairs:
         off, depth = _distances(views[i], views[j])
@@ -367,7 +358,6 @@ def _cost(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> tuple[flo
 
 
 def _moved(views: Sequence[_View], camera: str, T: Float64) -> list[_View]:
-    """The views with T_world_camera of one camera followed by T."""
     return [
         replace(view, frame=replace(view.frame, T_world_camera=view.frame.T_world_camera @ T))
         if view.frame.camera == camera

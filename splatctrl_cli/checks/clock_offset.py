@@ -1,6 +1,6 @@
-"""The offset between a robot's clock and its cameras', from when both see the robot move.
+"""Offset between a robot's clock and its cameras', by the motion both record.
 
-Where images change from frame to frame is compared with where a moving robot of spheres would change them.
+Image changes between frames are compared with those that a moving robot of spheres predicts.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ _NEAR = 0.05  # [m] in front of the camera
 
 @dataclass(kw_only=True)
 class CameraMotion:
-    """The frames of one camera: stamps (K + 1) [ns] and changes (K) of (h, w) float32 in [0, 1] between them."""
+    """A camera's stamps (K + 1) [ns], and changes (h, w) in [0, 1] between."""
 
     intrinsics: Intrinsics
     T_world_camera: Float64
@@ -31,13 +31,13 @@ class CameraMotion:
 
 @dataclass(kw_only=True)
 class ImageMotion:
-    """Collects how the images of each camera change."""
+    """Collected image changes by camera."""
 
     cameras: dict[str, CameraMotion] = field(default_factory=dict)
     _last: dict[str, tuple[Float32, UInt8]] = field(default_factory=dict)
 
     def add(self, frame: RgbdFrame) -> None:
-        """Take the next frame of its camera."""
+        """Take the next frame."""
         camera = self.cameras.get(frame.camera)
         if camera is None:
             small = thumbnail_lens(frame.intrinsics)
@@ -59,7 +59,7 @@ class ImageMotion:
 
 
 def _change(depth_a: Float32, gray_a: UInt8, depth_b: Float32, gray_b: UInt8) -> Float32:
-    """Change of each pixel in [0, 1]: of depth where both frames have some, else of brightness."""
+    """Change per pixel in [0, 1]: of depth if in both frames, else of brightness."""
     both = (depth_a > 0) & (depth_b > 0)
     of_depth = np.minimum(np.abs(depth_b - depth_a) / limits.MOTION_DEPTH_STEP, 1.0)
     of_gray = np.minimum(np.abs(gray_b.astype(np.float32) - gray_a) / limits.MOTION_COLOR_STEP, 1.0)
@@ -67,9 +67,9 @@ def _change(depth_a: Float32, gray_a: UInt8, depth_b: Float32, gray_b: UInt8) ->
 
 
 def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) -> Float32:
-    """Depth (T, h, w) [m] of spheres, centres (T, S, 3) and radii (S,), as a camera sees them; 0 where there is none.
+    """Depth (T, h, w) [m] of spheres (T, S, 3) in a camera; 0 = none.
 
-    A sphere is drawn as a disc of its radius at its distance, which is exact on the optical axis.
+    A sphere is a disc of its radius (S,) at its distance, exact on the optical axis.
     """
     intrinsics = camera.intrinsics
     centers = transform_points(invert_transform(camera.T_world_camera), centers_world)
@@ -88,14 +88,14 @@ def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) ->
 
 
 def predicted_change(depth_a: Float32, depth_b: Float32) -> Float32:
-    """Change (K, h, w) in [0, 1] between silhouettes (K, h, w): 1 where only one has the robot."""
+    """Change (K, h, w) in [0, 1] of silhouettes; 1 where only one has the robot."""
     a, b = depth_a > 0, depth_b > 0
     of_depth = np.minimum(np.abs(depth_b - depth_a) / np.float32(limits.MOTION_DEPTH_STEP), np.float32(1.0))
     return np.where(a & b, of_depth, (a ^ b).astype(np.float32)).astype(np.float32)
 
 
 def correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Pearson's, of all entries; 0 where one does not vary. Sums and no dot products: those differ by threads."""
+    """Pearson correlation; 0 if constant. Dot products would vary with threads."""
     x, y = np.asarray(a, dtype=np.float64).ravel(), np.asarray(b, dtype=np.float64).ravel()
     x, y = x - x.mean(), y - y.mean()
     length = float(np.sqrt(np.sum(x * x)) * np.sqrt(np.sum(y * y)))
@@ -104,7 +104,7 @@ def correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotPoints:
-    """A robot's spheres at each joint state: centers (T, S, 3) [m], world, and radii (S,) [m]."""
+    """A robot's spheres by joint state: centers (T, S, 3) and radii (S,) [m], world."""
 
     centers: Float64
     radii: Float64
@@ -112,11 +112,11 @@ class RobotPoints:
 
 @dataclass(frozen=True, kw_only=True)
 class ClockOffset:
-    """What two clocks differ by, and how sure that is.
+    """The offset of two clocks, and its certainty.
 
-    offset_s: a frame's stamp minus the stamp of the joint state at that instant [s], None where it is not known;
-    uncertainty_s: the larger of how the cameras disagree and what the method was found to err by; correlation,
-    runner_up: of image and joint motion at the best offset and at the next best peak; reason: why it is not known.
+    offset_s: a frame's stamp minus the joint state's at that instant [s], None if unknown, for `reason`.
+    uncertainty_s: the larger of camera disagreement and the method's error. correlation, runner_up: at the best and
+    next peak.
     """
 
     offset_s: float | None
@@ -140,12 +140,11 @@ class ClockOffset:
 def estimate_clock_offset(
     states: Sequence[JointState], motion: ImageMotion, robot: RobotPoints | None = None
 ) -> ClockOffset:
-    """The offset at which the robot's motion and the images' correlate best.
+    """The offset at which robot and image motion correlate best.
 
-    states: by stamp. With `robot` and cameras that stand still, the change of every pixel between two frames is
-    compared with that of the silhouette of the robot's spheres; else the change of whole images with the distance the
-    joints move, which is coarser. The mean over cameras has its peak, by a parabola, at the offset. It is not known
-    where nothing moves, where the correlation is low, where another peak is as good, or at the end of the search.
+    states: by stamp. With `robot` and stationary cameras, pixel changes are compared with the spheres' silhouette;
+    else, coarser, whole images with joint motion. The offset is the parabolic peak of the mean over cameras. It is
+    unknown without motion, at low correlation, with a rival peak, or at the end of the search.
     """
     cameras = [motion.cameras[name] for name in sorted(motion.cameras) if motion.cameras[name].changes]
     num = sum(len(camera.changes) for camera in cameras)
@@ -173,8 +172,9 @@ def estimate_clock_offset(
 
 
 def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
-    """The states (K,) of stamps (T,) that rise which `estimate_clock_offset` looks at: it finds the same from them as
-    from all, and of a log that is longer or denser than its frames they are few.
+    """Indices (K,) of states, with ascending stamps (T,), that suffice for `estimate_clock_offset`.
+
+    A long or dense log needs few.
     """
     cameras = [camera for camera in motion.cameras.values() if camera.changes]
     if not cameras:
@@ -198,13 +198,13 @@ def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
 
 
 def _span(cameras: Sequence[CameraMotion]) -> tuple[int, int]:
-    """First and last stamp [ns] that an offset within `OFFSET_REACH` can bring to a frame."""
+    """First and last stamp [ns] within `OFFSET_REACH` of a frame."""
     reach = round(limits.OFFSET_REACH * 1e9)
     return min(c.stamps_ns[0] for c in cameras) - reach, max(c.stamps_ns[-1] for c in cameras) + reach
 
 
 def _offsets(span_s: float, cameras: Sequence[CameraMotion]) -> tuple[Float64, float]:
-    """The offsets [s] to try over states of `span_s`, none where these are too few, and the step between them."""
+    """Offsets [s] to try over `span_s`, none if too short, and their step."""
     step = min(float(np.median(np.diff(camera.stamps_ns))) * 1e-9 for camera in cameras) / limits.OFFSET_STEPS
     count = int(min(limits.OFFSET_REACH, limits.OFFSET_SHARE * span_s) / step) if step > 0 else 0
     if count < 2 * limits.OFFSET_STEPS:
@@ -213,14 +213,12 @@ def _offsets(span_s: float, cameras: Sequence[CameraMotion]) -> tuple[Float64, f
 
 
 def _since(camera: CameraMotion, start: int) -> Float64:
-    """Seconds of its frames since a stamp [ns]."""
     return np.array([stamp - start for stamp in camera.stamps_ns]) * 1e-9
 
 
 def _near(
     states: Sequence[JointState], robot: RobotPoints | None, cameras: Sequence[CameraMotion]
 ) -> tuple[list[JointState], RobotPoints | None]:
-    """The states, and the robot's points at them, that an offset within `OFFSET_REACH` can bring to a frame."""
     first, last = _span(cameras)
     near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
     points = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
@@ -230,7 +228,7 @@ def _near(
 def _pixel_scores(
     seconds: Float64, robot: RobotPoints, step: float, camera: CameraMotion, start: int, offsets: Float64
 ) -> Float64:
-    """With the robot at every `step` from the first state on, between states linearly."""
+    """Scores with the robot interpolated at every `step` from the first state."""
     number = np.round((_since(camera, start) - offsets[:, None]) / step).astype(np.int64)  # (O, K + 1)
     is_inside = (number >= 0) & (number * step < seconds[-1] + step / 2)
     wanted = np.unique(number[is_inside])
@@ -260,13 +258,13 @@ def _sum_scores(seconds: Float64, position: Float64, camera: CameraMotion, start
 
 
 def _kept(is_inside: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
-    """Times between frames (K,) that lie in the log of joints, none where these are too few to judge."""
+    """Intervals (K,) within the joint log; none if too few."""
     keep = is_inside[1:] & is_inside[:-1]
     return keep if keep.sum() >= max(limits.MOTION_INTERVALS // 2, len(keep) // 2) else np.zeros_like(keep)
 
 
 def _at(seconds: Float64, curve: Float64, at: Float64) -> Float64:
-    """Rows (K, D) of a curve (T, D) at times (K,), linearly."""
+    """Rows (K, D) of a curve (T, D) at times (K,), linear."""
     after = _after(seconds, at)
     before = after - 1
     share = np.clip((at - seconds[before]) / (seconds[after] - seconds[before]), 0.0, 1.0)[:, None]
@@ -274,12 +272,12 @@ def _at(seconds: Float64, curve: Float64, at: Float64) -> Float64:
 
 
 def _after(seconds: Float64, at: Float64) -> Index:
-    """The state (K,) that ends the interval in which each time lies, or the nearest interval."""
+    """State (K,) that ends each time's interval, or the nearest."""
     return np.clip(np.searchsorted(seconds, at), 1, len(seconds) - 1)
 
 
 def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: float) -> ClockOffset:
-    """The peak of the mean of scores (C, O); error [s]: what the method errs by."""
+    """The peak of the mean of scores (C, O); error [s]: of the method."""
     score = scores.mean(axis=0)
     best = int(np.argmax(score))
     inner = score[1:-1]
@@ -306,7 +304,7 @@ def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: floa
 
 
 def _vertex(offsets: Float64, score: Float64, best: int) -> float:
-    """Of the parabola through the scores within half a time between frames of the best."""
+    """Vertex of a parabola through scores within half a frame interval of the best."""
     reach = min(max(limits.OFFSET_STEPS // 2, 2), best, len(score) - 1 - best)
     if reach == 0:
         return float(offsets[best])

@@ -1,4 +1,4 @@
-"""What `check` says about a recording: the table of its checks, its findings, and what each later command lacks."""
+"""Results of `check`: the table of checks, findings, obstacles to later commands."""
 
 import re
 from collections import Counter
@@ -11,7 +11,7 @@ from splatctrl_cli.records import RgbdFrame
 
 
 class Severity(StrEnum):
-    """error: a later command fails or its result is wrong; warning: something is lost or doubtful; note: no fault."""
+    """error: a later command fails or errs; warning: a loss or doubt; note: no fault."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -25,9 +25,7 @@ ALL = ("ingest", *LATER)
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One kind of finding: what it says, how bad it can be, the commands that refuse a recording with an error of it,
-    or whose result would be wrong, and what to do where the finding does not say.
-    """
+    """One kind of finding: meaning, severities, commands blocked by its error, default remedy."""
 
     code: str
     severities: tuple[Severity, ...]
@@ -143,7 +141,7 @@ _BLOCKED = {"": (), "all": ALL, "later": LATER, "replay": ("replay",)}
 
 
 def _checks() -> Iterator[Check]:
-    """The entries of `_TABLE`, whose rows go on in lines that are indented."""
+    """The entries of `_TABLE`, whose rows continue in indented lines."""
     for row in re.findall(r"^[a-z].*(?:\n +.*)*", _TABLE, flags=re.MULTILINE):
         code, severities, blocked, meaning, *remedy = (cell.strip() for cell in " ".join(row.split()).split("|"))
         words = tuple(Severity(word) for word in severities.split(", "))
@@ -155,9 +153,9 @@ CHECKS: Mapping[str, Check] = {check.code: check for check in _checks()}
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One thing about a recording: `code` names its entry of `CHECKS`, `where` the topic, camera or joint.
+    """One finding: `code` is its entry in `CHECKS`, `where` the topic, camera or joint.
 
-    value: the figure that was judged, in `unit`; stamp_ns: the first time it was met; both None where there is none.
+    value: the figure, in `unit`; stamp_ns: first occurrence; or None.
     """
 
     severity: Severity
@@ -198,8 +196,9 @@ error, warning, note = (partial(_finding, severity) for severity in ORDER)
 
 @dataclass(frozen=True, kw_only=True)
 class Rate:
-    """A row of the table of rates; is_read: by later commands; hz: median; longest_s: interval between two stamps;
-    delay_s: median of log time minus stamp.
+    """A row of the rates. is_read: by later commands; hz: median.
+
+    longest_s: between stamps; delay_s: median log time minus stamp.
     """
 
     topic: str
@@ -212,7 +211,7 @@ class Rate:
 
 @dataclass(frozen=True, kw_only=True)
 class Need:
-    """A later command, and what keeps this recording from it; empty where it can start."""
+    """A later command, and its obstacles; empty if it can start."""
 
     command: str
     lacks: tuple[str, ...]
@@ -220,8 +219,9 @@ class Need:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckReport:
-    """A checked recording: findings, rates by topic, needs by command; frames: reduced views, without colour, of
-    every camera that has poses.
+    """A checked recording: findings, rates by topic, needs by command.
+
+    frames: reduced views, without colour, of cameras with poses.
     """
 
     path: str
@@ -236,20 +236,20 @@ class CheckReport:
 
     @property
     def unit(self) -> str:
-        """What `num_messages` counts."""
+        """The unit of `num_messages`."""
         return "frames and states" if self.kind in {"capture", "image folder"} else "messages"
 
     @property
     def sorted_findings(self) -> list[Finding]:
-        """Worst first, then as they were found."""
+        """Worst first, else in order."""
         return sorted(self.findings, key=lambda finding: ORDER.index(finding.severity))
 
     def lacks(self, need: Need) -> tuple[str, ...]:
-        """What keeps a command from this recording, the errors among the findings included."""
+        """Obstacles to a command, with errors among findings."""
         return (*need.lacks, *(f"{f.where}: {f.what} [{f.code}]" for f in self.refusing(need)))
 
     def refusing(self, need: Need) -> list[Finding]:
-        """The errors among the findings that keep a command from this recording."""
+        """The errors that block a command."""
         errors = [f for f in self.sorted_findings if f.severity is Severity.ERROR]
         return [f for f in errors if need.command in CHECKS[f.code].blocked]
 
@@ -259,7 +259,7 @@ class CheckReport:
         return {str(s): sum(f.severity is s for f in self.findings) for s in ORDER}
 
     def seconds(self, finding: Finding) -> float | None:
-        """When a finding was first met, from the start of the recording."""
+        """First occurrence, from the recording's start."""
         if finding.stamp_ns is None or self.start_ns is None:
             return None
         return round((finding.stamp_ns - self.start_ns) * 1e-9, 3)
@@ -292,14 +292,14 @@ class CheckReport:
 
 
 def needs(*, num_cameras: int, num_frames: int, states_lack: str) -> list[Need]:
-    """One for each later command, errors among the findings apart. states_lack: why there are no joint states."""
+    """One per later command, without errors among findings. states_lack: why states are missing."""
     too_few = "one camera and less than three frames: nothing can be held out; record more views"
     lacks = {"score": too_few if num_cameras == 1 and 0 < num_frames < 3 else "", "replay": states_lack}
     return [Need(command=name, lacks=tuple(filter(None, [lacks.get(name)]))) for name in ALL]
 
 
 def damage_findings(where: str, notes: Sequence[str]) -> list[Finding]:
-    """One for each kind of damage, with how often it is met."""
+    """One per kind of damage, with its count."""
     return [
         warning("damaged", where, text if num == 1 else f"{text} ({num} times)", value=num)
         for text, num in Counter(notes).items()

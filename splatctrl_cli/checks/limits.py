@@ -1,5 +1,6 @@
-"""How much `splatctrl check` looks at, and from where on something becomes a finding. A unit stands in brackets
-before what a number means; without one it is a share, a factor or a count.
+"""Sample sizes and thresholds of `splatctrl check`.
+
+A unit in brackets precedes the meaning; others are shares, factors or counts.
 """
 
 # Cameras: lenses, poses and pairs of images
@@ -58,13 +59,13 @@ FILES_APART = 60.0  # [s] between the logs of one session
 # Joint states: units, limits and kinematics
 ANGLES_FAR = 0.5  # [rad] beyond the limits, and beyond a whole turn: not the limits of another joint
 STATES_SHARE = 0.5  # of the states that must be there
-STATES_PAUSE = 86_400.0  # [s] between states; beyond it another clock goes on
+STATES_PAUSE = 86_400.0  # [s] between states; beyond it the clock is another
 DEGREES_SLACK = 0.1  # [rad] by which degrees may exceed the limits
 POSES_COMPARED = 200  # that are compared, spread over the log
 POSES_POSITION = 0.005  # [m] within which poses agree
 POSES_ROTATION = 0.02  # [rad] within which poses agree
 LINK_TRAVEL = 0.05  # [m] or, of rotation, [rad] that a link must move to tell a tool from a wrong robot
-POSES_LEVER = 0.1  # [m] by which a rotation counts beside a position
+POSES_LEVER = 0.1  # [m] lever by which a rotation counts against a position
 LIMIT_SLACK = 0.01  # [rad or m] by which a state may exceed a joint's limit
 
 # The arm: depth images against forward kinematics

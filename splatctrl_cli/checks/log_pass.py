@@ -1,4 +1,4 @@
-"""One pass over a log for all that `check` asks: messages watched on their way, and a few frames of each camera."""
+"""One pass over a log for `check`: observed messages, and a few frames per camera."""
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -37,9 +37,9 @@ _FIRST_FIELD = re.compile(r"^(?:std_msgs/(?:msg/)?)?Header\s+\w+")
 
 
 class LogWatch:
-    """A log whose messages are looked at while somebody else reads them; images are decoded here, as far as needed.
+    """A log that observes messages read by another, decoding images as needed.
 
-    num_images: reading ends once a topic has had as many images. files: first and last log time by file.
+    num_images: reading ends at this many of a topic. spans: first and last log time [ns] by file.
     """
 
     def __init__(self, log: RawLog, options: SourceOptions, num_images: int | None = None) -> None:
@@ -62,11 +62,11 @@ class LogWatch:
         return min((t.first_ns for t in self.times.values() if t.first_ns), default=None)
 
     def topics(self) -> tuple[Topic, ...]:
-        """Of the log."""
+        """The log's topics."""
         return self._log.topics()
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Those of the log, each watched."""
+        """The log's messages, each observed."""
         for message in self._log.messages(damage, names):
             self._take(message)
             yield message
@@ -102,7 +102,7 @@ class LogWatch:
             return  # the survey counts it
 
     def _is_headed(self, topic: Topic) -> bool:
-        """Whether messages begin with a std_msgs/Header."""
+        """True if messages begin with a std_msgs/Header."""
         if topic not in self._headed:
             fields = [line.split("#")[0].strip() for line in topic.definition.splitlines()]
             first = next((line for line in fields if line), "")
@@ -143,7 +143,7 @@ class LogWatch:
 
 
 def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
-    """The camera as `ingest` makes it ready; None where it lacks something (rig.missing says what)."""
+    """The camera as `ingest` builds it, or None (rig.missing says why)."""
     try:
         return build_cameras(log, found, replace(options, cameras=(topics.name,)))[0]
     except InputError:
@@ -158,9 +158,9 @@ def reduced_frames(
     options: SourceOptions,
     late_ns: Mapping[str, int],
 ) -> list[RgbdFrame]:
-    """Reduced frames of a camera, spread over the log: those whose depth was kept and whose pose is known; color is
-    black where none was kept at the time of the depth. late_ns: how late frames are stamped against transforms, by
-    camera, 0 where nothing is said of it.
+    """Reduced frames of a camera, with kept depth and known pose.
+
+    color is black without one at depth's time. late_ns: delay of frames' stamps against transforms, by camera.
     """
     depths, colors = images.get(topics.depth), images.get(topics.color)
     kept_colors = {kept.stamp_ns: kept for kept in (colors.kept if colors is not None else ())}
@@ -177,7 +177,7 @@ def reduced_frames(
 
 
 def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Float64) -> RgbdFrame:
-    """Depth in the colour camera's view, without lens distortion, as `ingest` gives it but reduced."""
+    """Depth in the undistorted colour view, reduced."""
     assert kept.depth is not None
     depth: NDArray[Any] = kept.depth
     stride = kept.stride
@@ -218,7 +218,7 @@ def _reduced(image: NDArray[Any], stride: int) -> NDArray[Any]:
 
 
 def nearest(stamps: Sequence[int], stamp_ns: int) -> int | None:
-    """Of stamps in order."""
+    """The nearest of sorted stamps."""
     if not stamps:
         return None
     after = int(np.searchsorted(np.array(stamps), stamp_ns))
@@ -228,7 +228,7 @@ def nearest(stamps: Sequence[int], stamp_ns: int) -> int | None:
 def image_motion(
     watch: LogWatch, cameras: Sequence[tuple[CameraTopics, Camera]], frames: Mapping[str, Sequence[RgbdFrame]]
 ) -> ImageMotion:
-    """The motion that the first images of each camera show. frames: of each camera, from `reduced_frames`."""
+    """Motion in each camera's first images. frames: of `reduced_frames`."""
     motion = ImageMotion()
     for topics, camera in cameras:
         if frames[camera.name] and topics.color in watch.images:
@@ -238,7 +238,7 @@ def image_motion(
 
 
 def _thumbnails(watch: LogWatch, topics: CameraTopics, camera: Camera, posed: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """Colour beside depth only where both are of one view."""
+    """Depth with colour, where both share a view."""
     colors = watch.images[topics.color].thumbnails if camera.depth_to_color is None else []
     gray = {thumbnail.stamp_ns: thumbnail.color for thumbnail in colors}
     at, frames = sorted(gray), []

@@ -1,6 +1,7 @@
-"""Numbers of the method that are fixed on purpose. They are not settings: each was measured, or follows from the
-method or from what is compared, and a run with another one could not be compared with the rest. A unit stands in
-brackets before what a number decides; without one it is a share, a factor or a count.
+"""Fixed numbers of the method, deliberately no settings.
+
+Each was measured, or follows from the method or a comparison; another would make runs incomparable. A unit in
+brackets precedes the meaning; others are shares, factors or counts.
 """
 
 # Reading a recording: poses, joint states and clocks
@@ -71,22 +72,22 @@ CARD_SPLATS = 4000  # that a bake of another field is counted as having: its tim
 CARD_LEAST_TABLE = 16_000_000  # bytes of points, some 500,000: 3 s of a scene's field on 16 cores, 10 s on two
 SEED_LEVELS = 3  # cubes of one edge, half and a quarter of it
 SEED_CROWDED = 0.7  # of the edge: nearer than this to a live splat nothing is seeded
-SEED_BEND = 2.0  # weight of the thickness of a cube's points, in squared edges, beside squared colour differences
+SEED_BEND = 2.0  # weight of a cube's point thickness, in squared edges, against squared colour differences
 SEED_MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
 SEED_MOST_PIXELS = 4_000_000  # to seed at a time: more are thinned, at 120 bytes each
 SHELL_ITERATIONS = 0.3  # of the map's, for the shell: in a room 0.1 loses 1.5 dB, 1.0 wins 0.5
 SHELL_UNMET = 0.1  # of its budget: more seeds without a slot, and a shell begins again
-SEED_ASKED_VIEWS = 17  # that are asked whether they see through a pixel; all are asked of what is seeded
+SEED_ASKED_VIEWS = 17  # views tested for seeing through a candidate pixel; seeds are tested by all
 SEED_OVERSAMPLING = 4  # pixels drawn per splat, before those too near to each other go
 EVICT_EVERY = 5  # time steps: it takes as long as a few iterations; what has no splat is a ball until then
-EVICT_NEAREST = 8  # splats that are asked whether they stand for a voxel
+EVICT_NEAREST = 8  # splats tested for representing a voxel
 EVICT_ASKED = 8  # splats that are looked at for each missing slot, those that show least
 EVICT_NEARER = 0.3  # [m] by which a surface must be nearer to the robot's path than one given up for it
 MOST_GROWTH = 4  # times the default, to which the budget grows by itself
 NEAREST_REACH = 0.01  # [m] about a pixel, times the scale, in which no depth may be farther than what floats
 
 # Map: occupancy, and which pixels are the robot's
-NARROW_HOLE = 2.0  # [voxels] holes that are not wider are common beside edges
+NARROW_HOLE = 2.0  # [voxels] holes up to this width are common at edges
 SHADOW_STEP = 30.0  # [px/m] of disparity by baseline at a step of depth: 1.5 px of a baseline of 5 cm
 SHADOW_BASELINE = 0.12  # [m] between the imagers of a depth camera at most
 CARRIED_CELL = 0.03  # [m] edge at most of a cell of what is carried that has a sphere: sticks out 6 mm at most
@@ -94,7 +95,7 @@ CONTACT_REACH = 0.02  # [m] an object so near to the robot may touch it where th
 CONTACT_THICKNESS = 0.2  # [m] of a link at most: so far behind what a camera sees of it something may touch it
 SHRINK = 0.8  # of a radius at a time, of a sphere that depth sees through at its edge
 WELL_INSIDE = 0.005  # [m] below the robot's surface; what nothing shows to be an object there is the robot's
-ROBOT_REACH = 0.2  # [m] from the robot's surface; beyond it nobody asks for the distance
+ROBOT_REACH = 0.2  # [m] from the robot's surface; no distance is needed beyond it
 MASK_SPECK = 5e-5  # [m^2] of what is before the robot's surface alone: a 6 mm rod shows more from 9 mm length on
 MASK_ALONE = 4e-4  # [m^2] of it, if no other frame measured it
 MASK_BORDER = 32  # of an image's width, the pixels beyond its border in which the robot is looked for: 20 of 640
@@ -109,8 +110,8 @@ MASK_SURE = 4.0  # of the sensor's error, beyond which a piece before the robot 
 CONTRADICTED = 0.1  # [m] behind what another camera measures on its ray, depth is of no surface there
 CONTRADICTING_COLUMNS = 128  # of blocks of pixels in an image, which are held against the other cameras
 CONTRADICTING_PIXELS = 4  # such blocks side by side; fewer are noise
-SEEN_THROUGH_PIXELS = 16  # side by side that another camera sees through: noise leaves up to 4, a shiny thing 29
-ASKED_REACH = 0.15  # [m] from the robot's spheres: why space is unseen is asked so far
+SEEN_THROUGH_PIXELS = 16  # adjacent, that another camera sees through: up to 4 by noise, 29 by a shiny object
+ASKED_REACH = 0.15  # [m] from the robot's spheres, within which unseen space is explained
 VOTE_SHARE = 0.15  # of the robot's pixels in a voxel, fewer of an object are none: a 6 mm rod has 0.4
 MASK_SIGMAS = 2.0  # of the sensor's error that the robot's surface may explain
 MASK_FAR_OFF = 0.10  # [m] a residual beyond it is something else, before or behind the robot
@@ -157,12 +158,12 @@ KERNEL_MAX_SHARE = 1e-2  # of a kernel sum that is ever left out
 MARCH_STEPS = 5  # III-D: 3 to 5
 SIGNED_CARE = 1e-3  # of the truncation where weights have signs: what is left of a cancelling sum needs more
 VARIANCE_DIVISOR = 9.0  # III-D
-LEAST_VARIANCE = 1e-6  # before the division: what float32 leaves of 1 - sum
+LEAST_VARIANCE = 1e-6  # before the division: float32 rounding of 1 - sum
 CERTAIN_OCCUPANCY = 50.0  # log occupancy beyond which every probability is 1
 VOXELS_PER_LENGTH = 2  # h = l / 2, the grid of the density
 CG_ITERATIONS = 5000  # at most
-CG_TOLERANCE = 1e-6  # largest residual of a row, of the smallest value asked for
-CG_FLOOR = 1e-13  # of the largest value asked for: what float64 can do
+CG_TOLERANCE = 1e-6  # largest residual of a row, of the smallest required value
+CG_FLOOR = 1e-13  # of the largest required value: float64's precision
 CG_MAX_SPREAD = 16.0  # of a group's log values: beyond, the smaller drown in the rounding of the larger
 ROUGH_LENGTH = 10.0  # [m] from which on float32 costs the Gaussian kernel's distance 0.2 mm; at 100 m 5 cm
 MAX_RADIUS_SPREAD = 30.0  # of the radii: the largest over the smallest above zero
@@ -183,9 +184,9 @@ MOTION_WINDOW = 0.05  # [s] over which a motion is averaged, so that an encoder'
 ENCODER = 1e-3  # [rad or m] that each position may be off
 NEAR_EVERY_NS = 200_000_000  # [ns] between states that are looked at: cameras that stop are stale five times as late
 NEAR_MOVED = 0.01  # [m] the same, as soon as a sphere has moved so far: half a margin
-NEAR_LATTICE = 0.02  # [m] between the points beside the arm that are asked about: a voxel
+NEAR_LATTICE = 0.02  # [m] between query points around the arm: a voxel
 NEAR_FRESH_SHARE = 0.75  # of the seen points; the arm itself hides up to a quarter of its shell for seconds
-NEAR_BLIND = 0.9  # of the points about a sphere never seen: it comes to the unknown
+NEAR_BLIND = 0.9  # share of a sphere's points never seen, from which on it nears only unknown space
 NEAR_FEWEST = 5  # such points, at least
 UNWATCHED_NS = 500_000_000  # [ns] without depth from about the arm: two frame sets of a slow recording
 UNWATCHED_AFTER_NS = 10_000_000_000  # [ns] after a motion, in which the next depth is waited for
@@ -232,7 +233,7 @@ SELF_KEPT = 0.1  # of them may keep less than that
 SELF_SHARE = 0.5  # of the largest gap of two links: nearer they are near each other, however small the gap
 SELF_TOLD = 0.5  # of the postures that are not near must keep a margin that excludes the near ones
 SELF_ROUNDING = 1e-6  # [m] by which gaps of a pair that does not change may differ
-LEAST_OVERLAP = 1e-6  # [m] said of links whose surfaces cross without a vertex inside
+LEAST_OVERLAP = 1e-6  # [m] reported for links whose surfaces cross without a vertex inside
 NEVER_MARGIN = 0.02  # [m] a pair that comes nearer than this in a sample is kept, though it never collides there
 FIT_MIN_PATCH = 2e-3  # [m] longest edge of a patch, at the least
 FIT_BISECTIONS = 10  # of the lattice spacing, and of t, the largest protrusion
@@ -250,8 +251,8 @@ LIMIT_EXCEEDED = 1.01  # of a velocity or acceleration limit
 CLOCKS_APART = 0.05  # [s] beyond the estimate's own uncertainty: at 0.5 m/s an arm is then 25 mm elsewhere
 UNSEEN = 0.48  # of the points within the margin of the arm
 HIDDEN = 0.03  # [m] from a seen surface, to unseen space within the margin
-BEYOND = 0.10  # [m] the same about a sphere that comes to nothing else
-COARSE_VOXEL = 0.025  # [m] of a map beside a robot: its gaps and splats grow with it, the margin does not
+BEYOND = 0.10  # [m] the same about a sphere that nears nothing else
+COARSE_VOXEL = 0.025  # [m] of a map around a robot: gaps and splats grow with it, the margin does not
 MISPLACED = 0.005  # [m] of the robot's own surface: 0.1 to 2 mm on calibrated rigs, by their depth's noise
 DISPLACED_FRAMES = 12  # of a camera
 DISPLACED_ROWS = 160  # of an image, to which it is thinned
@@ -276,7 +277,7 @@ CALIBRATION_CREASE = 3.0  # times what a depth may err by, that it may stand out
 REFINE_ROWS = 240  # of an image that is looked at
 REFINE_BLUR = 0.6  # [px] of the small image, the sigma by which grey values are smoothed
 REFINE_POINTS = 6000  # of a view; every second one is laid on others, the rest says how well that went
-REFINE_ASKED = 32  # nearest views that are asked how much they share
+REFINE_ASKED = 32  # nearest views tested for overlap
 REFINE_NEIGHBOURS = 12  # of these, those that a view is laid on
 REFINE_OVERLAP = 0.1  # of a view's points that land on the surface of another, at least
 REFINE_ALIKE = 0.7  # cosine between the normals of two views of one surface, at least
@@ -297,7 +298,7 @@ BEND_MOST = 0.06  # of a depth, that a bend is corrected by
 BEND_FROM = 5e-4  # of the depth: views that are nearer each other have no bend worth a search
 BEND_VIEWS = 6  # of a camera, at least: every second one has to tell the bend
 BEND_ALIKE = 0.7  # cosine between the bends that two halves of the views tell, at least
-BEND_GAIN = 0.1  # by which a bend told by other views brings views together, at least
+BEND_GAIN = 0.1  # least share by which a bend found from other views reduces distances
 EXPOSURE_BLUR = 1.5  # [px] of the small image, the sigma by which colours are smoothed
 EXPOSURE_NEAR = 4.0  # sigmas of the depth within which two views show one surface
 EXPOSURE_LEVELS = (12.0, 243.0)  # of 255, between which a colour tells of the exposure
@@ -358,7 +359,7 @@ CALIBRATION_CUT = 10.0  # sigmas that a residual counts as, at most, where start
 CALIBRATION_FEWEST = 100  # residuals that tie two cameras, or a camera and the robot
 CALIBRATION_REACHES = (0.15, 0.15, 0.15, 0.08, 0.08, 0.04, 0.04, 0.03)  # [m] of a residual that counts, by round
 CALIBRATION_ROUGH = 6  # rounds at the last reach, of a first look
-CALIBRATION_STARTS = 4  # beside that of the recording
+CALIBRATION_STARTS = 4  # besides the recorded one
 CALIBRATION_AROUND = (0.06, 0.05)  # [rad], [m] that they are away, at most
 CALIBRATION_TUKEY = 4.685  # sigmas from which on a residual does not count
 CALIBRATION_LEAST_SPREAD = 0.5  # of what sensors err by, that residuals are taken to err by at least
@@ -385,7 +386,7 @@ CALIBRATION_BOARD_FIT = 0.05  # [m] that the board may be off where the robot ha
 CALIBRATION_BOARD_MOVED = 0.01  # [m] that a board which stands still is seen to move by, at most
 CALIBRATION_BOARD_DEPTH = (0.75, 1.33)  # times what the size of its squares says, that depth may have a board away
 CALIBRATION_BOARD_TOGETHER_NS = 50_000_000  # [ns] between frames that show a moving board at one moment
-CALIBRATION_TRAVEL = 0.1  # [m] that some point of the robot must move, for its surface to be told from a wrong model
+CALIBRATION_TRAVEL = 0.1  # [m] that a point of the robot must move, to distinguish its surface from a wrong model
 SWEEP_SAMPLES = 3  # values evenly between the ends that are tried before a verdict that can turn once is bisected
 SWEEP_SEARCHED = 7  # of a verdict that may turn back; the above are among them
 SWEEP_DIRECTIONS = 8  # of quasi-random ones in which several values are changed together

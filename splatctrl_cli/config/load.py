@@ -1,4 +1,4 @@
-"""The whole configuration: defaults, then a TOML file, then single assignments."""
+"""The whole configuration: defaults, a TOML file, single assignments."""
 
 import copy
 import dataclasses
@@ -26,7 +26,7 @@ from splatctrl_cli.errors import InputError, UsageError, did_you_mean
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """The whole configuration, one table per section in TOML."""
+    """The whole configuration, one TOML table per section."""
 
     scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)
     occupancy: OccupancyConfig = dataclasses.field(default_factory=OccupancyConfig)
@@ -40,14 +40,14 @@ class Config:
         check_voxel(self.scene, self.occupancy)
 
     def derived(self, **sections: Section) -> Self:
-        """A copy with sections that follow from a recording (`Section.derived`), which are not checked."""
+        """A copy with unchecked sections from a recording (`Section.derived`)."""
         made = copy.copy(self)
         for name, section in sections.items():
             object.__setattr__(made, name, section)
         return made
 
     def as_dict(self) -> dict[str, Any]:
-        """Nested plain values, as written to ``run.json``."""
+        """Nested plain values for ``run.json``."""
         return asdict(self)
 
 
@@ -88,10 +88,10 @@ def check_voxel(scene: SceneConfig, occupancy: OccupancyConfig) -> None:
 
 
 def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
-    """Defaults, then a preset (``preset=NAME`` among the assignments), the TOML file, each ``section.key=value``.
+    """Defaults, then a preset (``preset=NAME`` assigned), the TOML file, each ``section.key=value``.
 
-    Raises UsageError for an unknown section or key (naming the nearest), a value of the wrong type or out of range,
-    values that contradict each other, or TOML that does not parse; InputError for a file that is not there.
+    Raises UsageError for unknown sections or keys (naming the nearest), wrong types or ranges, contradictions, or
+    invalid TOML; InputError for a missing file.
     """
     given: dict[str, dict[str, Any]] = {}
     for where, section, values in _tables(path, assignments):
@@ -101,7 +101,7 @@ def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
 
 
 def sources_of(path: Path | None, assignments: Sequence[str]) -> dict[str, str]:
-    """Which of preset, file and ``--set`` gives each ``section.key`` that one gives. Raises as `load_config`."""
+    """Source (preset, file or ``--set``) of each given ``section.key``. Raises as `load_config`."""
     return {
         f"{section}.{key}": "--set" if where.startswith("--set ") else where
         for where, section, values in _tables(path, assignments)
@@ -110,7 +110,6 @@ def sources_of(path: Path | None, assignments: Sequence[str]) -> dict[str, str]:
 
 
 def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Where it is given, the section, and values by key."""
     presets = [text.partition("=")[2].strip() for text in assignments if _is_preset(text)]
     for name in presets:
         _check_known(name, PRESETS, "--preset", "")
@@ -140,7 +139,7 @@ def _is_preset(assignment: str) -> bool:
 
 
 def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
-    """The values with the types of their keys. Raises UsageError for an unknown key or another type."""
+    """Typed values. Raises UsageError for unknown keys or types."""
     kind = type(getattr(Config(), section))
     assert issubclass(kind, Section)
     hints, declared = typing.get_type_hints(kind), kind.declared
@@ -172,7 +171,6 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _parse_value(text: str) -> Any:
-    """A TOML value; what is none is a word."""
     try:
         parsed = tomllib.loads(f"value = {text}")
     except ValueError:
@@ -181,7 +179,7 @@ def _parse_value(text: str) -> Any:
 
 
 def type_name(hint: Any) -> str:
-    """A key's type in words: int, float, str, or float or list of float."""
+    """A key's type in words, such as float or list of float."""
     names = ["list of float" if option == tuple[float, ...] else option.__name__ for option in _options(hint)]
     return " or ".join(names)
 
@@ -191,7 +189,7 @@ def _options(hint: Any) -> tuple[Any, ...]:
 
 
 def _of_type(value: Any, hint: Any) -> Any:
-    """The value, an integer as a float and a list as a tuple where the type asks for these."""
+    """The value; integers to floats, lists to tuples, by type."""
     options = _options(hint)
     if str in options and isinstance(value, float) and math.isnan(value):
         return "nan"  # a word here, which TOML takes for a number

@@ -1,4 +1,4 @@
-"""What a key of the configuration may hold, declared once beside its default; checks and docs follow from it."""
+"""Ranges of configuration keys, declared with their defaults; checks and docs follow."""
 
 import copy
 import typing
@@ -14,9 +14,9 @@ MAX_SEED = 2**31 - 1  # fits every 32-bit integer, signed or not
 
 @dataclass(frozen=True)
 class Within:
-    """A number from `low` to `high`, both allowed, in `unit`; `or_zero`: or 0 alone, which switches something off.
+    """A number from `low` to `high`, inclusive, in `unit`; `or_zero`: or 0, which switches off.
 
-    Its arguments are positional, so that a declaration reads like the row of a table.
+    Positional, so that a declaration reads like a table's row.
     """
 
     low: float
@@ -32,7 +32,7 @@ class Within:
         return f"{span} {self.unit}" if self.unit else span
 
     def holds(self, value: Any) -> bool:
-        """Whether a number, or each number of a tuple, lies in the range; NaN never does."""
+        """True if a number, or each of a tuple, is in range; NaN never."""
         numbers = value if isinstance(value, tuple) else (value,)
         is_within = numbers != () and all(self.low <= number <= self.high for number in numbers)
         return is_within or (self.or_zero and value == 0)
@@ -52,7 +52,7 @@ class OneOf:
         return f"{', '.join(self.words[:-1])} or {self.words[-1]}"
 
     def holds(self, value: Any) -> bool:
-        """Whether the value is one of the words."""
+        """True for one of the words."""
         return value in self.words
 
 
@@ -60,18 +60,18 @@ Declared = Within | OneOf
 
 
 class Section:
-    """A table of the configuration. Its values are checked when it is made, wherever they come from."""
+    """A table of the configuration, checked when created."""
 
     section: ClassVar[str]
     declared: ClassVar[dict[str, Declared]]
 
     def __init_subclass__(cls, *, section: str) -> None:
-        """Raises TypeError for a key that says nothing of what it may hold."""
+        """Raises TypeError for a key without a range."""
         hints = typing.get_type_hints(cls, include_extras=True)
         cls.section, cls.declared = section, {key: _declared(hints[key]) for key in cls.__annotations__}
 
     def derived(self, **values: float) -> Self:
-        """A copy with values that follow from a recording, in whatever unit that is: they are not checked."""
+        """A copy with unchecked values from a recording, in its unit."""
         made = copy.copy(self)
         for key, value in values.items():
             object.__setattr__(made, key, value)
@@ -91,13 +91,13 @@ def _declared(hint: Any) -> Declared:
 
 
 def check(holds: bool, name: str, expected: str, value: object) -> None:
-    """Raise UsageError with the key, what it may be, and its value, unless that holds."""
+    """Raise UsageError with key, expectation and value, unless `holds`."""
     if not holds:
         raise UsageError(f"{name}: expected {expected}, got {shown(value)}", remedy="see splatctrl help config")
 
 
 def shown(value: object) -> str:
-    """A value as an error shows it."""
+    """A value, as shown in errors."""
     try:
         text = repr(value)
     except ValueError:  # an integer of more digits than Python prints
@@ -106,5 +106,5 @@ def shown(value: object) -> str:
 
 
 def cut(text: str) -> str:
-    """The beginning of a long text."""
+    """A long text's beginning."""
     return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."

@@ -1,6 +1,4 @@
-"""The numbers of the method by section: of the map and the distances to it (III-B to III-D), of control, planner and
-verdict (III-E).
-"""
+"""Numbers of the method by section: map and distances (III-B to III-D), control, planner and verdict (III-E)."""
 
 import math
 from dataclasses import dataclass

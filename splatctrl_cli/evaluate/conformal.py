@@ -1,16 +1,12 @@
-"""A bound on how far a map misses surface, from depth that did not train it: split conformal prediction over time.
+"""A bound on a map's missed surface from held-out depth: split conformal prediction over time.
 
-Each held-out frame set has one number, its largest miss. Neighbouring sets see the same surface at nearly the same
-moment and are not independent, so they are joined to stretches of the misses' autocorrelation time that
-begin that long after the one before has ended. A stretch's score is the largest miss in it. Of n scores that are
-exchangeable with a new one, the k-th smallest, ``k = ceil((n + 1) * confidence)``, is not exceeded by the new one
-with a probability of at least `confidence`, whatever their distribution (Vovk, Gammerman and Shafer 2005; Lei et al.
-2018, section 2). There is such a k up to a confidence of ``n / (n + 1)``: that is the one given where more is asked.
+Each held-out frame set has one number, its largest miss. As neighbouring sets are dependent, they form stretches of
+the misses' autocorrelation time, that long apart; a stretch's score is its largest miss. If n scores and a new one
+are exchangeable, the k-th smallest bounds the new one with probability at least `confidence`. Here ``k = ceil((n + 1)
+* confidence)``, up to confidence ``n / (n + 1)`` (Vovk, Gammerman and Shafer 2005; Lei et al. 2018, section 2).
 
-What is promised is about a further stretch of the kind that was measured, before any is recorded; it is no
-probability for each state. Nothing is said of surface from which the held-out camera returns no depth, of a scene or
-a camera that changes between what was measured and what is judged, or of a moment unlike all that were measured:
-stretches are only as exchangeable as the scene.
+The bound is for a further stretch of the same kind, before it is recorded, not for each state. It excludes surface
+without depth return, changes of scene or camera, and unprecedented moments.
 """
 
 import math
@@ -26,9 +22,9 @@ ROUNDING = 1e-9  # of (n + 1) * confidence, which is a whole number where it sho
 
 @dataclass(frozen=True, kw_only=True)
 class ConformalBound:
-    """A score [m] that a further stretch does not exceed with `confidence`, from num_stretches of `length` sets each.
+    """A score [m] that a further stretch does not exceed with `confidence`.
 
-    at: the set that decides it, an index into the misses.
+    From num_stretches of `length` sets; at: index of the deciding set.
     """
 
     bound: float
@@ -39,8 +35,9 @@ class ConformalBound:
 
 
 def conformal_bound(misses: Float64, confidence: float) -> ConformalBound | None:
-    """The bound of misses (T,) [m] by time, one a frame set, NaN where a set has none; None where they make fewer
-    than FEWEST_STRETCHES stretches. `confidence` is lowered to what their number allows.
+    """The bound of misses (T,) [m], one per frame set by time, NaN for none.
+
+    None below FEWEST_STRETCHES stretches. Their number limits `confidence`.
     """
     if not np.isfinite(misses).any():
         return None
@@ -60,17 +57,18 @@ def conformal_bound(misses: Float64, confidence: float) -> ConformalBound | None
 
 
 def conformal_rank(num_scores: int, confidence: float) -> int:
-    """Which of n scores, counted from 1 by size, bounds a further one: ``ceil((n + 1) * confidence)``, n + 1 where
-    none of them does.
+    """Rank of the bounding score, from 1: ``ceil((n + 1) * confidence)``.
+
+    n + 1 if none bounds.
     """
     return math.ceil((num_scores + 1) * confidence - ROUNDING)
 
 
 def autocorrelation_time(misses: Float64) -> int:
-    """Frame sets, at least 1, over which misses (T,) stay alike: ``1 + 2 sum_k rho_k`` up to the first lag k at which
-    the autocorrelation rho is not positive (Geyer 1992, its initial sequence by single lags), rounded up.
+    """Number of frame sets, at least 1, over which misses (T,) correlate.
 
-    NaN takes no part. Misses that do not vary say nothing of time: 1.
+    ``1 + 2 sum_k rho_k``, rounded up, to the first lag k with autocorrelation rho <= 0 (Geyer 1992, by single lags).
+    NaN is left out; constant misses give 1.
     """
     is_there = np.isfinite(misses)
     apart = np.where(is_there, misses, 0.0) - is_there * (np.mean(misses[is_there]) if is_there.any() else 0.0)
@@ -89,9 +87,9 @@ def autocorrelation_time(misses: Float64) -> int:
 
 
 def stretches(num_sets: int, length: int) -> Index:
-    """Which stretch (T,) each of the frame sets counts to: one of `length` sets begins `length` sets after the last
-    of the one before. The sets in between, and those after the last whole stretch, count to the one before as well:
-    that only raises its score, so that no miss is lost, and what holds of stretches without them still holds.
+    """The stretch (T,) of each set: `length` sets, starting `length` after the last one's end.
+
+    Other sets count to the previous stretch, which only raises its score: the bound still holds.
     """
     period = 2 * length - 1
     whole = max((num_sets + period - length) // period, 1)
@@ -99,7 +97,7 @@ def stretches(num_sets: int, length: int) -> Index:
 
 
 def stretch_scores(misses: Float64, stretch: Index) -> tuple[Float64, Index]:
-    """The largest miss (n,) of every stretch that has any, and which set (n,) it is of."""
+    """Each stretch's largest miss (n,), and its set (n,)."""
     known = np.flatnonzero(np.isfinite(misses))
     order = known[np.lexsort((-misses[known], stretch[known]))]
     first = order[np.unique(stretch[order], return_index=True)[1]]

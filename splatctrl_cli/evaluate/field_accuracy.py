@@ -1,4 +1,4 @@
-"""A baked field against the true distance, by band of it: the truth of a simulated log, or a mesh."""
+"""A baked field against the true distance, by distance band."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -20,10 +20,7 @@ from splatctrl_cli.robot.mesh_distance import MeshDistance
 
 @dataclass(frozen=True, kw_only=True)
 class BandAccuracy:
-    """Errors field - truth [m] over the cells of one band of true distance: positive = over-estimate = unsafe.
-
-    None where the band has no cell.
-    """
+    """Errors field - truth [m] in a distance band; positive is unsafe. None if empty."""
 
     lower: float
     upper: float
@@ -37,7 +34,7 @@ class BandAccuracy:
 
 @dataclass(frozen=True, kw_only=True)
 class OverEstimate:
-    """The share of cells where a field exceeds the truth by more than `allowance` [m], and by how much more."""
+    """Share of cells above the truth by more than `allowance` [m], and their excess."""
 
     allowance: float
     count: int
@@ -48,7 +45,7 @@ class OverEstimate:
 
     @property
     def holds(self) -> bool:
-        """True where no cell exceeds the allowance, over at least one cell."""
+        """True if no cell, of any, exceeds the allowance."""
         return self.count > 0 and self.count_beyond == 0
 
 
@@ -73,9 +70,9 @@ OVER_SCALES = {
 
 @dataclass(frozen=True, kw_only=True)
 class FieldAccuracy:
-    """Accuracy of several fields at the same points: bands by field name, over all points and over the seen ones.
+    """Bands by field name, everywhere and where seen, at the same points.
 
-    seen is empty, and the over-estimate is over all points, where nobody asked which ones were seen.
+    Without known visibility, seen is empty and the over-estimate is over all points.
     """
 
     everywhere: Mapping[str, tuple[BandAccuracy, ...]]
@@ -83,7 +80,7 @@ class FieldAccuracy:
     over_estimate: OverEstimate
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values, as written to ``field.json``."""
+        """Plain values for ``field.json``."""
         return {**asdict(self), "holds": self.over_estimate.holds}
 
     def figures(self) -> dict[str, float | None]:
@@ -100,12 +97,12 @@ class FieldAccuracy:
 
 
 def metric_names(field_names: Sequence[str]) -> tuple[str, ...]:
-    """Flat names of the numbers in a FieldAccuracy: ``seen.hard.0_2cm.rmse``, ``over_estimate.count``."""
+    """Flat names of the numbers: ``seen.hard.0_2cm.rmse``, ``over_estimate.count``."""
     return tuple(metric_scales(field_names, [band_name(lower, upper) for lower, upper in BANDS]))
 
 
 def metric_scales(field_names: Sequence[str], bands: Sequence[str]) -> dict[str, Scale]:
-    """How two runs are compared by each of `metric_names`, for bands by name."""
+    """Scales of `metric_names` for comparing runs."""
     places = [f"{where}.{name}.{band}" for where in ("everywhere", "seen") for name in field_names for band in bands]
     over = {f"over_estimate.{name}": scale for name, scale in OVER_SCALES.items()}
     return {f"{place}.{figure}": scale for place in places for figure, scale in BAND_SCALES.items()} | over
@@ -121,10 +118,9 @@ def field_accuracy(
 ) -> FieldAccuracy:
     """Compare fields with the truth at points outside the objects.
 
-    distances: name -> (Q,) [m], `hard` among them; truth (Q,) [m], >= 0 counts; seen (Q,) True where a training
-    camera saw the nearest true surface point, None where nobody looked. The over-estimate is that of `hard` at seen
-    points up to 20 cm, against 1 cm + `median_radius` [m]. Raises InputError for arrays of different lengths, or
-    without `hard`.
+    distances: name -> (Q,) [m], including `hard`. truth (Q,) [m]: >= 0 counts. seen (Q,): a training camera saw the
+    nearest true surface point; None if unknown. The over-estimate is of `hard` at seen points up to 20 cm, against 1
+    cm + `median_radius` [m]. Raises InputError for unequal lengths, or without `hard`.
     """
     if "hard" not in distances:
         raise InputError(f"distances: expected one named hard, got {', '.join(distances) or 'none'}")
@@ -144,21 +140,21 @@ def field_accuracy(
 
 @dataclass(frozen=True, kw_only=True)
 class GridDistance:
-    """A distance that a grid holds: values (X, Y, Z) [m], and what is to be added to them [m]."""
+    """A distance channel (X, Y, Z) [m], and an offset [m] to add."""
 
     values: NDArray[np.generic]
     added: float = 0.0
 
     def at(self, cells: NDArray[np.int64]) -> Float64:
-        """The distances [m] of cells by flat index, without a copy of the channel, which may be on disk."""
+        """Distances [m] by flat index, without copying a channel on disk."""
         return np.asarray(self.values.reshape(-1)[cells].astype(np.float64) + self.added)
 
 
 def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
-    """The distances that a grid holds, by field name: sdf, hard, se, gpdf.
+    """A grid's distances by field name: sdf, hard, se, gpdf.
 
-    hard is its channel, or else ``bound`` with the margin of the header put back, the same to a micrometre (where
-    never-seen cells were made obstacles, the distance to those as well). Raises InputError for a grid with neither.
+    Without its channel, hard is ``bound`` plus the header's margin, within a micrometre (and includes never-seen
+    obstacle cells). Raises InputError with neither.
     """
     found: dict[str, GridDistance] = {
         name: GridDistance(values=grid.channels[name])
@@ -177,7 +173,7 @@ def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
 
 
 def median_radius(grid: DistanceGrid) -> float:
-    """The median radius [m] of the splats a grid was made of, by its header. Raises InputError where it has none."""
+    """The median splat radius [m] in the header. Raises InputError without one."""
     health = grid.header.get("health")
     if not isinstance(health, dict) or not isinstance(health.get("radius"), int | float):
         raise InputError("distance grid: expected health.radius in its header, got none", remedy="bake it again")
@@ -191,7 +187,7 @@ def _bands(error: Float64, truth: Float64, chosen: Bool) -> tuple[BandAccuracy, 
 
 
 def band_accuracy(error: Float64, lower: float, upper: float) -> BandAccuracy:
-    """The figures of errors (Q,) [m] in a band of true distance."""
+    """Statistics of errors (Q,) [m] in a distance band."""
     is_empty = not len(error)
     return BandAccuracy(
         lower=lower,
@@ -224,9 +220,7 @@ REACH = BANDS[-1][1]  # [m] of true distance that is compared
 
 @dataclass(frozen=True, kw_only=True)
 class TrueCells:
-    """Q cells drawn of a grid: centres (Q, 3) [m], the grid's `FIELDS` there (Q,) [m], the true distance (Q,) [m] and
-    the surface point (Q, 3) [m] that gives it; world.
-    """
+    """Q sampled cells, world: centres, `FIELDS`, true distance (Q,) [m], nearest surface point."""
 
     points: Float64
     fields: Mapping[str, Float64]
@@ -236,13 +230,12 @@ class TrueCells:
 
 @dataclass(frozen=True, kw_only=True)
 class TruthComparison:
-    """The accuracy, and how many cells went into it.
+    """The accuracy against the truth, and its cell counts.
 
-    num_drawn of the grid's cells, num_blank of them without a distance (field.unknown = nan), num_near of the others
-    outside the objects and within 20 cm, num_seen of those with a nearest true surface point that a training camera
-    saw inside the workspace; num_outside_workspace more were seen, but their surface lies where the scene keeps no
-    splats. reliability: of each form of the probability, at seen cells within 20 cm of a surface, inside or out.
-    error_mean, error_sigma [m]: of sdf at seen cells within `PROBABILITY_NEAR` of a surface, None without any.
+    num_drawn cells were sampled; num_blank have no distance (field.unknown = nan); num_near of the rest lie outside
+    objects within 20 cm. A training camera saw the nearest surface point of num_seen, and of num_outside_workspace
+    where the scene keeps no splats. reliability: by probability form, at seen cells within 20 cm of a surface, either
+    side. error_mean, error_sigma [m]: of sdf at seen cells within `PROBABILITY_NEAR`, or None.
     """
 
     accuracy: FieldAccuracy
@@ -256,7 +249,7 @@ class TruthComparison:
     error_sigma: float | None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as written to ``field.json``."""
+        """Plain values for ``field.json``."""
         counts = {name: value for name, value in vars(self).items() if name.startswith("num_")}
         error = {"error_mean": self.error_mean, "error_sigma": self.error_sigma}
         curves = {name: _curve(curve) for name, curve in self.reliability.items()}
@@ -272,11 +265,10 @@ def compare_with_truth(
     median_radius: float,
     probabilities: Mapping[str, Callable[[Float64, Float64], Float64]],
 ) -> TruthComparison:
-    """The accuracy of `FIELDS`, and the reliability of the probabilities, at cells that `frames` saw the surface of.
+    """Accuracy of `FIELDS`, and reliability of probabilities, where `frames` saw the surface.
 
-    name: of the truth, for errors; workspace: where the scene keeps splats, None where that is not known;
-    median_radius [m] of the splats; probabilities: by name, at points (Q, 3) of sdf (Q,) [m]. Raises
-    NotEvaluableError where no cell is near an object.
+    name: of the truth, for errors. workspace: where the scene keeps splats, None if unknown. probabilities: functions
+    of points (Q, 3) and sdf (Q,) [m]. Raises NotEvaluableError with no cell near an object.
     """
     sdf, distance = cells.fields["sdf"], cells.distance
     is_blank = ~np.isfinite(sdf)
@@ -313,19 +305,17 @@ def compare_with_truth(
 
 
 def _curve(found: Reliability) -> dict[str, object]:
-    """Plain values; None where a bin is empty."""
     values = {name: [None if np.isnan(v) else float(v) for v in getattr(found, name)] for name in _CURVES}
     return {**values, "count": found.count, "calibration_error": found.calibration_error}
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeshComparison:
-    """The accuracy against the mesh of `file`, and how many cells went into it.
+    """The accuracy against the mesh `file`, and its cell counts.
 
-    num_in_reach of the grid's cells lie in the box of the mesh widened by 20 cm; num_drawn of those were drawn,
-    num_unknown of those have no distance (NaN, by the policy for unknown space), num_inside lie inside the mesh near
-    its surface, and num_near are outside of it and within 20 cm: those are compared. is_closed: the mesh has an
-    inside.
+    num_in_reach cells lie in the mesh's box widened by 20 cm; num_drawn were sampled. num_unknown of these have no
+    distance (NaN, by the unknown-space policy); num_inside lie inside the mesh near its surface. The num_near
+    compared lie outside within 20 cm.
     """
 
     file: str
@@ -339,18 +329,17 @@ class MeshComparison:
     num_near: int
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as written to ``field.json``."""
+        """Plain values for ``field.json``."""
         counts = {name: value for name, value in vars(self).items() if name != "accuracy"}
         return {**counts, **self.accuracy.as_dict()}
 
 
 def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_points: int = 50_000) -> MeshComparison:
-    """Errors of the grid's distances at cell centres, drawn with the seed, against the exact distance to a mesh.
+    """Errors of the grid's distances at cells sampled by `seed`, against the exact mesh distance.
 
-    The mesh is in the grid's frame, in metres, and neither moved nor scaled. Inside a closed mesh nothing is compared
-    (the field is a shell there); an open one has no inside, and its unsigned distance is the truth on both sides.
-    Which cells a camera saw is not known here: `seen` of the accuracy is empty. Raises InputError for a file that is
-    no mesh, NotEvaluableError where no cell is near it.
+    The mesh is in the grid's frame [m]. Inside a closed mesh, where the field is a shell, nothing is compared; an
+    open mesh's unsigned distance is the truth on both sides. `seen` is empty. Raises InputError for no mesh,
+    NotEvaluableError with no cell near it.
     """
     mesh = load_mesh(mesh_path)
     distances = grid_distances(grid)
@@ -389,7 +378,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
 
 
 def _drawn_cells(grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int) -> tuple[Index, int]:
-    """Some of the cells (C, 3) whose centres lie in a box, in order, and how many there are in all."""
+    """Sampled cells (C, 3), in order, of those in a box, and their number."""
     shape = np.array(grid.channels["sdf"].shape)
     first = np.maximum(np.ceil((lower - grid.origin) / grid.voxel).astype(np.int64), 0)
     last = np.minimum(np.floor((upper - grid.origin) / grid.voxel).astype(np.int64), shape - 1)

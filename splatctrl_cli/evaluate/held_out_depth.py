@@ -1,9 +1,8 @@
-"""A baked field beside the depth of cameras that did not train, and the surface of a scene beside reference points.
+"""A baked field against held-out depth, and a scene's surface against reference points.
 
-What a depth pixel says is sound in one direction: its point p is on a surface, so the true distance at any x is at
-most ``|x - p|``, and the ray up to p is free. A field that reads more than the distance to the nearest measured point
-over-estimates, whatever else there is. A field that reads less may know a surface that no held-out pixel shows; it
-can be called an error only where the ball around x, up to the nearest measured point, was itself seen to be free.
+A depth pixel at point p bounds the distance at x by ``|x - p|``, and the ray up to p is free. A field above the
+distance to the nearest measured point over-estimates. A lower one may know surface that no held-out pixel shows. It
+errs only if the ball around x, up to that point, was seen free.
 """
 
 import math
@@ -53,15 +52,13 @@ def cloud_score(
     unit: float = 1.0,
     threads: int = 1,
 ) -> dict[str, float]:
-    """Distances between the surface's points (P, 3) and the reference's (R, 3) [m], world; seen (R,).
+    """Distances [m] between points (P, 3) of a surface and a reference (R, 3), world.
 
-    As DTU's evaluation and jzhangbs/DTUeval-python, eval.py, have it: means over distances below `max_distance`.
-    counts (P,): points that enter the accuracy, all where None; the completeness is over the whole reference.
-    accuracy: mean distance [m] of the surface's points to the reference; completeness: of the reference's points to
-    the surface; chamfer: the mean of both. Points farther than the maximum distance count only in the `*_beyond`
-    shares. completeness_seen: over reference points that a training camera saw. nan where no point is left.
-    unit: metres per unit of the reference's file, for the words of a refusal. Raises NotEvaluableError where nothing
-    lies that near, or the reference would fit in another unit.
+    As DTU's evaluation and jzhangbs/DTUeval-python, eval.py: means of distances below `max_distance`; others count
+    only in the `*_beyond` shares. accuracy: surface points, of counts (P,) or all, to the reference. completeness:
+    the whole reference to the surface. chamfer: the mean of both. completeness_seen: of points that a training camera
+    saw (R,). nan without points. unit: metres per unit of the reference's file, for messages. Raises
+    NotEvaluableError without near points, or if another unit fits.
     """
     if not max_distance > 0:
         raise UsageError(f"--cloud-max: expected a distance above 0 m, got {max_distance:g}")
@@ -107,8 +104,7 @@ def _check_unit(points: Float64, reference: Float64, margin: float, unit: float)
 
 
 def _overlap(points: Float64, others: Float64, margin: float) -> float:
-    """Volume that the boxes of both, without one percent at either end, and `margin` [m] wider, share of what they
-    fill together."""
+    """Intersection over union of boxes, trimmed by 1 % per end, widened by `margin` [m]."""
     (low, high), (low_other, high_other) = (np.percentile(p, (1, 99), axis=0) for p in (points, others))
     sides = np.minimum(high, high_other) - np.maximum(low, low_other) + 2 * margin
     shared = float(np.prod(np.maximum(sides, 0.0)))
@@ -124,11 +120,11 @@ CLOUD_SCALES = {  # by the names of `cloud_score`
 
 
 def spaced(points: Float64, spacing: float) -> Float64:
-    """Of the points (P, 3), taken in random order, those farther than `spacing` [m] from all that were kept before.
+    """Points (P, 3), visited in random order, farther than `spacing` [m] from all kept before.
 
-    As DTU's evaluation thins (DTUeval-python, eval.py): where points scatter about a surface, every layer of them
-    counts, so that one point for each cube of that edge gives an accuracy a tenth better. What shares a cube of half
-    the edge is merged before (of the whole edge, where that leaves more than 6 million points).
+    As DTU thins (DTUeval-python, eval.py), so that every layer of a scattered surface counts; one point per cube
+    would improve accuracy by a tenth. Cubes of half the edge are merged first (the whole edge above 6 million
+    points).
     """
     _check_spacing(spacing)
     some = thinned(points, spacing / 2)
@@ -137,7 +133,7 @@ def spaced(points: Float64, spacing: float) -> Float64:
     some = some[np.random.default_rng(0).permutation(len(some))]
     low, high = (cKDTree(some).query_pairs(spacing, output_type="ndarray") if len(some) else NO_PAIRS).T
     is_open, kept = np.ones(len(some), np.bool_), np.zeros(len(some), np.bool_)
-    while is_open.any():  # who waits for no earlier one stays, and all near those go: what taking them in turn leaves
+    while is_open.any():  # points without an earlier open neighbour stay, their neighbours go: as if in turn
         first = is_open.copy()
         first[high] = False
         kept |= first
@@ -149,8 +145,9 @@ def spaced(points: Float64, spacing: float) -> Float64:
 
 
 def thinned(points: Float64, spacing: float) -> Float64:
-    """One of the points (P, 3) for each cube of edge `spacing` [m] that holds any: the first. Thinning parts of a
-    cloud, then what is left of them together, leaves the same.
+    """The first of points (P, 3) per cube of edge `spacing` [m].
+
+    Thinning parts beforehand changes nothing.
     """
     _check_spacing(spacing)
     if not len(points):
@@ -168,13 +165,13 @@ def _check_spacing(spacing: float) -> None:
 
 
 def points_on(mesh: TriangleMesh, spacing: float) -> Float64:
-    """Random points (P, 3) [m] on a mesh, even by area: four for each square of `spacing` [m], 2 million at most."""
+    """Random points (P, 3) [m] by area, four per squared `spacing`, at most 2 million."""
     num = min(math.ceil(4 * 0.5 * np.linalg.norm(face_normals(mesh.corners), axis=1).sum() / spacing**2), MAX_POINTS)
     return drawn_on(mesh, num, np.random.default_rng(0))[0]
 
 
 def drawn_on(mesh: TriangleMesh, num: int, rng: np.random.Generator) -> tuple[Float64, NDArray[np.int64]]:
-    """Random points (num, 3) [m] on a mesh, even by area, and the triangle of each (num,)."""
+    """Random points (num, 3) [m] by area, and their triangles (num,)."""
     corners, doubled = mesh.corners, np.linalg.norm(face_normals(mesh.corners), axis=1)
     face = rng.choice(len(corners), num, p=doubled / doubled.sum())
     u, v = rng.random((2, num))
@@ -184,12 +181,11 @@ def drawn_on(mesh: TriangleMesh, num: int, rng: np.random.Generator) -> tuple[Fl
 
 
 def _nearest(points: Float64, others: Float64, limit: float, threads: int) -> Float64:
-    """Distance (P,) [m] of each point to the nearest of `others`, inf where that is `limit` or farther."""
+    """Distance (P,) [m] to the nearest of `others`, inf from `limit` on."""
     return np.asarray(cKDTree(others).query(points, distance_upper_bound=limit, workers=threads)[0])
 
 
 def _mean_below(distances: NDArray[np.floating], limit: float) -> tuple[float, float]:
-    """Mean of the distances below the limit, and the share of the others."""
     if not len(distances):
         return math.nan, math.nan
     near = distances[distances < limit]
@@ -209,13 +205,12 @@ REACH = fixed.BANDS[-1][1]  # [m] before the surface that points are put on a ra
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutComparison:
-    """Errors [m] against held-out depth, and how many points went into them.
+    """Errors [m] against held-out depth, and counts of points.
 
-    on_surface: the fields at measured points, where the distance is 0 by what the camera says. before: at points on
-    the rays before them; `seen` are those whose ball, up to the nearest measured point, was seen to be free, where
-    under-estimates count as well; over all points only over-estimates are sound, and those beyond the allowance are
-    counted over all. num_edges pixels were left out as they may lie between two surfaces, num_outside drawn points
-    because they lie outside the grid, num_unknown because a corner of their cell has no distance.
+    on_surface: at measured points, whose distance is 0. before: on the rays in front; `seen` points have a ball, up
+    to the nearest measured point, seen free, so under-estimates count too. over_estimate is over all points, as it is
+    sound everywhere. num_edges pixels were left out at depth edges; num_outside points lie outside the grid,
+    num_unknown at a corner without distance.
     """
 
     on_surface: dict[str, BandAccuracy]
@@ -242,11 +237,11 @@ def compare_with_held_out_depth(
     counted: Sequence[Bool] | None = None,
     max_points: int = 20_000,
 ) -> HeldOutComparison:
-    """Errors of the grid's distances, interpolated, on `max_points` held-out rays drawn with the seed.
+    """Errors of interpolated distances on `max_points` held-out rays, sampled by `seed`.
 
-    frames: of cameras that did not train, at the stamp of the bake, in the grid's frame. counted: per frame (H, W),
-    False where a pixel shows what the field leaves out (the robot), None where there is nothing of the kind. Raises
-    InputError for masks that do not fit, NotEvaluableError where no measured point lies in the grid.
+    frames: of held-out cameras, at the bake's stamp, in the grid's frame. counted: per frame (H, W), False on objects
+    that the field leaves out (the robot). Raises InputError for masks that do not fit, NotEvaluableError without a
+    measured point in the grid.
     """
     distances = grid_distances(grid)
     upper = grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1)
@@ -287,9 +282,9 @@ def compare_with_held_out_depth(
 
 
 def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float64, Float64] | None) -> Bool:
-    """(H, W) False where a pixel's point lies outside the scene's box, or in one of the robot's spheres or near it.
+    """(H, W) False on points outside the scene's box, or near a robot sphere.
 
-    spheres: their centres (S, 3) and radii (S,) [m], world.
+    spheres: centres (S, 3) and radii (S,) [m], world.
     """
     is_deep = frame.depth > 0
     points = transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[is_deep])
@@ -302,7 +297,7 @@ def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float
 
 
 def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: Box) -> tuple[Float64, Float64, int]:
-    """The surface points (M, 3) in a box that the frames measured, the eye (M, 3) of each, and the edges left out."""
+    """Surface points (M, 3) in a box, their eyes, and the edges left out."""
     if counted is not None and [mask.shape for mask in counted] != [frame.depth.shape for frame in frames]:
         raise InputError(
             f"counted: expected a mask of the size of each of {len(frames)} frames, got {len(counted)} masks"
@@ -322,7 +317,7 @@ def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: 
 
 
 def depth_edges(depth: NDArray[np.float32]) -> Bool:
-    """(H, W) True where a measured neighbour's depth differs by more than a share of the pixel's own."""
+    """(H, W) True where a neighbour's depth differs by more than a share of the smaller."""
     is_edge = np.zeros(depth.shape, dtype=np.bool_)
     for axis in (0, 1):
         here, there = [slice(None)] * 2, [slice(None)] * 2
@@ -344,7 +339,7 @@ def _interpolated(grid: DistanceGrid, distances: dict[str, GridDistance], points
 
 
 def _ball_is_free(points: Float64, radius: Float64, frames: Sequence[RgbdFrame]) -> Bool:
-    """(Q,) True where every probe in the ball about a point was seen to be free."""
+    """(Q,) True if all probes in the ball were seen free."""
     index = np.arange(fixed.FREE_DIRECTIONS)
     height, turn = 1 - (2 * index + 1) / fixed.FREE_DIRECTIONS, index * np.pi * (3 - np.sqrt(5))  # Fibonacci's spiral
     flat = np.sqrt(1 - height**2)
@@ -358,7 +353,7 @@ def _ball_is_free(points: Float64, radius: Float64, frames: Sequence[RgbdFrame])
 
 
 def _seen_free(points_world: Float64, frames: Sequence[RgbdFrame]) -> Bool:
-    """(Q,) True where a point lies before, or just behind, what some frame measured along its ray."""
+    """(Q,) True before, or just behind, a frame's measured depth."""
     is_free = np.zeros(len(points_world), dtype=np.bool_)
     for frame in frames:
         asked = np.flatnonzero(~is_free)

@@ -1,7 +1,4 @@
-"""Metrics as they are declared: the value, what it rests on, of a figure of states how it folds over them, and how
-two runs are compared by it, or two of each of many recordings, by a confidence interval of the mean change; and how a
-clearance agrees with the truth.
-"""
+"""Declared metrics: value, count, fold over states and scale; clearances against the truth."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +18,7 @@ Column = Callable[[R], Float64]
 
 
 class Better(StrEnum):
-    """Which way a figure gets better."""
+    """The direction in which a figure improves."""
 
     HIGHER = "higher"
     LOWER = "lower"
@@ -30,9 +27,7 @@ class Better(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """How two values of a figure are compared: a change for the worse counts where it is larger than `absolute`, in
-    `unit`, and `relative` times the value before, together.
-    """
+    """Scale of a figure: worsening counts beyond absolute + relative times the earlier value."""
 
     unit: str = ""
     better: Better = Better.NEITHER
@@ -40,11 +35,11 @@ class Scale:
     relative: float = 0.0
 
     def tolerance(self, before: float) -> float:
-        """In `unit`, beside a value from before."""
+        """Tolerance in `unit`."""
         return self.absolute + self.relative * abs(before)
 
     def harm(self, before: float, after: float) -> float:
-        """By how much `after` is worse, negative where it is better; 0 where no direction is declared."""
+        """Worsening from `before` to `after`, negative if better; 0 without a direction."""
         sign = {Better.HIGHER: -1.0, Better.LOWER: 1.0, Better.NEITHER: 0.0}[self.better]
         return sign * (after - before)
 
@@ -64,8 +59,9 @@ LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
 
 @dataclass(frozen=True, kw_only=True)
 class Shown:
-    """In which row of a run's table of states a figure shows: where `column` is `pick`: "least", "largest", or else
-    that word.
+    """The row of a state table that shows a figure: where `column` is `pick`.
+
+    pick: "least", "largest", or a word of the column.
     """
 
     column: str
@@ -73,22 +69,21 @@ class Shown:
 
 
 def least_of(column: str) -> Shown:
-    """Where a column is least."""
+    """The row where a column is least."""
     return Shown(column=column, pick="least")
 
 
 def largest_of(column: str) -> Shown:
-    """Where a column is largest."""
+    """The row where a column is largest."""
     return Shown(column=column, pick="largest")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Metric(Generic[R]):
-    """One figure: its value, None where it has none, and how many states, views or points it rests on.
+    """One figure: its value, and the number of states, views or points behind it.
 
-    running: what it is before the first state, and over the states up to each (T,); None where it is not made of
-    single states. scale: how two runs are compared by it; shown: where a table of states shows it, None where none
-    does.
+    running: its value before the first state, and up to each (T,); None if not of single states. shown: its row in a
+    table of states.
     """
 
     name: str
@@ -101,7 +96,7 @@ class Metric(Generic[R]):
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """What a column (T,) comes to; accumulate: up to each state, from `start` on; None where no order tells that."""
+    """A column (T,) folded to a value; accumulate: up to each state, if defined."""
 
     of: Callable[[Float64], float | None]
     start: float = np.nan
@@ -109,30 +104,29 @@ class Fold:
 
 
 def _of_known(fold: Callable[[Float64], np.floating], values: Float64) -> float | None:
-    """A fold of the values that are not NaN; None without one."""
     there = values[~np.isnan(values)]
     return float(fold(there)) if len(there) else None
 
 
 def least(values: Float64) -> float | None:
-    """The smallest finite value, None without one."""
+    """The smallest finite value, or None."""
     finite = values[np.isfinite(values)]
     return float(finite.min()) if len(finite) else None
 
 
 def lowest(values: Float64) -> float | None:
-    """The least value that is not NaN, which may be infinite; None without one."""
+    """The least value, perhaps infinite, without NaN; or None."""
     return _of_known(np.min, values)
 
 
 def largest(values: Float64) -> float | None:
-    """The largest value; None where one is infinite or none is there."""
+    """The largest value; None if one is infinite, or without any."""
     there = values[~np.isnan(values)]
     return float(np.max(there)) if len(there) and np.isfinite(there).all() else None
 
 
 def last(values: Float64) -> float | None:
-    """The last finite value; None without one."""
+    """The last finite value, or None."""
     there = values[np.isfinite(values)]
     return float(there[-1]) if len(there) else None
 
@@ -146,7 +140,7 @@ TOTAL = Fold(of=lambda values: int(np.nansum(values)))
 
 
 def known(values: Float64) -> int:
-    """How many are not NaN."""
+    """The number of values except NaN."""
     return int(np.sum(~np.isnan(values)))
 
 
@@ -159,7 +153,7 @@ def folded(
     scale: Scale = DESCRIBES,
     shown: Shown | None = None,
 ) -> Metric[R]:
-    """A column's fold, which rests on the values that are not NaN unless `count` says otherwise."""
+    """A column's fold; counts all but NaN, unless `count` is given."""
     accumulate = fold.accumulate
     return Metric(
         name=name,
@@ -179,7 +173,7 @@ def counted(
     scale: Scale = FAULTS,
     shown: Shown | None = None,
 ) -> Metric[R]:
-    """How many values of a column are so."""
+    """The number of values where `is_on`."""
     return Metric(
         name=name,
         value=lambda result: int(np.sum(is_on(result, column(result)))),
@@ -198,7 +192,7 @@ SEED = 0
 
 @dataclass(frozen=True, kw_only=True)
 class MeanChange:
-    """The mean of num_pairs differences, and an interval that has it with CONFIDENCE."""
+    """The mean of num_pairs differences, and its CONFIDENCE interval."""
 
     mean: float
     low: float
@@ -207,8 +201,9 @@ class MeanChange:
 
 
 def mean_change(differences: Sequence[float]) -> MeanChange | None:
-    """The mean of paired differences with its percentile interval: means of RESAMPLES draws with replacement, by SEED
-    (Efron and Tibshirani 1993, section 13.3). None for fewer than FEWEST pairs.
+    """The mean of paired differences with its percentile interval; None below FEWEST pairs.
+
+    RESAMPLES draws with replacement, by SEED (Efron and Tibshirani 1993, section 13.3).
     """
     values, num = np.asarray(differences, dtype=np.float64), len(differences)
     if num < FEWEST:
@@ -224,10 +219,10 @@ FIGURES = ("num_compared", "median", "p95", "largest", "largest_over", "toleranc
 def clearance_agreement(
     clearance: Float64, truth: Float64, is_seen: Bool, median_radius: float
 ) -> dict[str, float | None]:
-    """Clearance (T,) against the truth (T,) [m], over states nearer than 10 cm to a surface that was seen (T,).
+    """Agreement of clearance with truth (T,) [m], within 10 cm of seen surface.
 
-    By the names of `FIGURES`: how many states are compared; |clearance - truth| as median, 95 % and largest [m]; the
-    largest over-estimate [m]; the share of states within the tolerance [m]. None where no state is compared.
+    By `FIGURES`: states compared; |clearance - truth| as median, 95 % and largest [m]; largest over-estimate [m];
+    share within tolerance [m]. None without states.
     """
     tolerance = MAP_ALLOWANCE + median_radius
     compared = (truth < CLEARANCE_NEAR) & is_seen & np.isfinite(clearance)
@@ -245,9 +240,9 @@ def clearance_agreement(
 def mark_seen(
     seen: Bool, points_world: FloatRows, stamp_ns: Stamps, frame: RgbdFrame, *, has_clock: bool = True
 ) -> None:
-    """Set `seen` (T,) where a surface point (T, 3) [m], asked for at a stamp (T,), was seen in a frame not later.
+    """Set `seen` (T,) where `frame`, not later than the stamp, saw the point [m].
 
-    The points are read a block at a time, and only where some were not seen yet.
+    points_world (T, 3) are read in blocks, only those not yet seen.
     """
     for first in range(0, len(seen), BLOCK):
         part = slice(first, first + BLOCK)

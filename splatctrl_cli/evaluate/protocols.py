@@ -1,11 +1,10 @@
-"""How DTU's scans are scored, so that figures compare with published ones: which views, and where points count.
+"""DTU's scoring protocols, for published figures: view splits, and where points count.
 
 Views are numbered from 0: view 0 is ``rect_001`` of DTU.
 
-Where DTU's own evaluation looks is in ObsMaskN_10.mat and PlaneN.mat of its ObsMask folder, lengths in millimetres:
-ObsMask (X, Y, Z) says which cells of BB (2, 3), Res [mm] wide, the reference scanner observed; points of the
-reference count where P (4) . (x, y, z, 1) > 0, above the ground plane (DTU's PointCompareMain.m;
-jzhangbs/DTUeval-python, eval.py).
+ObsMaskN_10.mat and PlaneN.mat of DTU's ObsMask folder, in millimetres, say where points count. ObsMask (X, Y, Z):
+cells of BB (2, 3), Res wide, that the reference scanner observed. Reference points count above the ground, at ``P (4)
+. (x, y, z, 1) > 0`` (DTU's PointCompareMain.m; jzhangbs/DTUeval-python, eval.py).
 """
 
 import re
@@ -34,7 +33,7 @@ BEFORE, BEYOND = 0.060, 0.120  # [m] outside the box within which points are kep
 
 @dataclass(frozen=True, kw_only=True)
 class Split:
-    """View numbers: those that train, those that are scored, and those that neither may touch."""
+    """View numbers for training, for scoring, and left out of both."""
 
     training: tuple[int, ...]
     scored: tuple[int, ...]
@@ -48,13 +47,11 @@ class Split:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreProtocol:
-    """What a name fixes.
+    """A named scoring protocol.
 
-    mask: what of a view counts in the published figure: the pixels of a mask where one is given, those of the object
-    (a mask has to be given), or those with a reference depth. fill: colour outside the mask in the published SSIM;
-    is_zero_padded: without a mask that has zeros beyond the image's border.
-    size: width and height [px] of the published figures. scans: of DTU, in the published mean. Empty training and
-    scored views say that a rule splits the views.
+    mask: pixels of the published figure: of a mask if given, of the object (mask required), or with reference depth.
+    fill: colour outside the mask in the published SSIM; is_zero_padded: its border without a mask. size [px], scans:
+    as published. Without training and scored views, a rule splits.
     """
 
     name: str
@@ -71,14 +68,11 @@ class ScoreProtocol:
 
     @property
     def scores_training(self) -> bool:
-        """Whether the views that are scored are those that trained."""
+        """True if the training views are scored."""
         return not (self.scored or self.every)
 
     def split(self, numbers: Sequence[int], where: str) -> Split:
-        """The views `numbers` of a scan, named `where`, by this protocol.
-
-        Views that it does not name are left out. Raises InputError where views that it names are missing.
-        """
+        """Split views `numbers` of scan `where`; others are left out. Raises InputError for missing ones."""
         if self.scores_training:
             return Split(training=tuple(numbers), scored=tuple(numbers))
         if self.every:
@@ -104,7 +98,7 @@ class ScoreProtocol:
 
 
 def _regnerf(num_training: int) -> ScoreProtocol:
-    """The first N of nine input views train, 25 are scored, 15 left out.
+    """N of nine input views train, 25 are scored, 15 left out.
 
     google-research/google-research, regnerf/internal/datasets.py, class DTU, split 'pixelnerf'; figures over the
     object (regnerf/eval.py), 400x300 by ``factor = 4`` of regnerf/configs.
@@ -150,7 +144,7 @@ PROTOCOLS = {protocol.name: protocol for protocol in _FIXED}
 
 
 def score_protocol(name: str) -> ScoreProtocol:
-    """The protocol of that name, or of a ``holdout:`` rule. Raises UsageError with the choices."""
+    """The protocol of a name or ``holdout:`` rule, else UsageError."""
     if name.startswith("holdout:"):
         return _holdout(name)
     if name in PROTOCOLS:
@@ -179,7 +173,6 @@ def _holdout(name: str) -> ScoreProtocol:
 
 
 def _ranges(numbers: Sequence[int]) -> str:
-    """``0-3, 7``: in order."""
     runs: list[list[int]] = []
     for number in sorted(set(numbers)):
         if runs and number == runs[-1][-1] + 1:
@@ -192,9 +185,9 @@ def _ranges(numbers: Sequence[int]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservedSpace:
-    """is_observed (X, Y, Z): cells from `low` (3,) [m] on, `resolution` [m] wide, of a box up to `high` (3,) [m].
+    """Observed cells (X, Y, Z), `resolution` [m] wide, of a box `low` to `high` [m].
 
-    plane (4,): a point (x, y, z) [m] is above the ground where plane . (x, y, z, 1) > 0.
+    plane (4,): ``plane . (x, y, z, 1) > 0`` is above the ground [m].
     """
 
     is_observed: Bool
@@ -204,11 +197,11 @@ class ObservedSpace:
     plane: Float64
 
     def near(self, points: Float64) -> Bool:
-        """(Q,) True for points (Q, 3) [m] in the box or near it: others are compared with nothing."""
+        """(Q,) True for points (Q, 3) [m] near the box, to be compared."""
         return np.asarray(((points >= self.low - BEFORE) & (points < self.high + BEYOND)).all(axis=1))
 
     def observed(self, points: Float64) -> Bool:
-        """(Q,) True for points (Q, 3) [m] in observed cells: these count in the accuracy."""
+        """(Q,) True for points (Q, 3) [m] that count in the accuracy."""
         cells = np.rint((points - self.low) / self.resolution).astype(np.int64)
         inside = np.flatnonzero(((cells >= 0) & (cells < self.is_observed.shape)).all(axis=1))
         observed = np.zeros(len(points), np.bool_)
@@ -216,12 +209,12 @@ class ObservedSpace:
         return observed
 
     def above(self, points: Float64) -> Bool:
-        """(Q,) True for points (Q, 3) [m] above the ground: these count in the completeness."""
+        """(Q,) True for points (Q, 3) [m] that count in the completeness."""
         return np.asarray(points @ self.plane[:3] + self.plane[3] > 0)
 
 
 def scan_number(scan: str) -> int:
-    """24 of ``scan24``. Raises InputError for a name without a number."""
+    """24 for ``scan24``. Raises InputError without a number."""
     match = re.search(r"(\d+)$", scan)
     if match is None:
         raise InputError(f"scan '{scan}': expected a name with DTU's number, such as scan24")
@@ -229,7 +222,7 @@ def scan_number(scan: str) -> int:
 
 
 def cloud_of_scan(folder: Path, scan: str) -> Path:
-    """DTU's points of a scan (``stl024_total.ply``), or ``scan24.ply``. Raises InputError where there is neither."""
+    """Path of ``scan24.ply`` or ``stl024_total.ply``. Raises InputError without either."""
     names = [f"{scan}.ply"] + ([f"stl{scan_number(scan):03d}_total.ply"] if scan[-1:].isdigit() else [])
     for name in names:
         if (folder / name).is_file():
@@ -238,7 +231,7 @@ def cloud_of_scan(folder: Path, scan: str) -> Path:
 
 
 def read_observed(folder: Path, scan: str) -> ObservedSpace:
-    """What of the space around a scan counts. Raises InputError naming the file."""
+    """A scan's observed space. Raises InputError naming the file."""
     number = scan_number(scan)
     path, plane_path = folder / f"ObsMask{number}_10.mat", folder / f"Plane{number}.mat"
     box, resolution = _array(path, "BB", 6).reshape(2, 3), float(_array(path, "Res", 1)[0])

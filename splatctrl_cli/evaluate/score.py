@@ -1,4 +1,4 @@
-"""Scores of rendered views against recorded ones, over all pixels and over those that a training camera saw."""
+"""Scores of rendered against recorded views, over all pixels and those seen in training."""
 
 import math
 from collections.abc import Sequence
@@ -49,9 +49,9 @@ PROTOCOL = {
 
 @dataclass(frozen=True, kw_only=True)
 class RegionScore:
-    """Figures over one region of a view: `share` of the view's pixels; psnr [dB]; nan where the region is empty.
+    """Figures of a region: `share` of the view's pixels; psnr [dB]; nan if empty.
 
-    in_front: share of the pixels with both depths where the render stands before the measured surface.
+    in_front: share of pixels with both depths where the render lies before the measured surface.
     """
 
     share: float
@@ -78,11 +78,10 @@ CORRECTABLE = tuple(f"{name}_{region}" for name in REGION if name != "depth_pixe
 
 @dataclass(frozen=True, kw_only=True)
 class ViewScore:
-    """One view: `valid_share` of its pixels have a reference depth; `all` and `seen` are its regions.
+    """One view: valid_share has reference depth; `all`, `seen` and `masked` are regions.
 
-    Where there is a mask: `masked` is its region, ssim_published is that of the view with the rest filled; without
-    one, ssim_published is there where the protocol has one. size: width and height [px]. corrected: the same view at
-    its corrected pose and exposure, its depth freed of its camera's bend.
+    ssim_published: filled outside a mask; without one, if the protocol has it. size: width, height [px]. corrected:
+    with corrected pose, exposure and depth bend.
     """
 
     view: str
@@ -97,7 +96,7 @@ class ViewScore:
     corrected: "ViewScore | None" = None
 
     def figures(self) -> dict[str, float]:
-        """The view's figures by flat name, ``psnr_seen``, ``depth_median_all`` [m], …"""
+        """Figures by flat name, ``psnr_seen``, ``depth_median_all`` [m], …"""
         found = {
             "valid_share": self.valid_share,
             "seen_share": self.seen.share,
@@ -135,12 +134,11 @@ def score_view(
     fill: float = 0.0,
     is_zero_padded: bool = False,
 ) -> ViewScore:
-    """The scores of a rendering against `frame`.
+    """Score a rendering against `frame`, by `PROTOCOL`.
 
-    color (H, W, 3) in [0, 1], depth (H, W) [m] normalised by accumulated opacity, 0 = none; seen (H, W): pixels
-    that a training camera saw; mask (H, W): pixels that the mask rule selects, `fill` the grey outside it for
-    the published SSIM; is_zero_padded: without a mask, it is that of `ssim_map` of that kind. What is not valid in
-    `frame` is in no region. `PROTOCOL` says what each figure means.
+    color (H, W, 3) in [0, 1]; depth (H, W) [m], normalised by accumulated opacity, 0 = none. seen, mask (H, W):
+    pixels seen in training, and of the mask rule. The published SSIM has grey `fill` outside the mask, or
+    is_zero_padded without one. Invalid pixels of `frame` are in no region.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
     photo = frame.color.astype(np.float64) / 255.0
@@ -177,10 +175,10 @@ def score_view(
 
 
 def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float:
-    """Share of the mass of the splats in voxels that were observed free; nan where there is no mass.
+    """Share of the splats' mass with centres in voxels observed free; nan without mass.
 
-    A splat's mass is its opacity times its radius squared: what it can cover. It is where its centre is. The robot's
-    splats are left out: they move through free space. free_below: occupancy under which a seen voxel is free.
+    Mass is opacity times squared radius, what a splat can cover. The robot's are left out, since they cross free
+    space. free_below: a free voxel's occupancy.
     """
     mass = np.where(splats.labels == Label.ROBOT, 0.0, splats.opacities * splats.radii.astype(np.float64) ** 2)
     is_free = (grid.num_updates > 0) & (grid.log_odds < math.log(free_below / (1.0 - free_below)))
@@ -191,23 +189,21 @@ def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float
 
 
 def in_front(depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool) -> float:
-    """Share of the masked pixels with both depths (H, W) [m] whose `depth` is nearer by more than IN_FRONT.
+    """Share of masked pixels whose `depth` is nearer than the reference by IN_FRONT.
 
-    nan where no pixel has both.
+    nan without a pixel with both depths.
     """
     both = mask & (depth > 0) & (reference > 0)
     return float(np.mean(depth[both] < reference[both] - IN_FRONT)) if both.any() else math.nan
 
 
 def metric_names() -> tuple[str, ...]:
-    """The names that `total_score` can have, known before anything is scored; those of a mask only where one was
-    given.
-    """
+    """All possible names of `total_score`; a mask's occur only with one."""
     return tuple(metric_scales())
 
 
 def metric_scales() -> dict[str, Scale]:
-    """How two runs are compared by each of `metric_names`."""
+    """Scales of `metric_names` for comparing runs."""
     of_regions = {f"{name}_{region}": scale for region in REGIONS for name, scale in REGION.items()}
     return {
         **dict.fromkeys(("num_views", "valid_share", "seen_share", "mask_share"), DESCRIBES),
@@ -218,10 +214,7 @@ def metric_scales() -> dict[str, Scale]:
 
 
 def total_score(views: Sequence[ViewScore]) -> dict[str, float]:
-    """Each figure's mean over the views that have it, by name; nan where no view has.
-
-    Raises NotEvaluableError when there is no view.
-    """
+    """Each figure's mean over views that have it, or nan. Raises NotEvaluableError without a view."""
     if not views:
         raise NotEvaluableError("no view was scored: expected at least one, got 0")
     rows = [view.figures() for view in views]
@@ -233,5 +226,5 @@ def total_score(views: Sequence[ViewScore]) -> dict[str, float]:
 
 
 def as_json(figures: dict[str, float]) -> dict[str, Any]:
-    """The same figures with None for what is not a finite number, which JSON cannot hold."""
+    """The figures, None if not finite."""
     return {name: value if math.isfinite(value) else None for name, value in figures.items()}

@@ -1,8 +1,7 @@
-"""What a score concludes from its figures: means over scans, changes since an earlier score, the verdict; and what
-speaks against it: masks turned inside out, views that trained, pictures that belong to other poses.
+"""Conclusions from a score: means over scans, changes, verdict and doubts.
 
-A report is what ``score.json`` holds: ``metrics`` by flat name, ``protocol``, ``warnings``, and ``views``, or
-``results`` by scan.
+A report is ``score.json``: ``metrics`` by flat name, ``protocol``, ``warnings``, and ``views``, or ``results`` by
+scan.
 """
 
 import json
@@ -42,7 +41,7 @@ NAMES_WITH_CHANGES = (*NAMES, *(PREFIX + name for name in NAMES))  # since a bas
 
 
 def read_baseline(path: Path) -> dict[str, Any]:
-    """The report of an earlier score. Raises InputError where the file is not a score."""
+    """An earlier score's report. Raises InputError for another file."""
     try:
         earlier = json.loads(path.read_text(encoding="utf-8"))
         if isinstance(earlier["metrics"], dict) and isinstance(earlier["protocol"], dict):
@@ -55,7 +54,7 @@ def read_baseline(path: Path) -> dict[str, Any]:
 
 
 def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
-    """New less old of each figure, None where either is; raises InputError where they came about differently."""
+    """New minus old figures, None if either is. Raises InputError if not comparable."""
     earlier = read_baseline(path)
     now, then = ({**one["protocol"], "scans": one.get("scans")} for one in (report, earlier))
     for name in COMPARED:
@@ -72,7 +71,7 @@ def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
 
 
 def report_of_scans(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The means over the scans of what each scan's `results` hold; a figure that one of them lacks is None."""
+    """Means over the scans; None for a figure missing in one."""
     each, scans = list(results.values()), list(results)
     metrics = {
         name: (sum_of if name in SUMS else mean_of)([one["metrics"].get(name) for one in each])
@@ -90,19 +89,19 @@ def report_of_scans(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def sum_of(values: Sequence[float | None]) -> float | None:
-    """None where any is missing."""
+    """The sum; None if any value is missing."""
     known = [value for value in values if value is not None]
     return sum(known) if len(known) == len(values) else None
 
 
 def mean_of(values: Sequence[float | None]) -> float | None:
-    """None where any is missing."""
+    """The mean; None if any value is missing."""
     total = sum_of(values)
     return None if total is None else total / len(values)
 
 
 def _common(protocols: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What the scans were scored by: where they differ, each of it."""
+    """The scans' common protocol; differing values are joined."""
     first = protocols[0]
     common = {}
     for name, value in first.items():
@@ -113,7 +112,7 @@ def _common(protocols: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def other_scans(protocol: Mapping[str, Any], scans: Sequence[str]) -> list[str]:
-    """In words, how these scans differ from those of the published mean."""
+    """Warning of scans that differ from the published mean's."""
     published = protocol["published_scans"]
     missing = [number for number in published or () if f"scan{number}" not in scans]
     others = [name for name in scans if name not in {f"scan{number}" for number in published or ()}]
@@ -125,7 +124,7 @@ def other_scans(protocol: Mapping[str, Any], scans: Sequence[str]) -> list[str]:
 
 
 def score_verdict(report: Mapping[str, Any], require: Sequence[str], *, is_damaged: bool) -> Verdict:
-    """The verdict on a report: that there are views, what speaks against its figures, and each gate."""
+    """The verdict on a report: views, warnings, and gates."""
     metrics, counts = report["metrics"], counts_of(report)
     num_views, num_scans = metrics["num_views"], metrics.get("num_scans")
     compared = Reason(
@@ -143,7 +142,7 @@ def score_verdict(report: Mapping[str, Any], require: Sequence[str], *, is_damag
 
 
 def counts_of(report: Mapping[str, Any]) -> dict[str, int]:
-    """How many views each metric rests on: those that have the figure; of a change, those of the metric now."""
+    """The number of views behind each metric or change."""
     metrics = report["metrics"]
     each = [report] if "views" in report else list(report["results"].values())
     views = [view for one in each for view in one["views"]]
@@ -160,10 +159,9 @@ THUMBNAIL = (16, 12)  # pixels
 
 @dataclass(kw_only=True)
 class Doubts:
-    """Gathers what is odd while views are scored.
+    """Collected oddities of views: inverted masks, training views, wrong poses.
 
-    is_still: nothing moves, so that every view has its one picture; may_train: views that trained are scored on
-    purpose.
+    is_still: a static scene, with one picture per view; may_train: training views are scored on purpose.
     """
 
     is_still: bool
@@ -176,9 +174,9 @@ class Doubts:
     _twins: list[str] = field(default_factory=list)
 
     def look(self, view: View, render: NDArray[np.floating], mask: Bool | None) -> None:
-        """Take in a view, its render (H, W, 3) in [0, 1] and the pixels (H, W) of its mask.
+        """Check a view, its render (H, W, 3) in [0, 1] and mask (H, W).
 
-        Raises InputError for a mask without a pixel: the mean would be over other views than the protocol's.
+        Raises InputError for an empty mask: the mean would miss a view.
         """
         if mask is not None and not mask.any():
             raise InputError(
@@ -195,7 +193,7 @@ class Doubts:
         self._renders.append(_thumbnail(np.clip(render, 0.0, 1.0)))
 
     def lines(self) -> list[str]:
-        """Each doubt in words, with its figure and what to look at."""
+        """A sentence per doubt, with its figure."""
         lines = []
         if self._masks:
             lines.append(
@@ -241,7 +239,7 @@ def _thumbnail(image: NDArray[np.floating]) -> Float64:
 
 
 def _strangers(names: Sequence[str], photos: Sequence[Float64], renders: Sequence[Float64]) -> list[str]:
-    """Views whose photo is clearly nearer the render of another view than its own."""
+    """Views whose photo is clearly nearer another's render."""
     if len(names) < 2:
         return []
     x, y = np.stack(photos), np.stack(renders)

@@ -1,4 +1,4 @@
-"""What a judging command concludes: one outcome, and each criterion that it rests on; requirements on metrics."""
+"""Verdicts of judging commands: outcome and criteria; requirements on metrics."""
 
 import inspect
 import math
@@ -16,7 +16,7 @@ E = TypeVar("E")  # what a criterion looks at
 
 
 class Outcome(StrEnum):
-    """What evidence says of a claim."""
+    """Result of a claim, given the evidence."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -30,12 +30,11 @@ _WORST_FIRST = (Outcome.FAILED, Outcome.NOT_EVALUABLE, Outcome.PASSED)  # a defi
 
 @dataclass(frozen=True, kw_only=True)
 class Reason:
-    """What one criterion found; `criterion` is empty until `Criterion.reasons` names it.
+    """One criterion's finding; `Criterion.reasons` names its `criterion`.
 
-    value and threshold in `unit`, None where there is none; time_s: when [s], counted as in the output's files;
-    place (3,): where [m], world; who: the link, sphere, joint or camera; cause: what is there; remedy: what a person
-    can do. count: how many states, views or points the value rests on. label: what the outcome is called where this
-    decides it, such as "contact". is_note: worth a line though it decides nothing.
+    value, threshold: in `unit`, or None. time_s [s]: as in the output's files. place (3,) [m]: world. who: link,
+    sphere, joint or camera. cause: what is there. remedy: for the user. count: states, views or points behind the
+    value. label: the outcome's name if this decides, such as "contact". is_note: worth a line, decides nothing.
     """
 
     criterion: str = ""
@@ -54,7 +53,7 @@ class Reason:
     is_note: bool = False
 
     def __str__(self) -> str:
-        """The sentence with when, who, what, where and the remedy."""
+        """The sentence with when, cause and remedy."""
         when = "" if self.time_s is None else f" at {self.time_s:.2f} s"
         near = f", {self.cause}" if self.cause else ""
         remedy = f"; {self.remedy}" if self.remedy else ""
@@ -69,16 +68,16 @@ note = partial(Reason, outcome=Outcome.PASSED, is_note=True)
 
 
 def held(sentence: str, value: float, threshold: float, unit: str, count: int) -> Reason:
-    """The criterion holds, which is not worth a line."""
+    """A passed criterion, not worth a line."""
     return Reason(outcome=Outcome.PASSED, sentence=sentence, value=value, threshold=threshold, unit=unit, count=count)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Criterion(Generic[E]):
-    """One thing that a verdict asks of what a command found.
+    """One criterion of a verdict.
 
-    find: its reasons, none where it does not apply; what it asks is the first paragraph of its docstring. broken:
-    what it comes to where that does not hold, as the documentation's table has it.
+    find: its reasons, if it applies; its docstring's first paragraph enters the documentation's table. broken: that
+    table's cell on a violation.
     """
 
     name: str
@@ -86,23 +85,22 @@ class Criterion(Generic[E]):
     broken: str
 
     def reasons(self, found: E) -> Iterator[Reason]:
-        """With its name, unless they have a narrower one of their own."""
+        """Its reasons, under its name unless they have one."""
         return (replace(reason, criterion=reason.criterion or self.name) for reason in self.find(found))
 
     @property
     def docs(self) -> str:
-        """The row of the table, its cells separated by |."""
+        """The table's row, its cells separated by |."""
         asked = " ".join((inspect.getdoc(self.find) or "").split("\n\n")[0].split()).removesuffix(".")
         return f"{self.name} | {asked[0].lower()}{asked[1:]} | {self.broken}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """The outcome of a command and its reasons: those that decided it first.
+    """The outcome of a command and its reasons, deciding ones first.
 
-    label: the outcome in the command's own word, such as "safe"; scope: what was judged; notes: what a person should
-    know and that decides nothing. is_damaged: part of the input was lost. counts: how many states, views or points
-    each metric of the command rests on. how: a word on how it passed, such as "proven" or "waived".
+    label: the outcome in the command's word, such as "safe"; how: such as "proven" or "waived"; scope: what was
+    judged; notes: decide nothing. is_damaged: part of the input was lost. counts: states, views or points by metric.
     """
 
     command: str
@@ -120,11 +118,11 @@ class Verdict:
 
     @property
     def exit_code(self) -> int:
-        """1 failed, 5 not evaluable; passed 0, or 3 where part of the input was lost."""
+        """0 passed, 1 failed, 3 passed on damaged input, 5 not evaluable."""
         return EXIT_CODES[self.outcome] or (DAMAGED if self.is_damaged else 0)
 
     def exit_code_of(self, criteria: tuple[str, ...] | None) -> int:
-        """`exit_code` of the reasons alone whose criterion begins with one of `criteria` (None: of all)."""
+        """`exit_code` by criteria that begin with one of `criteria` (None: all)."""
         if criteria is None:
             return self.exit_code
         asked = [reason.outcome for reason in self.reasons if reason.criterion.startswith(criteria)]
@@ -132,12 +130,12 @@ class Verdict:
 
     @property
     def decisive(self) -> tuple[Reason, ...]:
-        """The reasons that are not passed, those of the outcome first."""
+        """The reasons not passed, the outcome's first."""
         return tuple(reason for reason in self.reasons if reason.outcome is not Outcome.PASSED)
 
     @property
     def said(self) -> tuple[Reason, ...]:
-        """The reasons that passed and are worth a line."""
+        """Passed reasons worth a line."""
         return tuple(reason for reason in self.reasons if reason.is_note and reason.outcome is Outcome.PASSED)
 
     @property
@@ -153,7 +151,7 @@ class Verdict:
         return f"{self.command}: {self.label.upper()}{scope}: {self.decisive[0]}{others}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; numbers that are not finite are None."""
+        """Plain values for JSON; non-finite numbers are None."""
         return {
             "outcome": str(self.outcome),
             "label": self.label,
@@ -179,11 +177,9 @@ def verdict_of(
     is_damaged: bool = False,
     counts: Mapping[str, int] | None = None,
 ) -> Verdict:
-    """The verdict that reasons make: failed where any failed, else not evaluable where any is, else passed.
+    """The verdict: failed if any reason failed, else not evaluable if any is, else passed.
 
-    Without a single reason nothing was judged, which is not evaluable. passed: the label of a verdict that passed,
-    how: a word on how.
-    The label of a failure is the first given by `Reason.label` in the order of the reasons.
+    Without any reason it is not evaluable. passed: the label when passed; a failure takes the first `Reason.label`.
     """
     given = list(reasons)
     if not given:
@@ -207,12 +203,12 @@ def verdict_of(
 
 
 def damage_mark(sentence: str | None, exit_code: int | None) -> str:
-    """Say of a run in a table that its recording is damaged: a word after its label, or nothing."""
+    """The word ", damaged" for a run of a damaged recording, else nothing."""
     return ", damaged" if exit_code == DAMAGED or DAMAGE in (sentence or "") else ""
 
 
 def brief(result: Any) -> str:
-    """Represent a result in a few lines: its verdict, values that are short, and of the others type and size."""
+    """A result in a few lines: long values by type and size."""
     shown = []
     for name, value in ((each.name, getattr(result, each.name)) for each in fields(result)):
         text, size = repr(value), f" of {len(value)}" if isinstance(value, Sized) else ""
@@ -248,9 +244,9 @@ _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": ope
 def check_gate_names(
     requirements: Sequence[str], names: Collection[str], elsewhere: Mapping[str, Collection[str]] | None = None
 ) -> None:
-    """Raise UsageError for a requirement on a metric that is not among `names`; to be called before the work.
+    """Raise UsageError for a metric not in `names`, before the work.
 
-    elsewhere: the metrics that other options would give, by those options.
+    elsewhere: metrics of other options, by those options.
     """
     for requirement in requirements:
         name, _, _ = parse_gate(requirement)
@@ -269,11 +265,9 @@ def gate_reasons(
     *,
     first_time: "FirstTime | None" = None,
 ) -> list[Reason]:
-    """A reason for each requirement: passed, failed, or not evaluable where its metric has no finite value or rests
-    on nothing.
+    """A reason per requirement: passed, failed, or not evaluable without a finite value or count.
 
-    counts: how many states, views or points each metric rests on. first_time gives the first time [s] at which a
-    metric's own states break a requirement, None where it has none.
+    counts: states, views or points by metric. first_time: first time [s] of a violating state, or None.
     """
     check_gate_names(requirements, metrics)
     reasons = []
@@ -305,7 +299,7 @@ def _holds(comparison: str, bound: float, value: float) -> bool:
 
 
 def gate(text: str) -> str:
-    """`text` itself, for argparse. Raises UsageError where it is not a requirement."""
+    """`text` itself, for argparse, else UsageError."""
     parse_gate(text)
     return text
 

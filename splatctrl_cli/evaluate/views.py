@@ -1,6 +1,4 @@
-"""The views of a recording that are scored, what the training cameras had seen by then, which points a camera saw;
-and how near one image is to another.
-"""
+"""Views to score, visibility by training cameras, and similarity of images."""
 
 import math
 from collections import Counter
@@ -19,10 +17,10 @@ from splatctrl_cli.records import Bool, Float32, Float64, Index, RecordSource, R
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A frame to score, its name, and the training frames that count as known at its time.
+    """A frame to score, its name, and the training frames known at its time.
 
-    The name is the camera and a number: with a clock among the camera's frames, without one among all views, or the
-    stamp where stamps are the views' own numbers.
+    The name is the camera and a number: within the camera's frames with a clock, among all views without, or the
+    stamp.
     """
 
     name: str
@@ -41,9 +39,8 @@ def views_to_score(
 ) -> Iterator[View]:
     """The frames of the `scoring` cameras in time order.
 
-    With a clock, what counts is the newest frame of each training camera not later than the view (a frame of the same
-    stamp counts); without one, every training frame of the recording, which is then read twice. corrected: a frame at
-    the pose, exposure and depth that the scene was trained with.
+    With a clock, each training camera's newest frame up to the view's stamp is known; without, every training frame,
+    in two passes. corrected: a frame with training's pose, exposure and depth.
     """
     if not has_clock:
         known = tuple(corrected(frame) for frame in frames_of(source) if frame.camera in training)
@@ -65,7 +62,6 @@ def views_to_score(
 
 
 def _name(camera: str, number: int) -> str:
-    """``cam3-0000``: fit for a file name."""
     return f"{camera.strip('/').replace('/', '_')}-{number:04d}"
 
 
@@ -75,7 +71,6 @@ def frames_of(source: RecordSource) -> Iterator[RgbdFrame]:
 
 
 def _moments(source: RecordSource) -> Iterator[list[RgbdFrame]]:
-    """Frames of the same stamp, together."""
     moment: list[RgbdFrame] = []
     for frame in frames_of(source):
         if moment and frame.stamp_ns != moment[0].stamp_ns:
@@ -87,10 +82,9 @@ def _moments(source: RecordSource) -> Iterator[list[RgbdFrame]]:
 
 
 def seen_by(points_world: NDArray[np.floating], frames: Iterable[RgbdFrame], tolerance: float = 0.02) -> Bool:
-    """(Q,) True where a point (Q, 3) [m] is on a surface that one of the frames measured.
+    """(Q,) True where a frame measured a surface at a point (Q, 3) [m].
 
-    The point falls on a pixel of the frame (the nearest), and that pixel has a depth within `tolerance` [m] of the
-    point's own depth: neither hidden behind something else, nor in the free space before it.
+    The nearest pixel's depth agrees within `tolerance` [m]: neither occluded nor in free space.
     """
     seen = np.zeros(len(points_world), dtype=np.bool_)
     for frame in frames:
@@ -102,16 +96,13 @@ def seen_by(points_world: NDArray[np.floating], frames: Iterable[RgbdFrame], tol
 
 
 def surface_points(frame: RgbdFrame) -> tuple[Float64, Bool]:
-    """The world points (Q, 3) [m] of a frame's pixels that have a depth, and where those pixels are (H, W)."""
+    """World points (Q, 3) [m] of pixels with depth, and their mask (H, W)."""
     valid = frame.depth > 0
     return transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[valid]), valid
 
 
 def seen_pixels(frame: RgbdFrame, others: Sequence[RgbdFrame], tolerance: float = 0.02) -> Bool:
-    """(H, W) True where the frame's own depth lies on a surface that one of the `others` measured.
-
-    The nearest cameras are asked first: they saw most of it, and what was seen is not asked again.
-    """
+    """(H, W) True where one of `others` measured the frame's surface, nearest cameras first."""
     points_world, seen = surface_points(frame)
     center = frame.T_world_camera[:3, 3]
     nearest = sorted(others, key=lambda other: float(np.linalg.norm(other.T_world_camera[:3, 3] - center)))
@@ -127,7 +118,7 @@ def _agrees(points_world: NDArray[np.floating], frame: RgbdFrame, tolerance: flo
 
 
 def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tuple[Index, Float64, Float32]:
-    """The points (K,) of Q that land on the frame's image, their own depth (K,) [m], and what was measured there."""
+    """Indices (K,) of points (Q, 3) in the image, their depth, and the measured."""
     points_camera = transform_points(invert_transform(frame.T_world_camera), points_world)
     landing = np.flatnonzero(points_camera[:, 2] > 1e-6)
     pixels = np.floor(project(frame.intrinsics, points_camera[landing]) + 0.5)
@@ -140,9 +131,9 @@ def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tupl
 
 @dataclass(frozen=True, kw_only=True)
 class DepthErrors:
-    """Absolute depth errors over `num_pixels` pixels where both images have a depth; nan where there are none.
+    """Absolute depth errors where both images have depth; nan without any.
 
-    median, mean, p90 [m]; within_1cm and within_2cm are shares of those pixels.
+    median, mean, p90 [m]; within_1cm and within_2cm are shares.
     """
 
     num_pixels: int
@@ -154,10 +145,9 @@ class DepthErrors:
 
 
 def psnr(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool | None = None) -> float:
-    """Peak signal-to-noise ratio [dB] for a peak of 1: ``-10 log10(mean squared error)`` of the masked pixels.
+    """Peak signal-to-noise ratio [dB] for a peak of 1: ``-10 log10(mean squared error)``.
 
-    image, reference (H, W, 3) in [0, 1]; mask (H, W), None = all. Pixels outside the mask count in neither sum nor
-    share. Identical images give inf, an empty mask nan.
+    image, reference (H, W, 3) in [0, 1]; mask (H, W). inf for identical images, nan for an empty mask.
     """
     squared = np.square(image.astype(np.float64) - reference)
     selected = squared if mask is None else squared[mask]
@@ -170,11 +160,11 @@ def psnr(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Boo
 def ssim_map(
     image: NDArray[np.floating], reference: NDArray[np.floating], *, is_zero_padded: bool = False
 ) -> Float64:
-    """Structural similarity (H, W, 3) per pixel and channel of images (H, W, 3) in [0, 1] (Wang et al. 2004).
+    """Structural similarity (H, W, 3) of images in [0, 1] (Wang et al. 2004).
 
-    Gaussian window 11×11, sigma 1.5, C1 = 0.01², C2 = 0.03², population moments; at the border the image is mirrored
-    with its edge pixel repeated, or continued with zeros, as 3D Gaussian splatting has it
-    (graphdeco-inria/gaussian-splatting, utils/loss_utils.py), which hides errors there.
+    Gaussian window 11×11, sigma 1.5, C1 = 0.01², C2 = 0.03², population moments. The border is mirrored with its edge
+    pixel. Zero-padding, as in 3D Gaussian splatting (graphdeco-inria/gaussian-splatting, utils/loss_utils.py), hides
+    errors there.
     """
     x, y = image.astype(np.float64), np.asarray(reference, dtype=np.float64)
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = (
@@ -188,12 +178,11 @@ def ssim_map(
 
 
 def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool, fill: float) -> float:
-    """SSIM of images (H, W, 3) in [0, 1] that are `fill` outside the mask (H, W), as NeRF's papers print it.
+    """SSIM of images in [0, 1], `fill` outside the mask, as in NeRF's papers.
 
-    They call scikit-image with its defaults (skimage/metrics/_structural_similarity.py before 0.20): box window of
-    7 pixels, sample moments, the data range of floats taken as 2, and a border of 3 pixels left out of the mean.
-    That range lifts the figure: compare it only with figures of the same kind. nan for images below 7 pixels and for
-    an empty mask.
+    scikit-image's default (skimage/metrics/_structural_similarity.py before 0.20): box window of 7 pixels, sample
+    moments, data range 2 for floats, 3 border pixels left out. That range lifts the figure: compare only within its
+    kind. nan below 7 pixels, or for an empty mask.
     """
     if min(mask.shape) < SSIM_BOX or not mask.any():
         return math.nan
@@ -214,7 +203,7 @@ def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating],
 def depth_errors(
     depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool | None = None
 ) -> DepthErrors:
-    """Errors of `depth` (H, W) [m] against `reference` (H, W) [m] where both are above 0 and the mask holds."""
+    """Errors of `depth` [m] against `reference` [m], where both are above 0 in the mask."""
     both = (depth > 0) & (reference > 0)
     if mask is not None:
         both &= mask
@@ -235,7 +224,6 @@ _DEPTH_FIGURES = ("median", "mean", "p90", "within_1cm", "within_2cm")
 
 
 def _window_mean(image: Float64, border: Literal["reflect", "constant"]) -> Float64:
-    """The Gaussian-weighted mean of each pixel's window, rows then columns."""
     offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
     weights = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
     weights /= weights.sum()

@@ -1,4 +1,4 @@
-"""The moments of least clearance, drawn over the camera image of that time."""
+"""Moments of least clearance, drawn over the camera image."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -22,10 +22,9 @@ INK, PAPER = (34, 34, 34), (255, 255, 255)
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """What is drawn: spheres (S, 3) [m], world, and radii (S,) [m] at a stamp; the worst of them; the nearest surface
-    point (3,) of an obstacle, NaN where none is known; the lines of text under the image.
+    """Spheres (S, 3), radii (S,) [m], world, and the worst of them, to draw.
 
-    is_moving (S,): whether a joint moves a sphere.
+    obstacle (3,): nearest surface point, or NaN. caption: lines under the image. is_moving (S,): moved by a joint.
     """
 
     stamp_ns: int
@@ -46,13 +45,14 @@ class Sight:
 
     @property
     def age_s(self) -> float:
-        """By how much [s] the image is older than the moment."""
+        """Age [s] of the image."""
         return (self.moment.stamp_ns - self.frame.stamp_ns) * 1e-9
 
 
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
-    """Indices of at most `num` states with least clearance (T,), the least first: each the least within `APART` on
-    either side, so that the flank of an event is not another one. NaN does not count.
+    """Indices of at most `num` states with least clearance (T,), ascending.
+
+    Each is the least within `APART`, so that an event counts once. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
     beside = np.concatenate([[np.inf], values, [np.inf]])
@@ -71,9 +71,9 @@ def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> 
 
 
 def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Sight | None]:
-    """For each moment the newest image not later of the camera that sees its worst sphere best, None without any.
+    """The newest image up to each moment that best shows its worst sphere, or None.
 
-    One pass over the frames (by stamp), which ends with the last moment; of each camera one frame is held.
+    One pass over frames (by stamp), one kept per camera.
     """
     found: list[Sight | None] = [None] * len(moments)
     waiting = sorted(range(len(moments)), key=lambda i: -moments[i].stamp_ns)
@@ -91,7 +91,7 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
 
 
 def draw_sight(path: Path, sight: Sight) -> None:
-    """Write the image with every sphere's outline, the worst one bold, a line to its obstacle, and the caption."""
+    """Write the image with silhouettes, the worst bold, a line to its obstacle, and caption."""
     moment, frame = sight.moment, sight.frame
     zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
     image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
@@ -119,9 +119,7 @@ def _best(moment: Moment, newest: dict[str, RgbdFrame]) -> Sight | None:
 
 
 def _view(moment: Moment, frame: RgbdFrame) -> tuple[int, int, float]:
-    """How well an image shows the worst sphere: whether it and its obstacle are in it, whether nothing hides the
-    sphere, and how large it is [px].
-    """
+    """Rank: sphere and obstacle in view, not occluded, size [px]."""
     R, t = frame.T_world_camera[:3, :3], frame.T_world_camera[:3, 3]
     sphere, obstacle = ((point - t) @ R for point in (moment.centers[moment.worst], moment.obstacle))
     radius = float(moment.radii[moment.worst])
@@ -134,7 +132,7 @@ def _view(moment: Moment, frame: RgbdFrame) -> tuple[int, int, float]:
 
 
 def _cell(point: Float64, intrinsics: Intrinsics) -> tuple[int, int] | None:
-    """Row and column of a point in camera coordinates; None outside the image."""
+    """Row and column of a point, camera frame; None outside."""
     if not np.isfinite(point).all() or point[2] <= NEAR:
         return None
     column, row = (round(float(v)) for v in _pixel(point, intrinsics, 1))
@@ -142,7 +140,7 @@ def _cell(point: Float64, intrinsics: Intrinsics) -> tuple[int, int] | None:
 
 
 def _pixel(point: Float64, intrinsics: Intrinsics, zoom: int) -> Float64:
-    """(2,) column and row of a point before the camera, in an image that is enlarged by `zoom`."""
+    """(2,) column and row of a point, enlarged by `zoom`."""
     plane = np.array([intrinsics.fx, intrinsics.fy]) * point[:2] / point[2] + [intrinsics.cx, intrinsics.cy]
     return np.asarray((plane + 0.5) * zoom - 0.5)
 
@@ -156,7 +154,6 @@ def _outline(
     color: tuple[int, int, int],
     thickness: int,
 ) -> None:
-    """The silhouette of a sphere: the circle in which its tangent cone from the camera touches it, projected."""
     away = float(np.linalg.norm(center))
     if center[2] - radius <= NEAR:
         return
@@ -174,14 +171,12 @@ def _outline(
 
 
 def _surface(center: Float64, obstacle: Float64, moment: Moment) -> Float64:
-    """The sphere's surface point towards the obstacle, in camera coordinates."""
     offset = obstacle - center
     length = max(float(np.linalg.norm(offset)), 1e-9)
     return np.asarray(center + offset * (moment.radii[moment.worst] / length))
 
 
 def _join(picture: UInt8, start: Float64, end: Float64) -> None:
-    """A line from the sphere to the obstacle's nearest point, which is marked."""
     a, b = (tuple(int(v) for v in np.round(point)) for point in (start, end))
     for color, thickness in ((INK, 4), (POINT, 2)):
         cv2.line(picture, a, b, color, thickness, cv2.LINE_AA)
@@ -190,7 +185,6 @@ def _join(picture: UInt8, start: Float64, end: Float64) -> None:
 
 
 def _captioned(lines: Sequence[str], width: int) -> UInt8:
-    """The lines of text on a strip of paper, made smaller where one is too long."""
     strip = np.full((LINE_HEIGHT * len(lines) + 2 * EDGE, width, 3), PAPER, np.uint8)
     for number, line in enumerate(lines):
         (length, _), _ = cv2.getTextSize(line, FONT, FONT_SCALE, 1)

@@ -1,6 +1,4 @@
-"""Pictures of a baked field for its report: slices through a point, its gradient, the probability of collision and
-how reliable that is.
-"""
+"""Pictures of a baked field: slices, gradient, collision probability and its reliability."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -34,7 +32,7 @@ BAR, MARK = "#0072b2", "#d55e00"
 
 @dataclass(frozen=True, kw_only=True)
 class Cut:
-    """A plane of cells across `axis`, every `step`-th of them along its sides; coordinates [m] of those."""
+    """Every `step`-th cell of a plane across `axis`, with coordinates [m]."""
 
     axis: int
     index: int
@@ -44,16 +42,16 @@ class Cut:
     voxel: float
 
     def of(self, grid: DistanceGrid, channel: str) -> Float64:
-        """The channel in the plane as a picture has it: rows upwards along the later axis."""
+        """The channel in the plane, rows upwards."""
         where: list[Any] = [slice(None, None, self.step)] * 3
         where[self.axis] = self.index
         return np.asarray(np.swapaxes(grid.channels[channel][tuple(where)], 0, 1), np.float64)
 
 
 def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
-    """Write three slices of `sdf` through the cell nearest to `point` [m], across z, y and x.
+    """Write slices of `sdf` through the cell at `point` [m], across z, y and x.
 
-    Contour lines at 0, 2, 5 and 10 cm; space that no camera saw is veiled and hatched.
+    Contour lines at 0, 2, 5 and 10 cm; never-seen space is veiled and hatched.
     """
     with _panels(grid, point) as (figure, panels):
         for axes, cut in panels:
@@ -71,7 +69,7 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
 
 
 def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
-    """Write three slices of `probability` through the cell nearest to `point` [m]; the surface as a line."""
+    """Write slices of `probability` through the cell at `point` [m], with the surface."""
     with _panels(grid, point) as (figure, panels):
         for axes, cut in panels:
             image = axes.imshow(
@@ -92,10 +90,10 @@ def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) 
 def gradient_picture(
     path: Path, grid: DistanceGrid, histogram: Sequence[int], bin_width: float, point: Sequence[float]
 ) -> None:
-    """Write the length of the gradient in a slice across z, and how many cells of the grid have which length.
+    """Write the gradient's length in a slice across z, and its histogram over the grid.
 
-    histogram: cells by length, bin k about k times `bin_width`, the last with all that is longer. A distance has
-    length 1 (Eikonal equation).
+    histogram: cells by length, bin k about k times `bin_width`, the last for all longer. A distance has length 1
+    (Eikonal equation).
     """
     (cut,) = _cuts(grid, point, axes=(2,))
     sides = [float(np.ptp(c)) + cut.voxel for c in cut.coordinates]
@@ -145,7 +143,7 @@ def _draw_histogram(axes: Any, histogram: Sequence[int], bin_width: float) -> No
 def _panels(
     grid: DistanceGrid, point: Sequence[float]
 ) -> Iterator[tuple["mpl.figure.Figure", list[tuple[Any, Cut]]]]:
-    """Axes for the slices across z, y and x, side by side at one scale."""
+    """Axes for slices across z, y and x, at one scale."""
     cuts = _cuts(grid, point, axes=(2, 1, 0))
     sides = np.array([[float(np.ptp(c)) + cut.voxel for c in cut.coordinates] for cut in cuts])
     height = float(np.clip((WIDTH - 3.2) * sides[:, 1].max() / sides[:, 0].sum() + 1.5, 3.2, 9.0))
@@ -157,7 +155,6 @@ def _panels(
 
 
 def _cuts(grid: DistanceGrid, point: Sequence[float], *, axes: Sequence[int]) -> list[Cut]:
-    """The planes through the cell nearest to `point`, in the grid."""
     shape = grid.channels["sdf"].shape
     cuts = []
     for axis in axes:
@@ -179,12 +176,11 @@ def _label(axes: Any, cut: Cut) -> None:
 
 
 def _knows_seen(grid: DistanceGrid) -> bool:
-    """Whether somebody looked: without an occupancy grid every cell is never seen, which tells nothing."""
+    """True with an occupancy grid; else every cell is never seen."""
     return "observed" in grid.channels and "no occupancy" not in str(grid.header.get("observed"))
 
 
 def _surface(axes: Any, cut: Cut, grid: DistanceGrid, color: str) -> None:
-    """The line where sdf is 0."""
     sdf = cut.of(grid, "sdf")
     known = sdf[np.isfinite(sdf)]
     if known.size and known.min() < 0 < known.max() and min(sdf.shape) > 1:
@@ -193,8 +189,9 @@ def _surface(axes: Any, cut: Cut, grid: DistanceGrid, color: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Reliability:
-    """Of B bins of predicted probability: edges (B + 1,), mean prediction (B,) and share that collided (B,), NaN in
-    an empty bin, count (B,); calibration_error is the mean of their difference, weighted by count.
+    """B bins of probability: edges (B + 1,), mean prediction, collided share, count (B,).
+
+    Empty bins have NaN. calibration_error: mean |predicted - observed|, weighted by count.
     """
 
     edges: Float64
@@ -205,7 +202,7 @@ class Reliability:
 
 
 def reliability(probability: Float64, is_colliding: Bool, bins: int = 10) -> Reliability:
-    """How often points (Q,) of a predicted probability do collide; bins equal in width.
+    """Collision rates of points (Q,) by predicted probability.
 
     Raises NotEvaluableError without points, UsageError for a probability outside [0, 1].
     """
@@ -231,9 +228,9 @@ def reliability(probability: Float64, is_colliding: Bool, bins: int = 10) -> Rel
 
 
 def reliability_picture(path: Path, curves: Mapping[str, Reliability], title: str = "Reliability") -> None:
-    """Write the share that collided over the predicted probability, a curve a form, and how many points each bin has.
+    """Write collided share over predicted probability by form, and points per bin.
 
-    A probability that means what it says lies on the diagonal.
+    A calibrated probability lies on the diagonal.
     """
     with drawn_figure(5.6) as figure:
         axes, bars = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1, 1]})

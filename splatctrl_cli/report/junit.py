@@ -1,5 +1,6 @@
-"""What CI systems are told of commands: a suite for each recording, a case for each criterion and gate, as JUnit XML,
-which GitLab, Jenkins and others show beside a run, and as annotations and a table on GitHub.
+"""Reports for CI: JUnit XML (GitLab, Jenkins), and annotations and a table on GitHub.
+
+Recordings are suites; criteria and gates are cases.
 """
 
 import os
@@ -16,7 +17,7 @@ from splatctrl_cli.files.output import output_path
 
 
 class Kind(StrEnum):
-    """How a case ended; the worst first."""
+    """Outcome of a case, worst first."""
 
     FAILED = "failed"
     ERROR = "error"
@@ -37,8 +38,9 @@ WORDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One criterion or gate. group: recording and command, which with the name tells it from all others; sentence:
-    what was found, in one line; text: all of it; seconds: 0 where it has no time of its own.
+    """One criterion or gate. group: recording and command, unique with the name.
+
+    sentence: the finding in one line; text: in full; seconds: 0 if not timed.
     """
 
     name: str
@@ -51,7 +53,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """The cases of one recording. path: its file or folder; notes: lines that decide nothing; started: ISO 8601."""
+    """A recording's cases. path: file or folder; notes: decide nothing; started: ISO 8601."""
 
     name: str
     cases: Sequence[Case]
@@ -62,14 +64,14 @@ class Suite:
     seconds: float = 0.0
 
     def count(self, *kinds: Kind) -> int:
-        """How many cases are of these kinds."""
+        """The number of cases of these kinds."""
         return sum(case.kind in kinds for case in self.cases)
 
 
 def cases_of(verdict: Mapping[str, Any], group: str, *, expected: str = "passed") -> list[Case]:
-    """A case for each criterion of a verdict, as `Verdict.as_dict` and the JSON of a command have it.
+    """A case per criterion of a verdict (`Verdict.as_dict`, or a command's JSON).
 
-    expected: the outcome that is right. Where another than "passed" was expected and came, every case passes.
+    expected: the right outcome; if it occurs and is not "passed", every case passes.
     """
     by_criterion: dict[str, list[Mapping[str, Any]]] = {}
     for reason in verdict["reasons"]:
@@ -87,14 +89,15 @@ def cases_of(verdict: Mapping[str, Any], group: str, *, expected: str = "passed"
 
 
 def damage_case(group: str) -> Case:
-    """The case of a damaged recording: it says why the exit code is not 0 where everything else passed."""
+    """The case of a damaged recording, to explain a nonzero exit code."""
     text = f"{DAMAGE} (exit code {DAMAGED}); splatctrl check says which"
     return Case(name="recording", group=group, kind=Kind.ERROR, sentence=text, text=text)
 
 
 def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[str] = ()) -> Case:
-    """The only case of a command that did not come to a verdict, without an exit code where it was killed; `line` is
-    what it said, `lines` the end of its log.
+    """The only case of a command without verdict; exit_code None if killed.
+
+    line: its message; lines: the end of its log.
     """
     name = "killed" if exit_code is None else WORDS.get(exit_code, "error")
     text = "\n".join([line, *lines, *([] if exit_code is None else [f"exit code: {exit_code}"])])
@@ -102,23 +105,22 @@ def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[
 
 
 def skipped_case(group: str, why: str) -> Case:
-    """The only case of a command that was not run."""
+    """The only case of a skipped command."""
     return Case(name="skipped", group=group, kind=Kind.SKIPPED, sentence=why, text=why)
 
 
 def notes_of(verdict: Mapping[str, Any]) -> list[str]:
-    """The sentence of a verdict, and its notes."""
+    """A verdict's sentence and notes."""
     return [verdict["sentence"], *verdict["notes"]]
 
 
 def worst_first(suites: Iterable[Suite]) -> list[tuple[Suite, Case]]:
-    """Every case that is not passed, with its suite: failures, errors, what is not evaluable, what was skipped."""
+    """Cases not passed, with suites: failed, error, not evaluable, skipped."""
     found = [(suite, case) for suite in suites for case in suite.cases if case.kind is not Kind.PASSED]
     return sorted(found, key=lambda pair: WORST_FIRST.index(pair[1].kind))
 
 
 def _case(name: str, group: str, reasons: Sequence[Mapping[str, Any]]) -> Case:
-    """The reasons of one criterion, the worst first, as one case."""
     ordered = sorted(reasons, key=lambda reason: WORST_FIRST.index(Kind(reason["outcome"])))
     worst, more = ordered[0], sum(reason["outcome"] != Kind.PASSED for reason in ordered[1:])
     sentence = worst["sentence"] if worst["time_s"] is None else f"{worst['sentence']} at {worst['time_s']:.2f} s"
@@ -132,7 +134,6 @@ def _case(name: str, group: str, reasons: Sequence[Mapping[str, Any]]) -> Case:
 
 
 def _told(reason: Mapping[str, Any]) -> str:
-    """All that is known of a reason, a line each."""
     unit = f" {reason['unit']}" if reason["unit"] else ""
     place = reason["place"]
     facts = {
@@ -155,9 +156,9 @@ _NOT_XML = re.compile("[^\t\n\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def write_junit(path: Path, suites: Sequence[Suite]) -> None:
-    """Write the suites into the file `path`, whole or not at all; a report that is there is replaced.
+    """Write the suites atomically to `path`, replacing a report.
 
-    Raises UsageError where `path` is another kind of file or cannot be written, WriteError where the disk is full.
+    Raises UsageError for another file or an unwritable path, WriteError on a full disk.
     """
     check_replaceable(path)
     with output_path(path, force=True, is_folder=False) as partial:
@@ -165,7 +166,7 @@ def write_junit(path: Path, suites: Sequence[Suite]) -> None:
 
 
 def check_replaceable(path: Path) -> None:
-    """Raise UsageError where `path` is a file that is no report of ours, and not empty."""
+    """Raise UsageError if `path` is neither ours nor empty."""
     try:
         with path.open("rb") as stream:
             start = stream.read(len(HEAD))
@@ -178,7 +179,7 @@ def check_replaceable(path: Path) -> None:
 
 
 def junit_text(suites: Sequence[Suite]) -> str:
-    """The suites as XML 1.0, the same for the same suites; what is no character of XML stands as its escape."""
+    """The suites as reproducible XML 1.0; other characters are escaped."""
     seconds = _seconds(sum(suite.seconds for suite in suites))
     root = ElementTree.Element("testsuites", {"name": "splatctrl", **_counts(suites), "time": seconds})
     for suite in suites:
@@ -213,7 +214,7 @@ def _add_case(suite: ElementTree.Element, case: Case) -> None:
 
 
 def _counts(suites: Sequence[Suite]) -> dict[str, str]:
-    """Errors are also what is not evaluable: nothing was shown to be right."""
+    """Not evaluable counts as error: nothing was proven."""
     return {
         "tests": str(sum(len(suite.cases) for suite in suites)),
         "failures": str(sum(suite.count(Kind.FAILED) for suite in suites)),
@@ -226,7 +227,7 @@ def _seconds(value: float) -> str:
 
 
 def _clean(text: str) -> str:
-    """The text with escapes for what no XML can hold: control characters, bytes that are not UTF-8."""
+    """The text, escaped where XML cannot hold it."""
     return _NOT_XML.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
@@ -237,11 +238,10 @@ MORE = "\n... and {} more that do not fit here\n"
 
 
 def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> None:
-    """Inside a step of GitHub Actions: annotations to `stream`, which has to be the process's stdout or stderr, and
-    the table to the summary of the step. Nothing elsewhere.
+    """Print annotations, and append a table to the step's summary, in GitHub Actions only.
 
-    is_fatal: the exit code is not 0; else annotations are warnings. Raises OSError where the summary cannot be
-    written.
+    stream: stdout or stderr. is_fatal: the exit code is not 0; else annotations are warnings. Raises OSError if the
+    summary cannot be written.
     """
     if os.environ.get("GITHUB_ACTIONS") != "true":
         return
@@ -254,9 +254,7 @@ def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> N
 
 
 def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping[str, str]) -> list[str]:
-    """A workflow command for each of the most severe cases; its file is the recording, where that is in the
-    repository.
-    """
+    """A workflow command per most severe case, on the recording if in the repository."""
     level = "error" if is_fatal else "warning"
     lines = []
     for suite, case in [pair for pair in worst_first(suites) if pair[1].kind is not Kind.SKIPPED][:MOST_ANNOTATIONS]:
@@ -270,7 +268,7 @@ def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping
 
 
 def summary(suites: Sequence[Suite], room: int) -> str:
-    """Markdown of at most `room` bytes: how many cases passed, and a row for each that did not, the worst first."""
+    """Markdown of at most `room` bytes: counts, and cases not passed, worst first."""
     cases = worst_first(suites)
     total = sum(len(suite.cases) for suite in suites)
     of = suites[0].name if len(suites) == 1 else f"{len(suites)} recordings"
@@ -297,13 +295,13 @@ def summary(suites: Sequence[Suite], room: int) -> str:
 
 
 def _cell(text: str) -> str:
-    """Text that Markdown and HTML leave as it is, in one line."""
+    """Text in one line, escaped for Markdown."""
     escaped = "".join(f"&#{ord(mark)};" if mark in "&<>|`*_[]\\#~@" else mark for mark in text)
     return " ".join(escaped.split()).encode("utf-8", "backslashreplace").decode()
 
 
 def _in_repository(path: str, environment: Mapping[str, str]) -> str:
-    """The file relative to the repository's folder; empty where it is a folder or lies elsewhere."""
+    """The file's path in the repository, or ""."""
     workspace = environment.get("GITHUB_WORKSPACE", "")
     if not (path and workspace and Path(path).is_file()):
         return ""
@@ -312,5 +310,5 @@ def _in_repository(path: str, environment: Mapping[str, str]) -> str:
 
 
 def _escaped(text: str) -> str:
-    """As actions/toolkit writes the message of a workflow command."""
+    """Text escaped as in actions/toolkit."""
     return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")

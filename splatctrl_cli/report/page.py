@@ -1,9 +1,8 @@
-"""One HTML file that opens from disk: verdict, timelines, pictures, tables, and scenes in 3-D.
+"""One self-contained HTML file: verdict, timelines, pictures, tables, and 3-D scenes.
 
-A scene is splats by time, an arm that moves among them, and what decided, packed into text for the viewer, which uses
-the three.js that trimesh brings. Packed, it is ``{"header": {...}, "bytes": "..."}`` in JSON: the bytes are deflated,
-base64; the header names each array in them by type, first byte and count. Points are whole numbers of 16 bits within
-their box: at three metres half a tenth of a millimetre.
+A scene holds splats by time, a moving arm, and the deciding event; trimesh brings the viewer's three.js. Packed, it
+is JSON ``{"header": {...}, "bytes": "..."}``: deflated base64, and each array's type, first byte and count. Points
+are 16-bit integers within their box: 0.05 mm at three metres.
 """
 
 import base64
@@ -40,9 +39,9 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """An arm over T states: seconds (T,) since the first; the bodies (L) of its links by name, each in its link's
-    frame; poses (T, L, 4, 4), world; path (T, 3) [m], world, of the end effector; clearance (T,) [m], NaN where it
-    is not known; margin [m].
+    """An arm over T states: seconds (T,) from the first; poses (T, L, 4, 4), world.
+
+    bodies (L): by link, in its frame. path (T, 3) [m]: the end effector, world. clearance (T,) [m]: NaN if unknown.
     """
 
     seconds: Float64
@@ -55,8 +54,9 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class Deciding:
-    """What decided a verdict: in words, when [s], where (3,) [m], world, and the sphere of the arm that came there,
-    its centre (3,) and radius [m], None where the robot is not known.
+    """The deciding event: sentence, time [s], place (3,) [m], world.
+
+    sphere: the arm's there, centre (3,) and radius [m], or None.
     """
 
     sentence: str
@@ -67,10 +67,10 @@ class Deciding:
 
 @dataclass(frozen=True, kw_only=True)
 class Space:
-    """What a three-dimensional page shows, in the world frame [m].
+    """Content of a 3-D page, world [m].
 
-    splats: by the time of the motion [s] from which they were known, the first from the start on. unknown: centres
-    (K, 3) of cubes never seen, and their edge. surface: where a baked distance is 0.
+    splats: by motion time [s] from which they were known, the first from the start. unknown: centres (K, 3) and edge
+    of never-seen cubes. surface: where a baked distance is 0.
     """
 
     splats: Mapping[float, SplatSet] = field(default_factory=dict)
@@ -80,7 +80,7 @@ class Space:
     deciding: Deciding | None = None
 
     def box(self) -> tuple[Float64, Float64]:
-        """The lower and upper corner (3,) of what there is to see: nine tenths of the splats, path and surface."""
+        """Lower and upper corner (3,) of 90 % of splats, path and surface."""
         parts = [np.asarray(splats.centers, np.float64) for splats in self.splats.values()]
         if self.motion is not None:
             parts += [self.motion.path, self.motion.poses[:, :, :3, 3].reshape(-1, 3)]
@@ -94,7 +94,7 @@ class Space:
 
 
 def bodies_of(surface: RobotSurface) -> dict[str, Surface]:
-    """The collision geometry of each link of a robot as triangles, in its frame."""
+    """A robot's collision geometry by link, as triangles in its frame."""
     parts: dict[str, list[trimesh.Trimesh]] = {}
     for kind, size, T, link in zip(
         surface.kinds, surface.sizes, surface.T_link_solid, surface.solid_links, strict=True
@@ -112,7 +112,7 @@ def bodies_of(surface: RobotSurface) -> dict[str, Surface]:
 
 
 def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
-    """size (3,): half edges of a box; radius and half length of a cylinder or capsule; radius of a ball."""
+    """size (3,): half edges; radius, half length of a cylinder or capsule; radius of a ball."""
     if kind == BOX:
         return trimesh.creation.box(extents=2 * size)
     if kind == BALL:
@@ -124,8 +124,9 @@ def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
 
 
 def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
-    """Centres (K, 3) [m] and edge [m] of at most `most` cubes for the voxels (X, Y, Z) that are unknown and border on
-    one that is not: the rest lies behind them. Cubes of 2, 3, ... voxels a side, unknown by half or more.
+    """Centres (K, 3) [m] and edge [m] of at most `most` cubes on unknown space's border.
+
+    Cubes of 2, 3, ... voxels a side are unknown by half or more.
     """
     factor = 1
     while True:
@@ -141,7 +142,7 @@ def coarsened(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most
 
 
 def _inner(full: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells whose six neighbours are full; what lies outside the grid counts as full."""
+    """Cells with six full neighbours; outside the grid counts as full."""
     padded = np.pad(full, 1, constant_values=True)
     inner = np.ones_like(full)
     for axis in range(3):
@@ -158,7 +159,7 @@ REMEDY = "pip install 'trimesh>=4.4,<6'"
 
 
 def three_js() -> str:
-    """The source of three.js, deflated, base64. Raises UsageError where trimesh no longer brings it."""
+    """The source of three.js, deflated, base64. Raises UsageError if trimesh has none."""
     try:
         archive = trimesh.util.decompress(trimesh.resources.get_bytes("templates/viewer.zip"), file_type="zip")
         page = archive["viewer.html.template"].read().decode("utf-8")
@@ -169,7 +170,7 @@ def three_js() -> str:
 
 
 def packed(space: Space) -> str:
-    """A scene as the viewer reads it, JSON."""
+    """A scene as JSON for the viewer."""
     block = bytearray()
     lower, upper = space.box()
     header: dict[str, Any] = {
@@ -199,9 +200,9 @@ def packed(space: Space) -> str:
 
 
 def _add(block: bytearray, values: ArrayLike, kind: type[np.generic]) -> list[Any]:
-    """[type, first byte, count] of the values, column by column: a column deflates better than a row.
+    """Append values, padded to 4 bytes: [type, first byte, count].
 
-    They go to the end of the block, each array to a multiple of four bytes.
+    Columns deflate better than rows.
     """
     array, start = np.asarray(values, kind), len(block)
     block += np.ascontiguousarray(array.T).tobytes()
@@ -210,7 +211,6 @@ def _add(block: bytearray, values: ArrayLike, kind: type[np.generic]) -> list[An
 
 
 def _points(block: bytearray, points: NDArray[np.floating]) -> dict[str, Any]:
-    """Points (K, 3) within their box, by column."""
     values = np.asarray(points, np.float64).reshape(-1, 3)
     lower, upper = (values.min(axis=0), values.max(axis=0)) if len(values) else (np.zeros(3), np.zeros(3))
     step = np.where(upper > lower, (upper - lower) / STEPS, 1.0)
@@ -260,7 +260,7 @@ QUALITY = 70  # of JPEG: WebP is a third smaller, and takes ten times as long
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A word in the colour of a state; link: the anchor of a section that it leads to."""
+    """A word in a state's colour; link: a section's anchor."""
 
     text: str
     state: str = ""
@@ -273,7 +273,7 @@ Row = tuple[Sequence[object], str]
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Rows under a header, or a text, under a title; is_folded: shown when the title is clicked."""
+    """Titled rows under a header, or text; is_folded: shown on click."""
 
     title: str = ""
     header: Sequence[str] = ()
@@ -284,7 +284,7 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """An image as a data URL, its size in pixels, and what it shows."""
+    """An image as data URL, with size [px] and title."""
 
     title: str
     data: str
@@ -294,7 +294,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSection:
-    """What a page says of one run. space: the name of its scene, "" for none; no_space: why there is none."""
+    """A run's section. space: its scene's name, or ""; no_space: why none."""
 
     anchor: str
     title: str
@@ -312,9 +312,7 @@ class RunSection:
 
 @dataclass(frozen=True, kw_only=True)
 class Page:
-    """A report. pictures: of runs without a section; scenes: what `viewer.packed` made, by name; opens: the first of
-    them at once.
-    """
+    """A report. pictures: of runs without a section; scenes: `packed`; opens: the first at once."""
 
     title: str
     state: str
@@ -328,7 +326,7 @@ class Page:
 
 
 def rendered(page: Page) -> str:
-    """The page as HTML; every text in it is escaped."""
+    """The page as HTML, all text escaped."""
     environment = Environment(loader=FileSystemLoader(PARTS), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {
         "classed": lambda state: str(state).replace(" ", "-"),
@@ -345,7 +343,7 @@ def rendered(page: Page) -> str:
 
 
 def picture(path: Path, title: str, most: int) -> Picture:
-    """An image file, no wider than `most` pixels, as JPEG. Raises InputError for one that does not decode."""
+    """An image file as JPEG, at most `most` [px] wide. Raises InputError if undecodable."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(f"{path}: is no image that can be decoded", remedy="make the run again")

@@ -1,9 +1,7 @@
-"""Pictures a person can look at: renders beside photos, with how far colours and depths are apart, and slices of a
-distance field; what all pictures share.
+"""Pictures of renders against photos, slices of a distance field, and shared drawing.
 
-Drawn through Matplotlib's Figure: nothing global is touched. Colours are those of Okabe and Ito or maps that stay
-readable without red and green. The bars of the errors end at the same values in every picture, so that views and
-methods can be compared by eye.
+Matplotlib's Figure keeps no global state. Colours are by Okabe and Ito, or maps readable without red and green. Error
+bars end at fixed values, comparable by eye.
 """
 
 from collections.abc import Iterator, Sequence
@@ -46,10 +44,9 @@ STYLE: Any = {  # matplotlib types its keys as one long literal
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonRow:
-    """One view: photo (H, W, 3) uint8, render (H, W, 3) in [0, 1], depths (H, W) [m], 0 = none.
+    """A view's photo (H, W, 3) uint8, render in [0, 1], and depths (H, W) [m].
 
-    `title` names the view, `figures` is a few words on how good the render is; mask (H, W): what
-    counts, None for all.
+    Depth 0 is none. `figures`: the render's quality in words; mask (H, W): pixels that count.
     """
 
     title: str
@@ -84,10 +81,10 @@ def field_slice_picture(
     spheres: tuple[Float64, Float64] | None = None,
     title: str = "",
 ) -> None:
-    """Write a slice of the grid's `sdf` channel across `axis` (0, 1, 2 = x, y, z) nearest to `value` [m].
+    """Write the slice of `sdf` across `axis` (0, 1, 2) nearest to `value` [m].
 
-    Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] that
-    the plane cuts are drawn as the circles of the cut. Raises NotEvaluableError where the plane misses the grid.
+    Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] show
+    as cut circles. Raises NotEvaluableError outside the grid.
     """
     index = round((value - grid.origin[axis]) / grid.voxel)
     count = grid.channels["sdf"].shape[axis]
@@ -118,7 +115,7 @@ def field_slice_picture(
 
 
 def span_of(seconds: Float64) -> tuple[float, float]:
-    """First and last time [s] of an axis, never the same."""
+    """First and last time [s] of an axis, never equal."""
     return float(seconds[0]), max(float(seconds[-1]), float(seconds[0]) + 1e-3)
 
 
@@ -131,7 +128,7 @@ def drawn_figure(height: float) -> Iterator["mpl.figure.Figure"]:
 
 
 def save_figure(figure: "mpl.figure.Figure", path: Path, told: str = "") -> None:
-    """Write the figure without the clock in it; told: what it shows, for who reads the file and does not look."""
+    """Write the figure without a date; told: its description in the file."""
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
@@ -153,7 +150,7 @@ def _draw_comparison(figure: "mpl.figure.Figure", axes: Sequence[Any], row: Comp
 
 
 def _draw_depth_error(panel: Any, row: ComparisonRow) -> tuple[Any, str]:
-    """The image of |render - recorded depth| [cm], for a colour bar, and its median in words."""
+    """Image of |render - recorded depth| [cm], and its median in words."""
     both = (row.photo_depth > 0) & (row.render_depth > 0)
     error = np.where(both, 100.0 * np.abs(row.render_depth - row.photo_depth), np.nan)
     panel.set_facecolor(UNRECORDED)
@@ -164,7 +161,7 @@ def _draw_depth_error(panel: Any, row: ComparisonRow) -> tuple[Any, str]:
 def draw_distance(
     axes: Any, coordinates: Sequence[Float64], distance: Float64, voxel: float, *, names_lines: bool = True
 ) -> Any:
-    """Draw a distance as colour, [cm], and its contour lines; returns the image, for a colour bar."""
+    """Draw a distance [cm] with contour lines; return the image."""
     finite = distance[np.isfinite(distance)]
     limit = 20.0  # [cm]
     image = axes.imshow(
@@ -194,7 +191,7 @@ def draw_distance(
 
 
 def draw_never_seen(axes: Any, coordinates: Sequence[Float64], never_seen: NDArray[np.bool_], voxel: float) -> None:
-    """Veil and hatch the cells that no camera saw."""
+    """Veil and hatch never-seen cells."""
     if not never_seen.any():
         return
     veil = np.zeros((*never_seen.shape, 4))
@@ -205,7 +202,6 @@ def draw_never_seen(axes: Any, coordinates: Sequence[Float64], never_seen: NDArr
 
 
 def _explain(axes: Any, *, has_spheres: bool, has_observed: bool) -> None:
-    """A legend under the picture for what has no axis of its own."""
     entries = []
     if has_spheres:
         entries.append(
@@ -218,7 +214,6 @@ def _explain(axes: Any, *, has_spheres: bool, has_observed: bool) -> None:
 
 
 def _draw_cut_spheres(axes: Any, spheres: tuple[Float64, Float64], axis: int, plane: float) -> None:
-    """The circles in which the plane cuts the spheres."""
     centers, radii = spheres
     first, second = (other for other in range(3) if other != axis)
     squared = np.square(radii) - np.square(centers[:, axis] - plane)
@@ -231,7 +226,7 @@ def _draw_cut_spheres(axes: Any, spheres: tuple[Float64, Float64], axis: int, pl
 
 
 def extent_of(coordinates: Sequence[Float64], voxel: float) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top [m] of cells with these centres."""
+    """Left, right, bottom, top [m] of cells with these centres."""
     (left, right), (bottom, top) = ((c[0] - voxel / 2, c[-1] + voxel / 2) for c in coordinates)
     return float(left), float(right), float(bottom), float(top)
 
@@ -243,7 +238,7 @@ OUTLINE = "#ffffff"
 
 
 def view_picture(path: Path, row: ComparisonRow) -> None:
-    """Write photo | render over colour error | depth error, with the mask's outline where there is one."""
+    """Write photo | render over colour error | depth error, with the mask's outline."""
     height, width = row.photo.shape[:2]
     render = np.clip(row.render, 0.0, 1.0)
     color_error = np.asarray(100.0 * np.abs(render - row.photo / 255.0).mean(axis=2))
@@ -281,7 +276,7 @@ def _outline(panels: Any, mask: NDArray[np.bool_]) -> None:
 
 
 def set_grid(axes: Any, axis: str = "y") -> None:
-    """Draw pale lines behind everything along an axis, or "both", and no frame above and to the right."""
+    """Draw pale grid lines along an axis, or "both"; hide top and right frame."""
     axes.grid(axis=axis, color="#e4e4e4", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -304,9 +299,9 @@ EDGE = 0.02  # [m] of empty space around all
 
 
 def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, radii: Float64) -> None:
-    """Write a PNG of three views along the axes: the shapes, shaded, their uncovered parts, the spheres as discs.
+    """Write three axis views: shaded shapes, uncovered parts, spheres as discs.
 
-    surfaces: triangles (F, 3, 3) [m]; centers (S, 3) [m], radii (S,) [m], all in one frame.
+    surfaces: triangles (F, 3, 3) [m]; centers (S, 3), radii (S,) [m], in one frame.
     """
     triangles = np.concatenate([refined(surface, 0.01)[0] for surface in surfaces])
     triangles = triangles[areas(triangles) > 0]
@@ -329,7 +324,7 @@ def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, rad
 
 
 def _draw_shapes(view: Any, triangles: Float64, is_bare: Bool, plane: tuple[int, int], viewer: Float64) -> None:
-    """Triangles painted from far to near, lit from the viewer."""
+    """Triangles from far to near, lit from the viewer."""
     order = np.argsort(triangles.mean(axis=1) @ viewer, kind="stable")
     seen = triangles[order]
     normal = face_normals(seen)

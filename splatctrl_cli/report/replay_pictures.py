@@ -1,7 +1,6 @@
-"""Pictures of a replay: clearance over time and what happened then, what a controller commanded, how far it went.
+"""Pictures of a replay: clearance and events, commands, and divergence.
 
-Curves of more states than a picture has columns are drawn as the range of their values in each column, so that no
-extreme is lost and a long log takes no longer than a short one.
+Long curves are drawn as their range per column: no extreme is lost, and time stays constant.
 """
 
 from collections.abc import Mapping, Sequence
@@ -74,10 +73,9 @@ def clearance_picture(
     title: str,
     events: Mapping[str, Intervals],
 ) -> None:
-    """Write clearance curves (T,) [m] over `seconds` (T,), in cm, with the margin [m] as a line; below, a strip per
-    kind of event with its intervals.
+    """Write clearance curves (T,) [m] over `seconds` (T,), with margin [m] and event strips.
 
-    Gaps (NaN) stay gaps; below the margin is shaded, and each curve's smallest value is marked.
+    NaN leaves gaps; below the margin is shaded, minima are marked.
     """
     shown = {kind: intervals for kind, intervals in events.items() if intervals}
     with drawn_figure(4.8 + _strip_height(shown)) as figure:
@@ -108,8 +106,9 @@ def clearance_picture(
 
 
 def evidence_picture(path: Path, seconds: Float64, shares: Float64) -> None:
-    """Write what is known of the space within the margin of the arm: shares (T, C) by `EvidenceClass`, one on top of
-    the other, at those `seconds` (T,) that were asked about.
+    """Write stacked shares (T, C) by `EvidenceClass` of the space within the margin.
+
+    Rows with NaN are left out.
     """
     is_asked = np.isfinite(shares).all(axis=1)
     there = [kind for kind in EVIDENCE_COLORS if shares[is_asked, kind].any()]
@@ -140,8 +139,9 @@ def commands_picture(
     interventions: Mapping[str, Intervals],
     logged: FloatRows | None = None,
 ) -> None:
-    """Write the commanded velocity of each joint (T, J) [rad/s] with its limit (J,), over a strip per kind of row
-    that shaped it, or of step that was not plainly taken. logged (T, J): what was done there, drawn behind.
+    """Write commanded velocities (T, J) [rad/s] with limits (J,), over strips of interventions.
+
+    These are rows that shaped the command, or steps not plainly taken. logged (T, J): drawn behind.
     """
     height = 0.78 * len(joints)
     with drawn_figure(height + 0.6 + _strip_height(interventions)) as figure:
@@ -167,7 +167,7 @@ def commands_picture(
 def open_loop_picture(
     path: Path, seconds: Float64, difference: FloatRows, joints: Sequence[str], margin: FloatRows, shaped: Intervals
 ) -> None:
-    """Write commanded less logged velocity (T, J) [rad/s] over the room (T,) [m/s] that the logged velocity left.
+    """Write commanded minus logged velocity (T, J) [rad/s], over the logged one's margin (T,) [m/s].
 
     shaped: intervals [s] in which a row shaped the command, shaded.
     """
@@ -204,7 +204,7 @@ def open_loop_picture(
 def divergence_picture(
     path: Path, seconds: Float64, joints: FloatRows, position: FloatRows, rotation: FloatRows
 ) -> None:
-    """Write how far the arm is from the log (T,): joints [rad], its frame's position [m] and rotation [rad]."""
+    """Write distance from the log (T,): joints [rad], a frame's position [m] and rotation [rad]."""
     curves = (
         ("all joints [rad]", joints, 1.0),
         ("frame, position [cm]", position, 100.0),
@@ -226,10 +226,7 @@ def divergence_picture(
 def _curve(
     axes: Any, seconds: Float64, values: Float64, *, color: str, width: float, style: Any = "-", label: str = ""
 ) -> float:
-    """A curve; of one that is too long the band from its lowest to its highest values, on a line where it is thin.
-
-    Returns how far its values are from zero at most.
-    """
+    """Draw a curve, or a long one's band; return its largest magnitude."""
     of = envelope(seconds, values)
     there = np.isfinite(of.lowest)
     height = float(np.max(of.highest[there]) - np.min(of.lowest[there])) if there.any() else 0.0
@@ -243,7 +240,7 @@ def _curve(
 
 
 def _clearance_curve(axes: Any, seconds: Float64, metres: FloatRows, name: str) -> float:
-    """Returns the least value [cm]; infinity where there is none."""
+    """Draw a curve; return its minimum [cm], or inf."""
     centimetres = 100.0 * np.asarray(metres, dtype=np.float64)
     color, style, width = FIELD_STYLES.get(name, (CURVE_COLORS[3], "-", 1.5))
     label = FIELD_NAMES.get(name, name)
@@ -258,9 +255,7 @@ def _clearance_curve(axes: Any, seconds: Float64, metres: FloatRows, name: str) 
 
 
 def _limit_axis(axes: Any, joint: str, limit: float, peak: float, beneath: float) -> None:
-    """The axis of one joint: as high as its velocity and what is drawn beneath it need, with the limit where it is in
-    sight, and in words.
-    """
+    """Scale a joint's axis to its curves, with its limit."""
     height = max(1.25 * max(peak, beneath), SMALLEST)
     axes.set_ylim(-height, height)
     for side in (-limit, limit):
@@ -285,7 +280,7 @@ def _strip_height(events: Mapping[str, Intervals]) -> float:
 
 
 def _draw_strip(axes: Any, above: Any, events: Mapping[str, Intervals], seconds: Float64) -> None:
-    """A row per kind with its intervals, which are also shaded faintly in the axes above; without any, a word."""
+    """Draw intervals by kind, or "no event"."""
     axes.set(xlabel="time [s]", xlim=span_of(seconds), ylim=(max(len(events), 1) - 0.4, -0.6))
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.set_yticks(range(len(events)), [f"{kind}  ({len(of)})" for kind, of in events.items()])
@@ -307,7 +302,7 @@ def _tidy(axes: Any, seconds: Float64) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Envelope:
-    """K columns: middle time (K,) [s], lowest and highest value (K,) of the states in each, NaN where none is."""
+    """K columns: middle time (K,) [s], lowest and highest value (K,), NaN if empty."""
 
     seconds: Float64
     lowest: Float64
@@ -315,13 +310,14 @@ class Envelope:
 
     @property
     def is_exact(self) -> bool:
-        """True where every column is one state."""
+        """True if every column is one state."""
         return self.lowest is self.highest
 
 
 def envelope(seconds: Float64, values: Float64, columns: int = 1000) -> Envelope:
-    """The range of values (T,) in each of `columns` equal parts of the time (T,); the values themselves where there
-    are at most two states to a column. A column without a state is left out, as a gap.
+    """Ranges of values (T,) in `columns` equal parts of time (T,).
+
+    Up to two states per column, the values themselves.
     """
     values = np.asarray(values, dtype=np.float64)
     if len(values) <= 2 * columns:
@@ -336,14 +332,15 @@ def envelope(seconds: Float64, values: Float64, columns: int = 1000) -> Envelope
 
 
 def column(rows: FloatRows, number: int) -> Float64:
-    """A column (T,) of rows (T, K), which are read a block at a time."""
+    """A column (T,) of rows (T, K), in blocks."""
     parts = [rows[first : first + BLOCK][:, number] for first in range(0, len(rows), BLOCK)]
     return np.concatenate([np.zeros(0), *parts])
 
 
 def spans(intervals: Sequence[tuple[float, float]], span_s: tuple[float, float]) -> list[tuple[float, float]]:
-    """Start and length [s] of intervals (first and last time) as they are drawn over an axis from and to `span_s`:
-    none shorter than `SHORTEST`, those that then touch joined.
+    """Start and length [s] of intervals on the axis `span_s`.
+
+    None is shorter than `SHORTEST`; touching ones are joined.
     """
     least = SHORTEST * (span_s[1] - span_s[0])
     drawn: list[tuple[float, float]] = []

@@ -1,6 +1,4 @@
-"""The clearance of a motion over time as inline SVG: every measure with the margin, events, and the steps of a
-controller; the same colours as the pictures of a replay.
-"""
+"""Inline SVG of clearance over time, in the colours of the replay's pictures."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
@@ -35,8 +33,9 @@ def timeline(
     events: Mapping[str, Intervals],
     rungs: Sequence[str] = (),
 ) -> Markup:
-    """Clearance curves (T,) [m] over `seconds` (T,), drawn in cm, the margin [m], a strip for each kind of event with
-    its intervals [s], and one for the `rungs` (T,) of a controller, if there are any.
+    """Clearance curves (T,) [m] over `seconds` (T,), in cm, with the margin [m] and strips.
+
+    Strips show each kind of event by its intervals [s], and a controller's `rungs` (T,).
     """
     axis = _Axis(seconds, curves, margin)
     strips = {kind: [(*span, KIND_COLORS.get(kind.split(" (")[0], QUIET), kind) for span in spans(of, axis.span)]
@@ -58,7 +57,7 @@ def timeline(
 
 
 def runs_of(rungs: Sequence[str], seconds: Float64) -> list[tuple[str, float, float]]:
-    """Consecutive states of one rung: it, the first time, and the time of the next state behind [s]."""
+    """Runs of equal rungs: rung, first time, next run's first time [s]."""
     found, first = [], 0
     for rung, group in groupby(rungs):
         behind = first + len(list(group))
@@ -111,7 +110,6 @@ class _Axis:
 
 
 def _steps(low: float, high: float, count: int) -> list[float]:
-    """Round numbers between `low` and `high`, about `count` of them."""
     rough = (high - low) / count
     power = 10.0 ** np.floor(np.log10(rough))
     step = power * min((1, 2, 5, 10), key=lambda factor: abs(factor * power - rough))
@@ -142,7 +140,6 @@ def _curves(axis: _Axis, seconds: Float64, curves: Mapping[str, Float64]) -> Ite
 
 
 def _pieces(values: Float64) -> list[slice]:
-    """The runs of values that are there."""
     there = np.concatenate([[False], np.isfinite(values), [False]])
     edges = np.flatnonzero(there[1:] != there[:-1])
     return [slice(first, last) for first, last in zip(edges[::2], edges[1::2], strict=True)]
@@ -153,7 +150,7 @@ def _points(x: Float64, y: Float64) -> str:
 
 
 def _strips(axis: _Axis, strips: Mapping[str, Sequence[tuple[float, float, str, str]]]) -> Iterator[str]:
-    """A row for each kind: its name, and bars from a time [s], so long [s], of a colour, with a title."""
+    """Rows by kind: name, and bars (start [s], length [s], colour, title)."""
     for row, (kind, bars) in enumerate(strips.items()):
         top = axis.bottom + 28 + STRIP * row
         yield f'<rect class="row" x="{LEFT}" y="{top}" width="{WIDTH - LEFT - RIGHT}" height="{STRIP - 6}"/>'
@@ -170,7 +167,7 @@ def _strips(axis: _Axis, strips: Mapping[str, Sequence[tuple[float, float, str, 
 
 
 def legend(curves: Mapping[str, Float64]) -> list[tuple[str, str, str]]:
-    """For each measure its colour, its name, and its least value in words."""
+    """Colour, name and least value, per measure."""
     rows = []
     for name, metres in curves.items():
         known = metres[np.isfinite(metres)]

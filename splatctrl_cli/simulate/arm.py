@@ -1,9 +1,8 @@
-"""The simulated arm: seven joints with the published kinematics of the Franka Emika Panda, in primitive shapes; and
-how it moves.
+"""The simulated arm: the Franka Emika Panda's joints in primitive shapes, and its motion.
 
-Joint placements follow the published (modified) Denavit-Hartenberg table (d1 = 0.333, d3 = 0.316, a4 = 0.0825,
-a5 = -0.0825, d5 = 0.384, a7 = 0.088, flange 0.107 m) and the published position and velocity limits. The shapes are
-ours: capsules (a cylinder and a sphere at either end) and boxes that roughly follow the real links.
+Joints follow the published (modified) Denavit-Hartenberg table (d1 = 0.333, d3 = 0.316, a4 = 0.0825, a5 = -0.0825, d5
+= 0.384, a7 = 0.088, flange 0.107 m), and published position and velocity limits. The shapes are ours: capsules (a
+cylinder and two spheres) and boxes that roughly follow the real links.
 """
 
 from collections.abc import Iterator, Mapping
@@ -41,7 +40,7 @@ PEAK = 1.875  # a minimum-jerk segment's top speed by its mean
 
 @dataclass(frozen=True, kw_only=True)
 class Capsule:
-    """All points within `radius` [m] of the segment from `start` to `end` (3,) [m], link frame."""
+    """Points within `radius` [m] of a segment between (3,) [m], link frame."""
 
     start: tuple[float, float, float]
     end: tuple[float, float, float]
@@ -95,9 +94,9 @@ SHAPES: dict[str, tuple[Capsule | Block, ...]] = {
 
 
 def slim(shape: Capsule | Block) -> tuple[Capsule | Block, ...]:
-    """Visual shapes inside of a collision shape, as parts of a robot lie inside of their convex hulls.
+    """Visual shapes inside a collision shape, as real parts lie inside convex hulls.
 
-    Over the arm's collision surface the visual one is 3 mm (median) and 27 mm (95 %) away, at most 30 mm.
+    Over the collision surface, the visual one is 3 mm (median) and 27 mm (95 %) away, at most 30 mm.
     """
     if isinstance(shape, Block):
         x, y, z = (size - 2 * GAP for size in shape.size)
@@ -154,9 +153,9 @@ def link_shape(link: str, shape: Capsule | Block) -> Shape:
 
 
 def arm_urdf(visual: Mapping[str, tuple[Capsule | Block, ...]] = SHAPES) -> str:
-    """The arm as URDF text: links link0..link7 and hand, joints joint1..joint7 and a fixed hand_joint.
+    """URDF text: links link0..link7 and hand, joints joint1..joint7 and a fixed hand_joint.
 
-    visual: the shapes of each link that are seen; `SHAPES` collide.
+    visual: visible shapes; `SHAPES` collide.
     """
     lines = ['<?xml version="1.0"?>', '<robot name="arm">']
     for link, shapes in SHAPES.items():
@@ -198,7 +197,7 @@ def hand_pose(q: Float64) -> Float64:
 
 
 def arm_spheres_yaml() -> str:
-    """The arm's covering spheres as YAML text, in cuRobo's layout (`collision_spheres` by link)."""
+    """Covering spheres in cuRobo's YAML layout (`collision_spheres` by link)."""
     lines = ["collision_spheres:"]
     for link, shapes in SHAPES.items():
         lines.append(f"  {link}:")
@@ -211,8 +210,8 @@ def arm_spheres_yaml() -> str:
 def covering_spheres(shapes: tuple[Capsule | Block, ...]) -> list[tuple[Float64, float]]:
     """Spheres (center (3,), radius) [m], link frame, whose union contains every shape.
 
-    Along a segment with steps h, a radius of sqrt(R^2 + (h/2)^2) covers the tube of radius R; for a bar of a box, R
-    is half the diagonal of its section. A sphere that lies inside another one is left out.
+    At steps h along a segment, radius sqrt(R^2 + (h/2)^2) covers a tube of radius R, half a bar's diagonal. Spheres
+    inside others are dropped.
     """
     spheres: list[tuple[Float64, float]] = []
     for start, end, radius in (spine for shape in shapes for spine in _spines(shape)):
@@ -228,10 +227,10 @@ def covering_spheres(shapes: tuple[Capsule | Block, ...]) -> list[tuple[Float64,
 
 
 def _spines(shape: Capsule | Block) -> list[tuple[Float64, Float64, float]]:
-    """Segments (start, end) and tube radii: a capsule's own, or those of the bars that a box is cut into.
+    """Segments (start, end) and tube radii, of a capsule or a box's bars.
 
-    The bars lie along the longest side. A bar's segment ends half a step before the bar does, so that the corners
-    are as far from the last sphere's middle as the edges between two spheres are.
+    Bars lie along the longest side. They end half a step early: corners are as far from the last sphere as edges
+    between spheres.
     """
     if isinstance(shape, Capsule):
         return [(np.array(shape.start, dtype=float), np.array(shape.end, dtype=float), shape.radius)]
@@ -251,7 +250,7 @@ def _spines(shape: Capsule | Block) -> list[tuple[Float64, Float64, float]]:
 
 
 def _primitives(shapes: tuple[Capsule | Block, ...]) -> Iterator[tuple[str, str]]:
-    """(geometry, origin) elements of URDF text; capsules as a cylinder and a sphere at either end, once each."""
+    """URDF (geometry, origin); a capsule is a cylinder and end spheres, once each."""
     balls: set[tuple[tuple[float, float, float], float]] = set()
     for shape in shapes:
         if isinstance(shape, Block):
@@ -273,7 +272,7 @@ def _primitives(shapes: tuple[Capsule | Block, ...]) -> Iterator[tuple[str, str]
 
 
 def _turned(axis: int, angle: float, xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Float64:
-    """The pose (4, 4) at xyz [m], turned about x (0) or z (2)."""
+    """The pose (4, 4) at xyz [m], about x (0) or z (2)."""
     T, c, s = np.eye(4), np.cos(angle), np.sin(angle)
     i, j = ((1, 2), (2, 0), (0, 1))[axis]
     T[i, i], T[i, j], T[j, i], T[j, j] = c, -s, s, c
@@ -293,13 +292,13 @@ class Motion:
     waypoints: Float64
 
     def within(self, velocity_limit: Float64) -> "Motion":
-        """The same way, slowed down as a whole where a joint would be faster than its limit (J,) [rad/s]."""
+        """The same path, slowed to the limits (J,) [rad/s]."""
         speeds = PEAK * np.abs(np.diff(self.waypoints, axis=0)) / np.diff(self.times)[:, None]
         slower = max(1.0, float(np.max(speeds / velocity_limit)))
         return replace(self, times=self.times + (slower - 1.0) * (self.times - self.times[0]))
 
     def at(self, time: float) -> tuple[Float64, Float64]:
-        """Positions (J,) [rad] and velocities (J,) [rad/s]; at rest before the first and after the last waypoint."""
+        """Positions (J,) [rad] and velocities (J,) [rad/s]; at rest outside."""
         time = float(np.clip(time, self.times[0], self.times[-1]))
         index = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2))
         span = self.times[index + 1] - self.times[index]

@@ -1,4 +1,4 @@
-"""Two models of an active-stereo camera: measured depth from exact depth."""
+"""Two models of an active-stereo camera: measured from exact depth."""
 
 from dataclasses import dataclass
 
@@ -16,19 +16,19 @@ EDGE = 0.5  # [px] of disparity between neighbours that are no longer one surfac
 
 @dataclass(frozen=True, kw_only=True)
 class StereoDepth:
-    """The depth that two imagers measure, in the image of a colour camera. A depth pixel is a pixel of the imagers;
-    the image's `focal` over theirs says how wide it is in the image.
+    """Depth measured by two imagers, in the image of a colour camera.
 
-    - Disparity d = f b / z errs by `spread` [px], so that depth errs by z^2 spread / (f b): 3.6 mm at 1 m and 14.5 mm
-      at 2 m with 0.07 px. Errors r depth pixels apart correlate by exp(-(r / `window`)^2). Steps are of 1/32 px.
-    - Beside an edge of 0.5 px or more, the background takes the depth of the foreground over `fattening` [px]: from
-      the first to the second number of depth pixels, evenly distributed, and alike within a window.
-    - Lost is the background that the second imager does not see: f b (1 / z_foreground - 1 / z_background) depth
-      pixels left of the foreground, less those that took its depth.
-    - Lost are a share `dropout` of all pixels, in blobs twice as wide as the window, and depths out of `least` to
-      `most` [m].
+    A depth pixel is a pixel of the imagers; the image's `focal` over theirs gives its width in the image.
 
-    width [px]: of the depth imagers, by which their focal length scales; None: as wide as the image.
+    - Disparity d = f b / z errs by `spread` [px], so depth errs by z^2 spread / (f b): with 0.07 px, 3.6 mm at 1 m
+      and 14.5 mm at 2 m. Errors r depth pixels apart correlate by exp(-(r / `window`)^2). Steps are of 1/32 px.
+    - Beside an edge of 0.5 px or more, the background takes the foreground's depth over `fattening` depth pixels.
+      That width is uniform between the two numbers, and constant within a window.
+    - Background that the second imager does not see is lost: f b (1 / z_foreground - 1 / z_background) depth pixels
+      left of the foreground, less those that took its depth.
+    - A share `dropout` of all pixels is lost, in blobs of two windows, as are depths out of `least` to `most` [m].
+
+    width [px]: of the imagers, scaling their focal length; None: as wide as the image.
     """
 
     spread: float = 0.07
@@ -40,7 +40,10 @@ class StereoDepth:
     width: int | None = None
 
     def applied(self, depth: Float32, rng: np.random.Generator, *, focal: float = 0.0) -> Float32:
-        """Measured depth (H, W) [m] of exact `depth`, 0 = none; focal [px]: of the image (0: of the imagers)."""
+        """Measured depth (H, W) [m] of exact `depth`, 0 = none.
+
+        focal [px]: the image's (0: the imagers').
+        """
         imager = FOCAL * (self.width or depth.shape[1]) / WIDTH
         scale = focal / imager if focal > 0 else 1.0  # pixels of the image in one of the imagers
         exact = np.where(depth > 0, imager * BASELINE / np.where(depth > 0, depth, 1.0), 0.0)
@@ -58,7 +61,7 @@ class StereoDepth:
 
 
 def _blurred(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Float64:
-    """Noise (H, W) of unit variance, blurred by a Gaussian of `sigma` [px]."""
+    """Gaussian-blurred noise (H, W) of unit variance."""
     impulse = np.zeros(min(shape))
     impulse[0] = 1.0
     kernel = gaussian_filter(impulse, sigma, mode="wrap")
@@ -66,8 +69,9 @@ def _blurred(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> 
 
 
 def _is_hidden(depth: Float32, focal_baseline: float) -> Bool:
-    """True where the second imager, to the right of the first, has something nearer before what a pixel shows: a
-    pixel right of it whose disparity shifts it there or farther to the left.
+    """True where a pixel is occluded from the second imager, right of the first.
+
+    A pixel to its right is then shifted there, or farther left.
     """
     columns = np.arange(depth.shape[1])
     shifted = np.where(depth > 0, columns - focal_baseline / np.where(depth > 0, depth, 1.0), np.inf)
@@ -76,7 +80,7 @@ def _is_hidden(depth: Float32, focal_baseline: float) -> Bool:
 
 
 def _fattened(disparity: Float64, reach: np.ndarray) -> Float64:
-    """Disparities (H, W), each the largest within `reach` (H, W) [px] where that is beyond an edge."""
+    """Disparities (H, W), each the largest within `reach` (H, W) [px] if beyond an edge."""
     out = disparity
     for radius in range(1, int(reach.max()) + 1):
         y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
@@ -87,13 +91,12 @@ def _fattened(disparity: Float64, reach: np.ndarray) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthNoise:
-    """A depth camera's error, in the manner of a D435 whose depth is registered to colour.
+    """Errors of a depth camera, like a D435 with depth registered to colour.
 
-    spread: standard deviation [m] at 1 m, growing with depth squared (an error in disparity); step [m]: distance
-    of neighbouring depths at 1 m, as disparity comes in fixed steps; patch [px]: size of the matching window, over
-    which errors agree; dropout: share of pixels lost at random, in blobs of a patch; edge [m]: step of depth
-    between neighbours beyond which both are lost; max_range [m]: farther is lost; baseline [m]: of the two imagers,
-    with which also what the second of them does not see is lost (0: nothing).
+    spread [m]: sigma at 1 m, growing with depth squared (disparity error). step [m]: quantisation at 1 m (disparity
+    steps). patch [px]: matching window, over which errors agree. dropout: share of pixels lost, in patch-sized blobs.
+    edge [m]: depth step that loses both neighbours. max_range [m]: farther is lost. baseline [m]: of the imagers, to
+    lose what the second does not see (0: off).
     """
 
     spread: float = 0.0012
@@ -105,7 +108,10 @@ class DepthNoise:
     baseline: float = 0.0
 
     def applied(self, depth: Float32, rng: np.random.Generator, *, focal: float = 0.0) -> Float32:
-        """Noisy depth (H, W) [m] of exact `depth`, 0 = none; focal [px]: of the camera, where there is a baseline."""
+        """Noisy depth (H, W) [m] of exact `depth`, 0 = none.
+
+        focal [px]: needed for a baseline.
+        """
         coarse = (depth.shape[0] // self.patch + 3, depth.shape[1] // self.patch + 3)
         error = _enlarged(rng.standard_normal(coarse), self.patch, depth.shape)
         lost = _enlarged(rng.standard_normal(coarse), self.patch, depth.shape)
@@ -119,7 +125,7 @@ class DepthNoise:
 
 
 def _enlarged(coarse: np.ndarray, factor: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Smooth unit-variance noise (H, W): coarse noise, blended bilinearly."""
+    """Unit-variance noise (H, W), blended bilinearly from coarse noise."""
     v, u = np.arange(shape[0]) / factor, np.arange(shape[1]) / factor
     i, j = v.astype(int), u.astype(int)
     a, b = (v - i)[:, None], (u - j)[None]
@@ -130,7 +136,7 @@ def _enlarged(coarse: np.ndarray, factor: int, shape: tuple[int, ...]) -> np.nda
 
 
 def _is_at_edge(depth: Float32, step: float) -> Bool:
-    """True at both pixels of every horizontal or vertical neighbour pair whose depths differ by more than `step`."""
+    """True at both neighbours whose depths differ by over `step`."""
     across, down = (np.abs(np.diff(depth, axis=axis)) > step for axis in (1, 0))
     sides = [np.pad(across, ((0, 0), pad)) for pad in ((1, 0), (0, 1))]
     sides += [np.pad(down, (pad, (0, 0))) for pad in ((1, 0), (0, 1))]

@@ -1,7 +1,7 @@
-"""Boxes, cylinders, capsules and spheres: exact signed distance, nearest surface point, ray hits, normals, textures.
+"""Textured boxes, cylinders, capsules and spheres: exact distance, surface points, ray hits, normals.
 
-A primitive's own frame has its origin in its middle; a cylinder or capsule stands along z. R rays, Q points. Textures
-are solid, with features of a few centimetres, smooth enough for a few thousand splats.
+Frames have their origin in the middle; cylinders and capsules stand along z. R rays, Q points. Solid textures have
+features of a few centimetres, smooth enough for a few thousand splats.
 """
 
 from collections.abc import Sequence
@@ -19,10 +19,9 @@ ALWAYS = (-(2**62), 2**62)  # [ns] a span of time that holds every stamp
 
 @dataclass(frozen=True, kw_only=True)
 class Texture:
-    """A pattern between two colours over the solid's own frame.
+    """A pattern of two colours, RGB in [0, 1], in the solid's frame.
 
-    pattern `noise`, `stripes` or `checks`; feature [m]: cell of the noise, or width of one stripe or check;
-    dark, bright: RGB in [0, 1]; seed: of the noise.
+    pattern: `noise`, `stripes` or `checks`; feature [m]: noise cell, or width of a stripe or check.
     """
 
     pattern: str
@@ -32,7 +31,7 @@ class Texture:
     seed: int = 0
 
     def color(self, points_shape: Float64) -> Float64:
-        """RGB (R, 3) in [0, 1] at points (R, 3) [m] in the solid's own frame."""
+        """RGB (R, 3) in [0, 1] at points (R, 3) [m] in the solid's frame."""
         p = points_shape / self.feature
         if self.pattern == "noise":
             share = _value_noise(p + 0.37, self.seed)
@@ -48,12 +47,12 @@ class Texture:
 
 
 def luminance_std(color: np.ndarray) -> float:
-    """Standard deviation of the luminance (0 to 1) of an 8-bit RGB image (H, W, 3)."""
+    """Standard deviation of luminance (0 to 1) of 8-bit RGB (H, W, 3)."""
     return float(np.std(color.astype(np.float64) @ LUMINANCE / 255))
 
 
 def _value_noise(p: Float64, seed: int) -> Float64:
-    """Smooth noise (R,) in [0, 1]: random values on the integer lattice, blended by smoothstep."""
+    """Smooth noise (R,) in [0, 1]: lattice values, blended by smoothstep."""
     cell = np.floor(p)
     t = p - cell
     t = t * t * (3 - 2 * t)
@@ -67,7 +66,6 @@ def _value_noise(p: Float64, seed: int) -> Float64:
 
 
 def _hash(lattice: np.ndarray, seed: int) -> Float64:
-    """A fixed pseudo-random value (R,) in [0, 1) per integer point (R, 3)."""
     x, y, z = (lattice[:, i].astype(np.uint64) for i in range(3))
     key = x * np.uint64(0x9E3779B97F4A7C15) ^ y * np.uint64(0xC2B2AE3D27D4EB4F) ^ z * np.uint64(0x165667B19E3779F9)
     key ^= np.uint64(seed * 0x27D4EB2F + 0x85EBCA6B)
@@ -81,9 +79,9 @@ def _hash(lattice: np.ndarray, seed: int) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class Track:
-    """Poses (K, 4, 4) of a solid that moves, at increasing stamps (K,) int64 [ns]; at rest before and after.
+    """Poses (K, 4, 4) at increasing stamps (K,) int64 [ns]; at rest outside.
 
-    Between two stamps the origin moves on a straight line and the solid turns about one axis, both evenly.
+    In between, the origin moves linearly and the solid rotates about one axis, uniformly.
     """
 
     stamp_ns: Stamps
@@ -109,11 +107,10 @@ class Track:
 
 @dataclass(frozen=True, kw_only=True)
 class Primitive:
-    """One solid: kind `box` (size = full x, y, z), `cylinder` (radius, height), `sphere` (radius) or `capsule`
-    (radius, length of its axis) [m].
+    """One solid: box, cylinder, sphere or capsule.
 
-    T_world_shape (4, 4) places it, or where it moves its first pose: `at` gives it as it stands at a stamp. It is
-    there while from_ns <= stamp < to_ns.
+    size [m]: full x, y, z; radius, height; radius; or radius, axis length. T_world_shape (4, 4): its pose, the first
+    if it moves. It is present while from_ns <= stamp < to_ns.
     """
 
     name: str
@@ -126,18 +123,18 @@ class Primitive:
     track: Track | None = None
 
     def at(self, stamp_ns: int) -> "Primitive":
-        """The solid as it stands at a stamp, without its track."""
+        """The solid at a stamp, without its track."""
         if self.track is None:
             return self
         return replace(self, T_world_shape=self.track.at(stamp_ns), track=None)
 
     def is_present(self, stamp_ns: int) -> bool:
-        """True while the solid is in the scene."""
+        """True while in the scene."""
         return self.from_ns <= stamp_ns < self.to_ns
 
     @property
     def bounding_radius(self) -> float:
-        """Radius [m] of the ball about its middle that holds it."""
+        """Bounding radius [m] about its middle."""
         if self.kind == "box":
             return float(np.linalg.norm(self.size)) / 2
         if self.kind == "capsule":
@@ -148,18 +145,18 @@ class Primitive:
 def solid(
     name: str, kind: str, size: tuple[float, ...], middle: Sequence[float], texture: Texture, yaw: float | None = None
 ) -> Primitive:
-    """Upright, or turned by yaw [rad] about z."""
+    """A solid, upright or rotated by yaw [rad] about z."""
     T_world_shape = pose_at(middle, None if yaw is None else turn_about_z(yaw))
     return Primitive(name=name, kind=kind, size=size, T_world_shape=T_world_shape, texture=texture)
 
 
 def box(name: str, size: tuple[float, ...], middle: Sequence[float], texture: Texture, yaw: float = 0.0) -> Primitive:
-    """Turned by yaw [rad] about z."""
+    """A box rotated by yaw [rad] about z."""
     return solid(name, "box", size, middle, texture, yaw)
 
 
 def closest_point(primitive: Primitive, points_world: Float64) -> tuple[Float64, Float64]:
-    """Signed distance (Q,) [m], negative inside, and the nearest surface point (Q, 3), world, of points (Q, 3)."""
+    """Signed distance (Q,) [m], negative inside, and surface point of points (Q, 3), world."""
     p = transform_points(invert_transform(primitive.T_world_shape), points_world)
     if primitive.kind == "sphere":
         surface = p / np.maximum(np.linalg.norm(p, axis=1, keepdims=True), 1e-300) * primitive.size[0]
@@ -209,7 +206,7 @@ def _capsule_closest(p: Float64, radius: float, half: float) -> tuple[Float64, F
 
 
 def hit(primitive: Primitive, origin_world: Float64, directions_world: Float64) -> Float64:
-    """The ray parameter t (R,) of the first hit of origin + t * directions (R, 3), inf where there is none."""
+    """Parameter (R,) of the first hit of origin + t * directions, or inf."""
     T_shape_world = invert_transform(primitive.T_world_shape)
     origin = T_shape_world[:3, :3] @ origin_world + T_shape_world[:3, 3]
     directions = directions_world @ T_shape_world[:3, :3].T
@@ -226,7 +223,7 @@ def hit(primitive: Primitive, origin_world: Float64, directions_world: Float64) 
 
 
 def normals(primitive: Primitive, points_shape: Float64) -> Float64:
-    """Outward unit normals (R, 3) at surface points (R, 3), both in the primitive's own frame."""
+    """Outward unit normals (R, 3) at surface points (R, 3), own frame."""
     if primitive.kind == "sphere":
         return points_shape / primitive.size[0]
     if primitive.kind == "capsule":
@@ -246,14 +243,13 @@ def normals(primitive: Primitive, points_shape: Float64) -> Float64:
 
 
 def _cylinder_span(origin: Float64, directions: Float64, radius: float, half: float) -> tuple[Float64, Float64]:
-    """Where rays are inside a cylinder along z: t from, t to."""
     side = _round_span(origin[:2], directions[:, :2], radius)
     caps = _slab_span(origin[2:], directions[:, 2:], np.array([half]))
     return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
 
 
 def _capsule_span(origin: Float64, directions: Float64, radius: float, half: float) -> tuple[Float64, Float64]:
-    """The same of a capsule: from the first to the last of its cylinder and its two balls, as it is convex."""
+    """Interval of t inside a capsule: hull of its cylinder's and balls', by convexity."""
     end = np.array([0.0, 0.0, half])
     spans = [
         _cylinder_span(origin, directions, radius, half),
@@ -265,7 +261,7 @@ def _capsule_span(origin: Float64, directions: Float64, radius: float, half: flo
 
 
 def _round_span(origin: Float64, directions: Float64, radius: float) -> tuple[Float64, Float64]:
-    """Where rays (2-D or 3-D) are inside a circle or ball about 0: t from, t to; NaN where they miss."""
+    """Interval of t inside a circle or ball about 0; NaN for misses."""
     a = np.sum(directions**2, axis=1)
     b = directions @ origin
     root = np.sqrt(b**2 - a * (origin @ origin - radius**2))
@@ -275,7 +271,7 @@ def _round_span(origin: Float64, directions: Float64, radius: float) -> tuple[Fl
 
 
 def _slab_span(origin: Float64, directions: Float64, half: Float64) -> tuple[Float64, Float64]:
-    """Where rays are between the faces at -half and half of every axis: t from, t to."""
+    """Interval of t between -half and half of every axis."""
     near, far = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)
     for axis, size in enumerate(half):
         a, b = (-size - origin[axis]) / directions[:, axis], (size - origin[axis]) / directions[:, axis]

@@ -1,4 +1,4 @@
-"""A simulated recording: the records of a log in time order, and what is true while it runs."""
+"""A simulated recording: records in time order, and the truth."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -34,11 +34,10 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions:
-    """What to record: duration [s], frames per second of each camera, image size [px], depth noise, its seed.
+    """Duration [s], frames per second per camera, image size [px], depth noise and seed.
 
-    with_person: a walking person with masks, instead of the standing cylinder. is_free: floor and walls alone,
-    without the table and what is on it. visitor: x, y and radius [m] of the standing cylinder.
-    color_rays: 0 to 4 rays for a pixel's colour beside the one for its depth.
+    with_person: a walking person with masks, instead of the cylinder. is_free: floor and walls alone. visitor: x, y
+    and radius [m] of the cylinder. color_rays: 0 to 4 per pixel, besides depth's.
     """
 
     duration_s: float = 7.0
@@ -75,8 +74,9 @@ class RecordingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """What stands there (`primitives`, the last of them, `temporary`, for a while only), the motion of an arm among
-    it, and cameras other than those of the table. has_people: images have masks of what is temporary.
+    """Solids (`primitives`, ending with the `temporary`), an arm's motion, and cameras, else the table's.
+
+    has_people: images mask temporary solids.
     """
 
     primitives: tuple[Primitive, ...]
@@ -87,7 +87,7 @@ class Scene:
 
     @classmethod
     def of(cls, options: RecordingOptions) -> "Scene":
-        """The scene that the options ask for."""
+        """The scene of the options."""
         motion = tabletop.arm_motion(options.duration_s)
         if options.is_free:
             walls = tuple(p for p in tabletop.furniture() if p.name != "table")
@@ -103,9 +103,9 @@ class Scene:
 
 
 class Recording:
-    """A scene, recorded once; the same options and scene give the same records. Images show the robot's visual
-    geometry, where its URDF has any. It keeps its velocity limits: where the time is too short for its way, the
-    recording ends on the way.
+    """A recorded scene, reproducible by options and scene.
+
+    Images show the robot's visual geometry, if any. The arm respects velocity limits, even if time ends on the way.
     """
 
     def __init__(
@@ -115,9 +115,7 @@ class Recording:
         scene: Scene | None = None,
         unmodelled: tuple[str, ...] = (),
     ) -> None:
-        """scene: another than that of the options, or the motion of another arm in it; unmodelled: names of
-        `UNMODELLED` parts that the arm has.
-        """
+        """scene: instead of the options'; unmodelled: `UNMODELLED` parts on the arm."""
         self.options, self.robot, self.unmodelled = options, robot, unmodelled
         parts = [(UNMODELLED[name][0], capsule) for name in unmodelled for capsule in UNMODELLED[name][1]]
         self._body = robot if not parts else _with_parts(robot, parts)
@@ -132,19 +130,19 @@ class Recording:
         self._meshes = tabletop.arm_meshes(surface) if len(surface.triangles) else None
 
     def joint_states(self) -> Iterator[JointState]:
-        """The arm's states from start to end, 50 a second."""
+        """The arm's states, 50 a second."""
         for index in range(int(self.options.duration_s * JOINT_RATE) + 1):
             position, velocity = self._motion.at(index / JOINT_RATE)
             stamp_ns = self.start_ns + index * 10**9 // JOINT_RATE
             yield JointState(stamp_ns=stamp_ns, position=position, velocity=velocity)
 
     def frames(self) -> Iterator[RgbdFrame]:
-        """The images of every camera in time order, cameras in turn at each stamp."""
+        """All images in time order, cameras in turn at each stamp."""
         for index in range(int(np.ceil(self.options.duration_s * self.options.fps - 1e-9))):
             yield from self.frames_at(index, self._motion.at(self._offset_ns(index) / 1e9)[0])
 
     def frames_at(self, index: int, q: Float64, cameras: Collection[str] | None = None) -> Iterator[RgbdFrame]:
-        """The images of the cameras (None: of every one) at the time of the frame `index`, with the arm at q (J,)."""
+        """Images of some cameras (None: all) at frame `index`, at q (J,)."""
         stamp_ns = self.start_ns + self._offset_ns(index)
         poses = self.link_poses(q)
         arm = tabletop.arm_solids(self._shapes, poses)
@@ -170,15 +168,15 @@ class Recording:
             )
 
     def records(self) -> Iterator[Record]:
-        """Joint states and images by stamp; joint states come before images of the same stamp."""
+        """Joint states and images by stamp, states first."""
         return by_stamp(self.joint_states(), self.frames())
 
     def link_poses(self, q: Float64) -> dict[str, Float64]:
-        """T_world_link (4, 4) of every link at joint positions q (J,)."""
+        """T_world_link (4, 4) by link at q (J,)."""
         return {link: self.robot.frame_pose(q, link) for link in self.robot.urdf.links}
 
     def static_transforms(self) -> list[Transform]:
-        """world -> camN_link -> camN_optical_frame of every camera, and world -> the arm's root link."""
+        """world -> camN_link -> camN_optical_frame, and world -> the arm's root link."""
         transforms: list[Transform] = [("world", self.robot.urdf.links[0], self.robot.T_world_base)]
         for camera in self.cameras:
             T_world_link = camera.T_world_camera @ OPTICAL_FROM_LINK.T
@@ -187,7 +185,7 @@ class Recording:
         return transforms
 
     def link_transforms(self, q: Float64) -> list[Transform]:
-        """Parent link -> link of every link but the root at joint positions q (J,)."""
+        """Parent link -> link, except the root, at q (J,)."""
         poses = self.link_poses(q)
         return [
             (parent, child, invert_transform(poses[parent]) @ poses[child])
@@ -195,10 +193,9 @@ class Recording:
         ]
 
     def clearances(self) -> tuple[np.ndarray, Float64]:
-        """Stamps (T,) int64 [ns] of the joint states and the arm's true clearance (T,) [m] at each.
+        """Stamps (T,) int64 [ns] of joint states, and the arm's true clearance (T,) [m].
 
-        The least exact distance of a moving collision sphere to what is there, less the sphere's radius; and that of
-        unmodelled parts, to a millimetre.
+        Least exact distance of moving collision spheres to the scene; unmodelled parts to 1 mm.
         """
         states = list(self.joint_states())
         moving, spheres = self._body.moving_spheres, self._body.sphere_set
@@ -212,18 +209,16 @@ class Recording:
         return np.array([state.stamp_ns for state in states], dtype=np.int64), np.array(clearance)
 
     def _offset_ns(self, index: int) -> int:
-        """When the frame `index` is taken, from the start [ns]."""
         return round(index * 1e9 / self.options.fps)
 
     @cached_property
     def _renderers(self) -> list[Renderer]:
-        """One by camera, with what is always there cast."""
         static, rays = self.primitives[: len(self.primitives) - len(self._temporary)], self.options.color_rays
         return [Renderer(camera, static, color_rays=rays) for camera in self.cameras]
 
 
 def _with_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> RobotModel:
-    """The robot with balls along the axes of capsules that move with its links."""
+    """The robot with balls along the capsules on its links."""
     balls = [(link, c.radius, x) for link, c in parts for x in np.linspace(c.start, c.end, NUM_BALLS)]
     links, radii, centers = zip(*balls, strict=True)
     own = robot.sphere_set
@@ -236,5 +231,5 @@ def _with_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> Robo
 
 
 def _shown(depth: Float32, without: Float32) -> UInt8:
-    """(H, W) 1 where `depth` [m] shows what is not there in `without`, else 0."""
+    """(H, W) 1 where `depth` [m] shows an object that `without` does not, else 0."""
     return np.asarray((depth > 0) & ((without == 0) | (depth < without)), np.uint8)

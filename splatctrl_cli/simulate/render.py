@@ -1,4 +1,4 @@
-"""Exact RGB-D images of primitives and meshes by ray casting: depth at pixel centres, colour from four rays."""
+"""Exact RGB-D images by ray casting: depth at pixel centres, colour from four rays."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ FACES_AT_ONCE = 32_000  # of meshes: their numbers are 16 bits wide
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A fixed camera: T_world_camera (4, 4) of its optical frame; is_training False for scoring only."""
+    """A fixed camera: T_world_camera (4, 4), optical frame; is_training False for scoring only."""
 
     name: str
     intrinsics: Intrinsics
@@ -30,8 +30,9 @@ class Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class Meshes:
-    """Triangles (F, 3, 3) [m], counter-clockwise seen from outside, each in the frame of one of `links`, whose number
-    is in `owners` (F,); textures by link. T_world_link (L, 4, 4): where the links are.
+    """Triangles (F, 3, 3) [m], counter-clockwise from outside, in link frames.
+
+    owners (F,): index into `links`; textures: by link; T_world_link (L, 4, 4).
     """
 
     links: tuple[str, ...]
@@ -41,15 +42,15 @@ class Meshes:
     T_world_link: Float64
 
     def at(self, poses: Mapping[str, Float64]) -> "Meshes":
-        """The same with the links at poses (4, 4) by name."""
+        """The meshes with links at poses (4, 4) by name."""
         return replace(self, T_world_link=np.array([poses[link] for link in self.links]).reshape(-1, 4, 4))
 
 
 class Renderer:
-    """Renders one camera; what never moves is cast once.
+    """Renderer of one camera; static solids are cast once.
 
-    A pixel's ray is scaled to one metre along the optical axis, so that its parameter is the depth. `color_rays` of
-    the four make a pixel's colour; with 0 it is that of the depth's ray.
+    Rays have unit length along the optical axis, so that t is depth [m]. `color_rays` rays give a pixel's colour;
+    with 0, depth's ray does.
     """
 
     def __init__(self, camera: Camera, static: Sequence[Primitive], *, color_rays: int = 4) -> None:
@@ -67,9 +68,7 @@ class Renderer:
         self._cast(static, self._depth, self._color)
 
     def image(self, moving: Sequence[Primitive], meshes: Meshes | None = None) -> tuple[UInt8, Float32]:
-        """color (H, W, 3) uint8 and depth (H, W) float32 [m], 0 = nothing there, with `moving` and `meshes` in the
-        scene.
-        """
+        """Colour (H, W, 3) uint8 and depth (H, W) float32 [m], 0 = none."""
         depth, color = self._depth.copy(), self._color.copy()
         self._cast(moving, depth, color)
         for ray, mine, faces in self._nearest_faces(meshes, depth):
@@ -79,7 +78,7 @@ class Renderer:
         return np.rint(mean * 255).astype(np.uint8), at_center.astype(np.float32)
 
     def depth(self, moving: Sequence[Primitive], meshes: Meshes | None = None) -> Float32:
-        """The same depth alone, without the work for colours."""
+        """The same depth, without colours."""
         depth = self._depth[:1].copy()
         self._nearest(moving, depth)
         for _ in self._nearest_faces(meshes, depth):
@@ -87,7 +86,7 @@ class Renderer:
         return np.where(np.isfinite(depth[0]), depth[0], 0).astype(np.float32)
 
     def _cast(self, primitives: Sequence[Primitive], depth: Float64, color: Float64) -> None:
-        """Lower `depth` (5, H, W) and set `color` (5, H, W, 3) wherever a primitive is the nearest."""
+        """Lower `depth` (5, H, W) and set `color` where a primitive is nearest."""
         origin = self.camera.T_world_camera[:3, 3]
         owner = self._nearest(primitives, depth)
         for index, primitive in enumerate(primitives):
@@ -97,7 +96,7 @@ class Renderer:
                 color[mine] = shaded(primitive, points_world)
 
     def _nearest(self, primitives: Sequence[Primitive], depth: Float64) -> NDArray[np.int64]:
-        """Lower `depth` (K, H, W) of the first K rays of each pixel; which primitive did so last, -1 for none."""
+        """Lower `depth` (K, H, W); index of the nearest primitive, or -1."""
         origin = self.camera.T_world_camera[:3, 3]
         owner = np.full(depth.shape, -1)
         for index, primitive in enumerate(primitives):
@@ -112,9 +111,7 @@ class Renderer:
     def _nearest_faces(
         self, meshes: Meshes | None, depth: Float64
     ) -> Iterator[tuple[int, Bool, NDArray[np.integer]]]:
-        """Lower `depth` (K, H, W) of the first K rays of each pixel; of each ray the pixels (H, W) where a triangle
-        is the nearest, and its number there.
-        """
+        """Lower `depth` (K, H, W); per ray, pixels of nearer triangles, and their numbers."""
         if meshes is None:
             return
         k = self.camera.intrinsics
@@ -139,7 +136,7 @@ class Renderer:
     def _shaded_faces(
         self, meshes: Meshes | None, depth: Float64, directions: Float64, faces: NDArray[np.integer]
     ) -> Float64:
-        """RGB (R, 3) of points at a depth (R,) along directions (R, 3) on triangles of these numbers (R,)."""
+        """RGB (R, 3) at depths (R,) along directions (R, 3), on triangles (R,)."""
         assert meshes is not None
         points_world = self.camera.T_world_camera[:3, 3] + depth[:, None] * directions
         a, b, c = np.moveaxis(meshes.triangles[faces], 1, 0)
@@ -154,7 +151,7 @@ class Renderer:
         return color
 
     def _window(self, primitive: Primitive) -> tuple[slice, slice, slice]:
-        """The rays that could meet the primitive's bounding ball: a conservative rectangle of pixels."""
+        """Conservative pixel rectangle of the primitive's bounding ball."""
         k = self.camera.intrinsics
         middle = (invert_transform(self.camera.T_world_camera) @ primitive.T_world_shape[:, 3])[:3]
         radius = primitive.bounding_radius
@@ -179,7 +176,7 @@ def shaded(primitive: Primitive, points_world: Float64) -> Float64:
 
 
 def lit(texture: Texture, points_shape: Float64, normals_shape: Float64, T_shape_world: Float64) -> Float64:
-    """RGB (R, 3) in [0, 1]: a texture under one distant light, the same from every side."""
+    """RGB (R, 3) in [0, 1]: a texture under a distant light, for any viewer."""
     facing = normals_shape @ (T_shape_world[:3, :3] @ LIGHT)
     light = AMBIENT + (1 - AMBIENT) * np.maximum(facing, 0)
     return np.asarray(texture.color(points_shape) * light[:, None])

@@ -1,7 +1,7 @@
-"""The scene: a textured table with things on it, an arm behind them, fixed cameras about it.
+"""The scene: objects on a textured table, an arm behind, fixed cameras around.
 
-World frame: z up, the table's top at z = 0, the arm's base at the origin, x forward. Views of the
-things from a turntable are in the manner of a DTU scan.
+World frame: z up, the table's top at z = 0, the arm's base at the origin, x forward. Turntable views resemble a DTU
+scan.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,7 +43,7 @@ MIDDLE = (0.60, 0.02, 0.06)  # [m] the middle of the things
 
 
 def furniture() -> list[Primitive]:
-    """Table, floor and three walls; they stand for the room and are obstacles like any other."""
+    """Table, floor and walls, obstacles like any other."""
     return [
         box("table", (1.70, 1.80, 0.05), (0.30, 0.0, -0.025), texture("noise", 0.10, "wood", 1)),
         box("floor", (4.0, 4.0, 0.05), (0.4, 0.0, -0.725), texture("noise", 0.15, "slate", 2)),
@@ -54,7 +54,7 @@ def furniture() -> list[Primitive]:
 
 
 def things() -> list[Primitive]:
-    """What stands on the table from beginning to end."""
+    """Objects on the table throughout."""
     return [
         box(
             "crate", (0.14, 0.18, 0.20), (0.655, 0.315, 0.10), texture("stripes", 0.06, "ocean", 0), np.deg2rad(20.0)
@@ -71,14 +71,14 @@ def things() -> list[Primitive]:
 
 
 def visitor(from_ns: int, to_ns: int, place: Sequence[float] = VISITOR) -> Primitive:
-    """The obstacle that is there for a while only; place: x, y and radius [m]."""
+    """The temporary obstacle; place: x, y and radius [m]."""
     x, y, radius = place
     stands = solid("visitor", "cylinder", (radius, 0.30), (x, y, 0.15), texture("stripes", 0.06, "grape", 2), 0.0)
     return replace(stands, from_ns=from_ns, to_ns=to_ns)
 
 
 def person(from_ns: int, to_ns: int, num_steps: int) -> list[Primitive]:
-    """Who walks along the table's near side instead of the visitor: a place for each of the steps."""
+    """The person along the table's near side, one solid per step."""
     stamps = [from_ns + (to_ns - from_ns) * step // num_steps for step in range(num_steps + 1)]
     grape = texture("noise", 0.05, "grape", 2)
     places = [(0.75 - 0.40 * step / max(num_steps - 1, 1), -0.50, 0.20) for step in range(num_steps)]
@@ -89,7 +89,7 @@ def person(from_ns: int, to_ns: int, num_steps: int) -> list[Primitive]:
 
 
 def cameras(width: int, height: int) -> tuple[Camera, ...]:
-    """Three training cameras and a fourth for scoring between the first two; focal length 0.92 image widths."""
+    """Three training cameras, and a scoring one between the first two; focal length 0.92 widths."""
     scale = width / 320
     intrinsics = Intrinsics(
         fx=295.0 * scale,
@@ -112,13 +112,13 @@ def cameras(width: int, height: int) -> tuple[Camera, ...]:
 
 
 def arm_motion(duration_s: float) -> Motion:
-    """The arm's motion: at rest at first, across the table, at rest at the end."""
+    """Motion across the table, at rest at both ends."""
     waypoints = np.array(WAYPOINTS)
     return Motion(times=np.linspace(0.06, 0.94, len(waypoints)) * duration_s, waypoints=waypoints)
 
 
 def arm_solids(shapes: Sequence[Shape], T_world_links: dict[str, Float64]) -> list[Primitive]:
-    """The arm's shapes as solids at one posture; the pattern is fixed to each link."""
+    """The arm's shapes at one configuration; patterns are fixed to links."""
     return [
         Primitive(
             name=f"{shape.link}.{index}",
@@ -132,7 +132,7 @@ def arm_solids(shapes: Sequence[Shape], T_world_links: dict[str, Float64]) -> li
 
 
 def arm_meshes(surface: RobotSurface) -> Meshes:
-    """The arm's meshes, white as robots are; the pattern is fixed to each link."""
+    """The arm's meshes in white, patterns fixed to links."""
     return Meshes(
         links=surface.links,
         triangles=surface.triangles,
@@ -143,13 +143,13 @@ def arm_meshes(surface: RobotSurface) -> Meshes:
 
 
 def texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:
-    """In two colours of the `PALETTE`."""
+    """A texture in two colours of the `PALETTE`."""
     dark, bright = PALETTE[palette]
     return Texture(pattern=pattern, feature=feature, dark=dark, bright=bright, seed=seed)
 
 
 def turntable_views() -> Iterator[RgbdFrame]:
-    """Exact views of the tabletop's things from an arc of 70 degrees at two heights; the stamp is the number."""
+    """Exact views from a 70-degree arc at two heights; the stamp is the number."""
     width, height = 256, 208  # [px]
     intrinsics = Intrinsics(
         fx=1.15 * width,
@@ -179,7 +179,7 @@ def turntable_views() -> Iterator[RgbdFrame]:
 
 
 def object_mask(frame: RgbdFrame) -> Bool:
-    """(H, W) True where a view shows one of the things, not the furniture."""
+    """(H, W) True where a view shows an object."""
     camera = Camera(
         name=frame.camera, intrinsics=frame.intrinsics, T_world_camera=frame.T_world_camera, is_training=True
     )

@@ -1,4 +1,4 @@
-"""The truth beside a simulated log: what stands where and when, and the exact distance to it."""
+"""The truth of a simulated log: solids over time, and exact distance."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -20,11 +20,10 @@ NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """Obstacles over time, cameras and robot of a simulated log; world frame, metres, nanoseconds.
+    """Obstacles over time, cameras and robot of a simulated log; world frame, m, ns.
 
-    stamps (T,) int64 [ns] of the joint states, clearance (T,) [m] of the arm's moving collision spheres at each, and
-    of the `unmodelled` parts that move with it; luminance_std: the least standard deviation of luminance (0 to 1)
-    over each camera's images.
+    clearance (T,) [m]: of moving collision spheres and `unmodelled` parts, at stamps (T,) int64 [ns] of joint states.
+    luminance_std: by camera, the least standard deviation of luminance (0 to 1).
     """
 
     path: Path
@@ -40,16 +39,16 @@ class Truth:
     unmodelled: tuple[str, ...] = ()
 
     def distance(self, points_world: Float64, stamp_ns: int) -> Float64:
-        """Signed distance (Q,) [m] of points (Q, 3) to everything there at `stamp_ns`, the robot left out."""
+        """Signed distance (Q,) [m] of points (Q, 3) to all but the robot."""
         return distance_to(self.primitives, points_world, stamp_ns)
 
     def closest(self, points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
-        """Signed distance (Q,) [m] and the surface point (Q, 3) that gives it."""
+        """Signed distance (Q,) [m], and its surface point (Q, 3)."""
         return closest_of(self.primitives, points_world, stamp_ns)
 
 
 def distance_to(primitives: Sequence[Primitive], points_world: Float64, stamp_ns: int) -> Float64:
-    """Signed distance (Q,) [m] of points (Q, 3) to the union of what is present; exact outside of everything."""
+    """Signed distance (Q,) [m] of points (Q, 3) to the present solids; exact outside."""
     return closest_of(primitives, points_world, stamp_ns)[0]
 
 
@@ -66,7 +65,7 @@ def distance_along(primitives: Sequence[Primitive], points_world: Float64, stamp
 
 
 def closest_of(primitives: Sequence[Primitive], points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
-    """Signed distance (Q,) [m] and surface point (Q, 3) of the nearest present primitive (inf, NaN where none)."""
+    """Signed distance (Q,) [m] and surface point of the nearest solid (inf, NaN: none)."""
     points = np.asarray(points_world, dtype=np.float64)
     distance = np.full(len(points), np.inf)
     surface = np.full((len(points), 3), np.nan)
@@ -80,7 +79,7 @@ def closest_of(primitives: Sequence[Primitive], points_world: Float64, stamp_ns:
 
 
 def truth_document(truth: Truth) -> dict[str, Any]:
-    """The truth as plain JSON values; `load_truth` reads them back unchanged."""
+    """The truth as JSON values; `load_truth` restores it."""
     return {
         "format": FORMAT,
         "version": VERSIONS[any(p.kind == "capsule" or p.track is not None for p in truth.primitives)],
@@ -114,7 +113,7 @@ def truth_document(truth: Truth) -> dict[str, Any]:
 
 
 def load_truth(path: Path) -> Truth:
-    """The truth file `path`. Raises InputError when it is missing, no truth file, or lacks a part."""
+    """Read a truth file. Raises InputError for another or damaged one."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
