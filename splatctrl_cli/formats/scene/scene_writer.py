@@ -1,4 +1,4 @@
-"""Writes the ``scene/`` folder, and the checkpoint from which an interrupted run goes on."""
+"""A writer of the ``scene/`` folder, and of checkpoints to resume from."""
 
 import csv
 import json
@@ -30,9 +30,10 @@ State = Mapping[str, NDArray[np.generic]]
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
-    """An interrupted run: `progress` as it was given to `SceneWriter.checkpoint`, the fitter's `state`, and what of
-    the folder was written then (bytes of the audit; stamp and number of splats of each snapshot; sha256 of the
-    snapshots' files by name, None in a checkpoint of an older version).
+    """An interrupted run: `SceneWriter.checkpoint`'s `progress`, the fitter's `state`, and the files then.
+
+    audit_bytes: size of the audit. snapshots: (stamp, number of splats). parts: sha256 of the snapshots' files by
+    name, None in an older checkpoint.
     """
 
     progress: dict[str, Any]
@@ -43,7 +44,7 @@ class Checkpoint:
 
 
 def read_checkpoint(folder: Path) -> Checkpoint:
-    """The checkpoint in a partial scene folder. Raises InputError where it cannot be read."""
+    """Read a partial scene's checkpoint. Raises InputError if unreadable."""
     path = folder / CHECKPOINT
     try:
         state = read_arrays(path, most=1 << 32)  # the largest grid takes 2.8e9 bytes, its splats the rest
@@ -60,10 +61,9 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 class SceneWriter:
-    """Writes a scene into a folder as the fitter goes: an empty folder, or one with `SELF_MODEL` or the
-    checkpoint to go on from.
+    """A writer of a scene during fitting, into a folder that is empty or has a checkpoint.
 
-    Snapshots are written while the fitter goes on; what goes wrong with one is raised by the next call.
+    An empty folder may have `SELF_MODEL`. Snapshots are written in the background; the next call raises their errors.
     """
 
     def __init__(self, folder: Path, comments: Mapping[str, str], checkpoint: Checkpoint | None = None) -> None:
@@ -122,9 +122,9 @@ class SceneWriter:
     def snapshot(
         self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, states: UInt8, shell: SplatSet | None = None
     ) -> None:
-        """Write the splats and the shell as they are at `stamp_ns`, and the `states` (X, Y, Z) of the voxels then.
+        """Write splats, shell and voxel `states` (X, Y, Z) of `stamp_ns`.
 
-        The arrays are the writer's from now on. `settle` says when they are in the files.
+        The writer owns the arrays from then on; `settle` waits for the files.
         """
         snapshot = Snapshot(stamp_ns=stamp_ns, path=self._place(len(self.snapshots)), num_splats=len(splats))
 
@@ -138,21 +138,21 @@ class SceneWriter:
         self.snapshots.append(snapshot)
 
     def settle(self, *, but: int = 0) -> None:
-        """Wait until all snapshots, or all but the last so many, are written. Raises what went wrong with one."""
+        """Wait until all snapshots but the last `but` are written. Raises their errors."""
         while len(self._unwritten) > but:
             self._unwritten.popleft().result()
 
     def close(self) -> None:
-        """Wait for the snapshot that is being written, whatever comes of it."""
+        """Wait for the current snapshot, ignoring errors."""
         self._thread.shutdown()
 
     def _write_shell(self, path: Path, stamp_ns: int, shell: SplatSet | None) -> None:
-        """A file of its own: what reads splats does not meet it."""
+        """Write the shell into its own file, which readers of splats skip."""
         if shell is not None and len(shell):
             write_ply(path, shell, self.comments | SHELL | {"stamp_ns": str(stamp_ns)})
 
     def checkpoint(self, progress: Mapping[str, Any], state: State, *, is_last: bool = False) -> None:
-        """Replace the checkpoint in one step, when all that it counts on is on disk; the last is compressed."""
+        """Replace the checkpoint atomically after flushing its files; the last is compressed."""
         self.settle()
         flush(self._audit)
         for snapshot in self.snapshots[self._num_flushed :]:

@@ -240,7 +240,7 @@ def _is_of_lens(name: str) -> bool:
 
 
 def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None:
-    """Write a sorted line per file, in bounded memory: the journal is read once per image folder.
+    """Write a sorted line per file; the journal is read once per image folder to bound memory.
 
     others: sha256 of the remaining files.
     """

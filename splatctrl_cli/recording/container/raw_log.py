@@ -43,7 +43,10 @@ class RawMessage:
 
 @dataclass(kw_only=True)
 class Damage:
-    """What a pass over a log could not read; remarks count unread forms that are no damage."""
+    """A record of the parts of a log that a pass could not read.
+
+    remarks: counts of what is no damage, such as messages of an unsupported form.
+    """
 
     count: int = 0
     notes: list[str] = field(default_factory=list)

@@ -104,8 +104,8 @@ def _numbers(seconds: Float64, period: float) -> Float64:
 def differentiated(stamp_ns: Stamps, position: Float64) -> Float64:
     """Velocities (T, J) [1/s] of positions (T, J) at rising stamps (T,) [ns].
 
-    Each is the slope of a parabola through the state and two neighbours on either side (Savitzky-Golay for uneven
-    steps), on the smoothed clock, never across a gap. A lone state has velocity 0.
+    Each is the slope of a parabola through the state and two neighbours on either side: Savitzky-Golay for uneven
+    steps. It uses the smoothed clock and never spans a gap. A lone state has velocity 0.
     """
     return np.concatenate([np.zeros((0, *position.shape[1:])), *(v for _, v in slopes_by_block(stamp_ns, position))])
 
