@@ -31,7 +31,7 @@ _PNG_CHUNKS = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}  # that must be understood
 
 @dataclass(frozen=True, kw_only=True)
 class ImageHead:
-    """Size [px], channels (1 or 3) and bits per channel of a file kept as it is."""
+    """Size [px], channels (1 or 3) and bits per channel of an undecoded file."""
 
     width: int
     height: int
@@ -126,7 +126,7 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
 
 
 def _says_more_than_it_holds(png: bytes) -> bool:
-    """True if a PNG announces an image or chunk beyond its bytes: OpenCV would allocate either.
+    """True if a PNG announces more than its bytes: OpenCV would allocate it.
 
     Also true without pixels, or with an unknown critical chunk.
     """

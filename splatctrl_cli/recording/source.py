@@ -51,7 +51,7 @@ __all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_s
 
 
 def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth: bool = True) -> FrameSource:
-    """Open an MCAP, ROS bag, capture, dataset folder or file, or image folder's TOML as records.
+    """Open an MCAP, ROS bag, capture, dataset or image folder's TOML as records.
 
     Raises InputError if missing, unusable, or without required depth.
     """

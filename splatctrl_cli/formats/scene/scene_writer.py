@@ -61,7 +61,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 class SceneWriter:
-    """A writer of a scene during fitting, into a folder that is empty or has a checkpoint.
+    """A writer of a scene during fitting, into an empty or a checkpoint's folder.
 
     An empty folder may have `SELF_MODEL`. Snapshots are written in the background; the next call raises their errors.
     """

@@ -100,9 +100,9 @@ def read_states(path: Path) -> OccupancyGrid:
 
 
 def read_seen(path: Path) -> SeenVoxels | None:
-    """Read only when voxels of either file were last seen: a replay does so five times a second.
+    """Read when voxels of either file were last seen, and no more, for replay speed.
 
-    None for an older file. Raises InputError for another one.
+    A replay does so five times a second. None for an older file. Raises InputError for another one.
     """
     with _refused(path, _OURS):
         header = _read_header(path)
@@ -227,7 +227,7 @@ def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Map
 
 
 def known_space(grid: OccupancyGrid, thresholds: OccupancyConfig) -> dict[str, object]:
-    """Extent [m] of a grid, its share in each `VoxelState`, and its robot and human voxels.
+    """Summarise a grid: extent [m], share of each `VoxelState`, robot and human voxels.
 
     Keys are the states' names in lower case, as in other commands and files.
     """

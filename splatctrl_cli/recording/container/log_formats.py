@@ -1,4 +1,4 @@
-"""Recorded logs opened by content: a file, a ROS 2 bag folder, or several logs of a session.
+"""Recorded logs opened by content: files, ROS 2 bag folders, logs of one session.
 
 Files or messages may be compressed with zstd.
 """

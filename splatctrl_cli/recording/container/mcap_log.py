@@ -1,4 +1,4 @@
-"""The messages of an MCAP file by its own records, and its index without a full read.
+"""An MCAP file's messages by its own records, and its index without a full read.
 
 Damage is skipped and counted. The `mcap` package's readers allocate what a record announces. Its indexed reader
 raises on valid files without a summary, and yields nothing from a truncated one.

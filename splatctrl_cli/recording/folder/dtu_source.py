@@ -1,4 +1,4 @@
-"""A DTU scan (MVSNet's or IDR's layout) as a record source of training and held-out views."""
+"""A DTU scan (MVSNet or IDR) as a record source of training and held-out views."""
 
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
@@ -26,7 +26,7 @@ def view_numbers(words: Sequence[str]) -> list[int]:
 
 
 class DtuSource:
-    """The views of a scan by number (view 0 is ``rect_001``), which is also the stamp.
+    """A scan's views by number (view 0 is ``rect_001``), which is also the stamp.
 
     The scene is static, so there is no clock. Views in `holdout` belong to camera ``holdout``, others to ``camera``;
     a `protocol` instead assigns or drops views. masks, depths: folders for what the layout does not have. downscale:

@@ -268,7 +268,7 @@ def _holdout(description: Description, names: list[str], options: SourceOptions)
 
 
 def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
-    """The layout's stamp, else by file name, by frame number and rate, or (no clock) one second a frame."""
+    """The stamp by layout, file name or frame number and rate; else one second a frame."""
     stamps = description.stamps
     if view.stamp_ns is not None:
         return view.stamp_ns

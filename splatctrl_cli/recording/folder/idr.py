@@ -1,7 +1,7 @@
 """DTU scans in the layout of IDR and NeuS.
 
-SCAN/cameras_sphere.npz (or cameras.npz) with world_mat_I, the projection (4, 4) of world points to pixels of image I,
-and scale_mat_I, from the unit sphere around the object to the world; SCAN/image/000000.png; SCAN/mask/000.png.
+SCAN/cameras_sphere.npz (or cameras.npz) with world_mat_I, the projection (4, 4) of world points to pixels of image I.
+scale_mat_I maps the unit sphere around the object to the world. SCAN/image/000000.png; SCAN/mask/000.png.
 Image I is the I-th by name (Totoro97/NeuS, models/dataset.py); if images are missing, the one named by that number.
 World lengths are millimetres there, metres here. The layout has no depth; ours may be in SCAN/depth as MVSNet's
 depth_map_0000.pfm (and depth_visual_0000.png).
@@ -123,9 +123,10 @@ def _sphere(views: Sequence[DtuView]) -> tuple[Float64, float]:
 
 
 def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
-    """Split P (3, 4) of world points [mm] into K (3, 3), K[2, 2] = 1, and T_world_camera (4, 4) [m].
+    """Split P (3, 4) of world points [mm] into K (3, 3) and T_world_camera (4, 4) [m].
 
-    P = s K [R | t] with any scale s, even negative; the camera is where P is 0. Raises InputError if P is no camera.
+    P = s K [R | t] with K[2, 2] = 1 and any scale s, even negative; the camera is where P is 0. Raises InputError if
+    P is no camera.
     """
     M = P[:, :3]
     determinant = np.linalg.det(M)
@@ -138,7 +139,7 @@ def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
 
 
 def _numbered(folder: Path, num: int) -> dict[int, Path]:
-    """Images by camera number: in order if there is one for each of `num`, else by their names.
+    """Images by camera number: in order if there are `num`, else by name.
 
     Raises InputError for a name that is no such number.
     """

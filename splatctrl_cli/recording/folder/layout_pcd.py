@@ -1,4 +1,4 @@
-"""Organised PCL point clouds: a ``.pcd`` with a point per pixel, or a folder of them.
+"""Organised PCL point clouds: a ``.pcd`` with a point per pixel, or a folder.
 
 The format is PCL's tutorial "The PCD file format" (v0.7; ascii, binary, binary_compressed), read by pypcd4 (extra
 `pcd`). It has no intrinsics, but its grid does: column u, row v is on that pixel's ray. VIEWPOINT is the camera's
@@ -43,7 +43,10 @@ _AGAIN = "copy the file again"
 
 @dataclass(frozen=True, kw_only=True)
 class Cloud:
-    """A cloud as written: points (H, W, 3) float64, NaN without one, color (H, W, 3) uint8 RGB, VIEWPOINT."""
+    """A cloud as written: points (H, W, 3) float64, color (H, W, 3) uint8 RGB, VIEWPOINT.
+
+    A missing point is NaN.
+    """
 
     points: Float64
     color: UInt8
@@ -72,7 +75,7 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def pinhole_of(points: Float64) -> Intrinsics | None:
-    """Fit a pinhole whose pixel (u, v) contains the point (H, W, 3) of row v, column u.
+    """Fit a pinhole whose pixel (u, v) sees the point (H, W, 3) of row v, column u.
 
     Least squares over u and v; None with too few points in front, or if none fits.
     """

@@ -38,7 +38,7 @@ def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Flo
 
 
 def rigid(matrix: Float64, where: str) -> Float64:
-    """Replace the rotation of a matrix (4, 4) by the nearest one, against rounding in text.
+    """Replace a matrix's (4, 4) rotation by the nearest one, against rounding in text.
 
     Raises InputError for scale, shear, mirror or NaN.
     """
@@ -95,7 +95,7 @@ def tum_rows(path: Path) -> dict[str, Float64 | None]:
 
 
 def read_matrix_lines(path: Path) -> dict[str, Float64]:
-    """Read a matrix per line, 4x4 or 3x4 by rows (KITTI), by line number from 0."""
+    """Read a 4x4 or 3x4 (KITTI) matrix per line, by line number from 0."""
     poses: dict[str, Float64] = {}
     for where, _, values in read_rows(path):
         if len(values) not in {12, 16}:

@@ -1,4 +1,4 @@
-"""A ROS log as records: cameras found, colour and depth paired, poses from tf, joints ordered.
+"""A ROS log as records: paired images, poses from tf, joints in one order.
 
 The first pass takes all but the images, as transforms may follow images that need them, and plans every frame. The
 second takes only planned images, as few at once as the log's order allows. For `ingest`, files that a capture can
