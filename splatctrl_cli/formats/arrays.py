@@ -1,8 +1,8 @@
 """Arrays in ``.npz`` without timestamps (same arrays, same bytes), read within a size limit.
 
-The limit: ten megabytes of ``.npz`` can expand to ten gigabytes of zeros. Files of arrays (T, ...) are read as
-columns in blocks of rows: NPZ, HDF5 and Parquet (extra `tables`: h5py, pyarrow). HDF5 names arrays by path
-(``observations/qpos``), Parquet by column; a column of equal lists is an array (T, K).
+Ten megabytes of ``.npz`` can hide ten gigabytes of zeros. NPZ, HDF5 and Parquet (extra `tables`: h5py, pyarrow) are
+read in blocks of rows (T, ...). HDF5 names arrays by path (``observations/qpos``), Parquet by column; equal lists
+make an array (T, K).
 """
 
 import tokenize
@@ -60,8 +60,7 @@ def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, lev
 def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, NDArray[np.generic]]:
     """Read the arrays `names` (default: all) of a ``.npz``, at most `most` bytes together.
 
-    Raises OSError, KeyError for a missing array, ValueError for objects, more bytes than `most` or than the array's
-    head says, and what is in `DAMAGE`.
+    Raises OSError, KeyError for a missing array, ValueError for objects or another size than announced, and `DAMAGE`.
     """
     with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
         chosen = (
@@ -125,9 +124,9 @@ def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> ND
 
 
 def npy_of(data: bytes) -> NDArray[np.generic]:
-    """Return the array of ``.npy`` bytes. Raises ValueError for objects or too few bytes.
+    """The array of ``.npy`` bytes, allocated only if they suffice, unlike `np.load`.
 
-    `np.load` would allocate what the header announces first.
+    Raises ValueError for objects or too few bytes.
     """
     return _array(BytesIO(data), "", len(data), None)
 
@@ -153,10 +152,7 @@ class ArrayFile(ABC):
         """Yield an array's rows, about `BLOCK` at a time. Raises InputError if unreadable."""
 
     def columns(self, names: Sequence[str]) -> Rows:
-        """Return the arrays' columns (T, K) side by side.
-
-        Raises InputError for arrays that are missing, not numbers, or of several lengths.
-        """
+        """Arrays side by side as columns (T, K). Raises InputError if missing, not numbers or of several lengths."""
         headers = [self._checked(name) for name in names]
         lengths = [shape[0] for shape, _ in headers]
         if len(set(lengths)) > 1:
@@ -197,7 +193,6 @@ class ArrayFile(ABC):
         return np.asarray(whole.astype(np.int64) * unit_ns + parts + epoch_ns)
 
     def _checked(self, name: str, *, least: int = 1, kinds: str = "iuf") -> tuple[tuple[int, ...], np.dtype[Any]]:
-        """Return shape and dtype of an array of at least `least` rows of these kinds."""
         header = self._header(name)
         if header is not None and header[1].kind in kinds and header[0]:
             shape, dtype = header
@@ -263,7 +258,6 @@ class NpzFile(ArrayFile):
                 raise self._unreadable("NPZ", error) from None
 
     def _opened(self, stack: ExitStack, name: str) -> tuple[tuple[int, ...], np.dtype[Any], bool, IO[bytes]]:
-        """Return shape, dtype, is_by_columns, and the stream after the header."""
         try:
             stream = stack.enter_context(stack.enter_context(zipfile.ZipFile(self.path)).open(f"{name}.npy"))
             shape, is_by_columns, dtype = npy_head(stream)
@@ -345,7 +339,6 @@ class ParquetFile(ArrayFile):
         return ((0,), np.dtype(np.float64)) if block is None else ((self._num, *block.shape[1:]), block.dtype)
 
     def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
-        """Yield the rows. Raises InputError for lists that differ in length."""
         shape: tuple[int, ...] | None = None
         names = [name] if self._only is None else list(dict.fromkeys([name, self._only[0]]))
         with self._opened() as file:
@@ -360,7 +353,7 @@ class ParquetFile(ArrayFile):
                     yield values
 
     def _values(self, column: Any, name: str) -> NDArray[Any]:
-        """Return a column (T, ...); missing floats are NaN."""
+        """A column (T, ...); missing floats are NaN."""
         if not hasattr(column.type, "value_type") or self._arrow.types.is_dictionary(column.type):
             return np.asarray(column.to_numpy(zero_copy_only=False))
         if column.null_count or len(set(column.value_lengths().to_numpy(zero_copy_only=False).tolist())) > 1:

@@ -42,8 +42,8 @@ class ImageHead:
 def image_head(data: bytes) -> ImageHead | None:
     """Read the head of a whole, plain JPEG or PNG; None for others, which need decoding.
 
-    Plain: Huffman-coded JPEG of 8 bits, grey or of three channels, with its closing mark; PNG of grey or RGB without
-    transparency or interlace, with right checksums in all chunks (ITU-T T.81; W3C PNG).
+    Plain: Huffman-coded 8-bit JPEG of one or three channels, with its closing mark; grey or RGB PNG without
+    transparency or interlace, all checksums right (ITU-T T.81; W3C PNG).
     """
     head = (_jpeg_head if data.startswith(JPEG) else _png_head)(data)
     return None if head is None or not 0 < head.width * head.height <= MOST_PIXELS else head
@@ -106,7 +106,7 @@ def _png_head(data: bytes) -> ImageHead | None:
 def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
     """Decode a JPEG, PNG, WebP, ..., ignoring its orientation tag; None if invalid or truncated.
 
-    color: 8-bit RGB; else as OpenCV has it, three channels as BGR. OpenCV would fill a cut JPEG with grey.
+    color: 8-bit RGB; else as OpenCV has it, in BGR. OpenCV alone would fill a cut JPEG with grey.
     """
     if any(data.startswith(start) and end not in data[-TAIL:] for start, end in _CLOSING_MARKS):
         return None
@@ -126,9 +126,9 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
 
 
 def _says_more_than_it_holds(png: bytes) -> bool:
-    """True if a PNG announces more than its bytes: OpenCV would allocate it.
+    """True if a PNG announces more than its bytes (OpenCV would allocate it).
 
-    Also true without pixels, or with an unknown critical chunk.
+    Also without pixels, or with an unknown critical chunk.
     """
     if len(png) < _PNG_HEAD.size:
         return True
@@ -151,7 +151,7 @@ def write_pfm(path: Path, image: Float32) -> None:
 def read_pfm(path: Path) -> Float32:
     """Read a grey PFM (H, W) float32 of either byte order; |scale| must be 1.
 
-    Raises InputError if missing, of another format, or of another length than its header's.
+    Raises InputError if missing, of another format or length.
     """
     content = read_bytes(path)
     header = re.match(rb"(PF|Pf)\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s", content[:128])

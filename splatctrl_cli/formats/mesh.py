@@ -16,9 +16,9 @@ STL_HEADER, STL_FACE = 84, 50  # bytes; the header ends with the number of faces
 
 @dataclass(frozen=True, kw_only=True)
 class TriangleMesh:
-    """vertices (V, 3) float64 [m]; faces (F, 3) int64, counter-clockwise seen from outside.
+    """vertices (V, 3) float64 [m]; faces (F, 3) int64, counter-clockwise from outside.
 
-    is_closed: every edge has two faces with opposite directions, so there is an inside. note: ignored parts of the
+    is_closed: every edge has two faces in opposite directions, so there is an inside. note: ignored parts of the
     file.
     """
 
@@ -36,9 +36,9 @@ class TriangleMesh:
 def load_mesh(path: Path) -> TriangleMesh:
     """Load a mesh that trimesh reads (OBJ, STL, PLY, OFF, GLB, COLLADA), all parts as one.
 
-    Vertices at one place are merged, whatever their texture and normal: a texture seam is not a hole. COLLADA is
-    scaled by its unit; its up axis is ignored, as in RViz. Bytes after a binary STL's faces are ignored, with a note.
-    Raises InputError if unreadable, without triangles, or with a coordinate that is not finite.
+    Vertices at one place are merged: a texture seam is not a hole. COLLADA is scaled by its unit; its up axis is
+    ignored, as in RViz. Bytes after a binary STL's faces are ignored, with a note. Raises InputError if unreadable,
+    without triangles, or not finite.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected a mesh, got no such file")
@@ -67,7 +67,7 @@ def load_mesh(path: Path) -> TriangleMesh:
 
 
 def _opened(path: Path) -> tuple[BytesIO | Path, str]:
-    """Return a binary STL without bytes after its faces, and a note; or a text as UTF-8."""
+    """A binary STL without bytes after its faces, and a note; or a text as UTF-8."""
     content = path.read_bytes()
     num = int.from_bytes(content[STL_HEADER - 4 : STL_HEADER], "little")
     end = STL_HEADER + STL_FACE * num  # of a text: gigabytes
@@ -89,6 +89,6 @@ def _opened(path: Path) -> tuple[BytesIO | Path, str]:
 
 
 def _collada_unit(path: Path) -> float:
-    """Metres per unit of a COLLADA file."""
+    """Metres per unit."""
     unit = ElementTree.parse(path).find("{*}asset/{*}unit")
     return 1.0 if unit is None else float(unit.get("meter", "1"))

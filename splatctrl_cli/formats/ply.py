@@ -96,9 +96,9 @@ class _Element:
 
 
 def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
-    """Read an element of a PLY file (ASCII or binary, either byte order) with the `required` properties.
+    """Read an element of a PLY (ASCII or binary, either byte order) with the `required` properties.
 
-    Raises InputError if missing, no PLY, truncated, too long, compressed, or without a property.
+    Raises InputError if missing, no PLY, of another length, compressed, or without a property.
     """
     content = read_bytes(path)
     form, elements, comments, length = _parse_header(path, content)
@@ -131,9 +131,9 @@ def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) 
 def write_table(path: Path, rows: NDArray[Any], comments: Mapping[str, str]) -> None:
     """Write `rows` (float32 and uint8 fields) as element vertex. Same input, same bytes.
 
-    Comments follow the properties, as some readers expect the vertex count in line three. Characters outside ASCII
-    become backslash escapes, as readers stop at them. Raises UsageError for a comment of several lines, or a key with
-    a colon.
+    Some readers expect the vertex count in line three, so comments follow the properties. They stop at characters
+    outside ASCII, which become backslash escapes. Raises UsageError for a comment of several lines, or a key with a
+    colon.
     """
     fields: Mapping[str, Any] = rows.dtype.fields or {}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
@@ -186,7 +186,7 @@ def _read_ascii(
 
 
 def _parse_header(path: Path, content: bytes) -> tuple[str, list[_Element], list[str], int]:
-    """Return format, elements, comments and header length [bytes]."""
+    """Format, elements, comments and header length [bytes]."""
     if not content.startswith((b"ply\n", b"ply\r\n")):
         raise InputError(f"{path}: no PLY file: expected it to start with 'ply', got {content[:8]!r}")
     end = content.find(b"\nend_header")
@@ -240,7 +240,6 @@ def read_positions(path: Path) -> Float64:
 
 
 def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
-    """Return properties (N, K) of at least one point."""
     ply = read_table(path, "vertex", ())
     missing = [name for name in names if name not in ply]
     if missing:
@@ -266,11 +265,11 @@ _Line = tuple[int, list[str]]
 
 
 def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
-    """Yield points (Q, 3) float64 [m] of a CSV's x, y, z, at most `POINTS_PER_BLOCK` at once.
+    """Yield a CSV's points (Q, 3) float64 [m] of x, y, z, at most `POINTS_PER_BLOCK` at once.
 
-    Without a header (a first line not all numbers), it must have three columns. Ignores other columns and empty
-    lines. Raises InputError naming `name`, line and column: a missing column, a line of another length, or no finite
-    number within `MAX_PLACE`.
+    A first line of numbers is no header, and then has three columns. Ignores other columns and empty lines. Raises
+    InputError naming `name`, line and column for a missing column, another length, or no finite number within
+    `MAX_PLACE`.
     """
     reader = csv.reader(stream)
     lines: Iterator[_Line] = ((reader.line_num, row) for row in reader if row)
@@ -294,7 +293,7 @@ def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
 
 
 def _axes(name: str, cells: Sequence[str]) -> list[int] | None:
-    """Return the columns of x, y and z; None if the first line is a point."""
+    """Columns of x, y and z; None if the line is a point."""
     if len(cells) == 3 and all(_number(cell) is not None for cell in cells):
         return None
     titles = [cell.strip().lstrip("\ufeff").lower() for cell in cells]
@@ -321,7 +320,6 @@ def _numbers(name: str, block: Sequence[_Line], columns: Sequence[int], num_colu
 
 
 def _first_wrong(name: str, block: Sequence[_Line], columns: Sequence[int], num_columns: int) -> InputError:
-    """Return the error for a block's first wrong line."""
     for number, row in block:
         if len(row) != num_columns:
             return InputError(

@@ -46,10 +46,9 @@ class Budget:
 
 
 def unpacked(data: bytes, compression: str, size: int, largest: int = MAX_BLOCK) -> bytes:
-    """Unpack the `size` bytes in `data`.
+    """Unpack the `size` bytes in `data`, never making more.
 
-    Raises BadBlockError for unknown or broken compression, more than `largest` announced, or another size than
-    announced (never making more).
+    Raises BadBlockError for unknown or broken compression, over `largest`, or another size.
     """
     if size > largest:
         raise BadBlockError(f"announces {size} bytes unpacked, at most {largest} are read")

@@ -118,9 +118,9 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
 class CalibratedSource(Recording):
     """Another source's records, corrected by a calibration.
 
-    Joint states move to the frames' clock. A moving camera has its recorded pose at the frame's time on the robot's
-    clock: from a log's transforms, else between the poses of frames. Frames without a pose within `tolerance_ns` are
-    left out and counted.
+    Joint states move to the frames' clock. A moving camera's pose is recorded at the frame's time on the robot's
+    clock: by a log's transforms, else between frames. Frames without a pose within `tolerance_ns` are left out and
+    counted.
     """
 
     def __init__(self, source: FrameSource, correction: Correction, tolerance_ns: int = 0) -> None:
@@ -208,7 +208,6 @@ class CalibratedSource(Recording):
 
     @cached_property
     def _num_without_pose(self) -> int:
-        """Frames that lose their pose by the clock."""
         return sum(self._pose(*frame) is None for frame in self.inner.poses())
 
     @cached_property
@@ -244,8 +243,8 @@ LIMITS = {"depth-noise": 1.0, "pose-error": 10.0, "pose-turn": 180.0, "seed": 2*
 class Perturbation:
     """Errors drawn from `seed`: twice the size is twice the same error.
 
-    depth_noise: a pixel's standard deviation at 1 m [m]; it grows with depth squared, as for stereo. pose_error [m],
-    pose_turn [degrees]: each camera's displacement and turn, the same in all frames.
+    depth_noise: standard deviation at 1 m [m]; it grows with depth squared, as for stereo. pose_error [m], pose_turn
+    [degrees]: per camera, the same in all frames.
     """
 
     depth_noise: float = 0.0

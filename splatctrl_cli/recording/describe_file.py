@@ -95,7 +95,7 @@ def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], n
 
 
 def _parsed(path: Path, parse: Callable[[], Any], what: str) -> Any:
-    """Run `parse`. Raises InputError if the file is not `what`."""
+    """Run `parse`. Raises InputError if it fails."""
     try:
         return parse()
     except (ValueError, EOFError, ParseError, yaml.YAMLError) as error:  # ValueError: what defusedxml forbids, too
@@ -178,7 +178,6 @@ def _image(path: Path, _head: bytes) -> Summary:
 
 
 def _find(content: Any, key: str) -> Any:
-    """Find `key` at any depth of nested tables."""
     if not isinstance(content, dict):
         return None
     if key in content:
@@ -187,7 +186,7 @@ def _find(content: Any, key: str) -> Any:
 
 
 def _short(value: object) -> object:
-    """Keep plain values and small tables; replace long lists by their length."""
+    """Shorten long lists to their length."""
     if isinstance(value, list) and (len(value) > _LIST_LIMIT or any(isinstance(v, list | dict) for v in value)):
         return f"{len(value)} entries"
     if isinstance(value, dict):

@@ -62,7 +62,6 @@ def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth
 
 
 def _opened(path: Path, options: SourceOptions, *, needs_depth: bool) -> FrameSource:
-    """Open as recorded."""
     if path.suffix == ".toml" or (not is_capture(path) and has_views(path)):
         source = open_image_folder(path, options) if path.suffix == ".toml" else open_layout(path, options)
         if needs_depth and (refusal := lacks_depth(source)) is not None:
@@ -198,7 +197,6 @@ def _topic_row(entry: TopicSurvey) -> list[object]:
 
 
 def _is_read(entry: TopicSurvey) -> bool:
-    """True if a command can read the topic."""
     name, kind = entry.topic.name, entry.topic.type_name or ""
     types = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS)
     return kind in types or kind.startswith("geometry_msgs/") or name.endswith(f"/{ROBOT}")
@@ -262,7 +260,7 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
 
 
 def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
-    """A scene's final known space, by its own thresholds."""
+    """A scene's final space by its own thresholds."""
     run: Mapping[str, Any] = describe_file(path / "run.json").facts if has_run else {}
 
     def used(name: str, default: float) -> float:
@@ -283,7 +281,7 @@ def _probability(value: Any) -> float:
 
 
 def _field_facts(path: Path) -> dict[str, object]:
-    """A distance grid's extent and making; empty for another file."""
+    """A grid's facts, empty for another file."""
     header: Mapping[str, Any] = describe_file(path).facts
     if header.get("format") != FORMAT or not {"shape", "first_cell", "voxel"} <= header.keys():
         return {}

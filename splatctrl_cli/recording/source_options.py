@@ -38,13 +38,12 @@ class PoseTopic:
 class SourceOptions:
     """The user's settings for an input; the defaults fit a well-formed log.
 
-    world_frame: frame of poses (default: tf's root). cameras: only these (default: all). By camera name:
-    camera_topics instead of those found; camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw, instead of
-    recorded ones; camera_pose_topics: pose topics if tf has none; human_topics: images not 0 on a person; intrinsics:
-    fx, fy, cx, cy [px] and distortion coefficients, instead of recorded ones. depth_scale [m per count]. root: folder
-    of an image folder's files. holdout: frames (index or name) of an image folder for camera `holdout`. stamps:
-    ``header``, or ``log`` for log times. calibration: a file of `calibrate`. perturb: changes to frames, by name
-    (`calibrated`).
+    world_frame: of poses (default: tf's root). cameras: only these (default: all). By camera name: camera_topics
+    instead of those found; camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw; camera_pose_topics if tf
+    has none; human_topics: images not 0 on a person; intrinsics: fx, fy, cx, cy [px] and distortion coefficients,
+    instead of recorded ones. depth_scale [m per count]. root: of an image folder's files. holdout: its frames (index
+    or name) for camera `holdout`. stamps: ``header``, or ``log`` for log times. calibration: a file of `calibrate`.
+    perturb: changes to frames (`calibrated`).
     """
 
     world_frame: str | None = None

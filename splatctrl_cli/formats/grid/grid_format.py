@@ -1,9 +1,9 @@
 """The file formats of a baked distance grid: declarations, channels and headers.
 
-A channel may be a memory map larger than memory, so functions hold at most `CHUNK` bytes of it.
+A channel may be a memory map larger than memory, so functions copy at most `CHUNK` bytes at once.
 
-`GridSlabs` fills a grid on disk along x. A folder has one ``NAME.npy`` per channel, at full size from the start, and
-``progress.json``: the plan and the layers of x on disk. A slab of layers is one run of bytes in each file, so an
+`GridSlabs` fills a grid on disk along x: one ``NAME.npy`` per channel, at full size from the start, and
+``progress.json`` with the plan and finished layers. A slab of layers is one run of bytes in each file, so an
 interrupted bake can continue.
 """
 
@@ -97,7 +97,7 @@ def parse_header(name: str, text: str) -> dict[str, object]:
 
 
 def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -> Shape:
-    """Return the cells along x, y, z of channels given as dtype and shape.
+    """Cells along x, y, z of channels given as dtype and shape.
 
     Raises InputError without sdf, or for an unknown name, dtype or shape.
     """
@@ -168,11 +168,11 @@ def from_x_fastest(planes: NDArray[np.generic]) -> NDArray[np.generic]:
 class GridFormat:
     """A file format, listed in its module's ``ENTRIES``, for the program and its docs.
 
-    `name` is the --formats value. `write` writes to a path that ends in `suffix`, or one file per channel if
-    `is_per_channel`. `describe` takes a path and its first bytes, and returns None for another kind. A grid must have
-    one of the channels `needs`. With `holds_unknown`, cells can lack a distance. `bytes_per_cell` is on disk; None
-    means that of all channels. `check` raises UsageError for a missing library. `docs` is the row in
-    docs/artefacts.md, cells between bars: name, file, who opens it, checked, cost.
+    `name`: the --formats value. `write`: to a path with `suffix`, or a file per channel if `is_per_channel`.
+    `describe`: from a path and its first bytes; None for another kind. `needs`: channels, one of which is required.
+    `holds_unknown`: cells can lack a distance. `bytes_per_cell`: on disk, None for all channels' bytes. `check`
+    raises UsageError without a library. `docs`: row in docs/artefacts.md, cells between bars: name, file, who opens
+    it, checked, cost.
     """
 
     name: str
@@ -259,9 +259,9 @@ class GridSlabs:
         self.num_layers, self.counts = num_layers, counts or {}
 
     def write(self, slab: Mapping[str, NDArray[np.generic]], counts: Mapping[str, int] | None = None) -> None:
-        """Write the next x layers, ``(L, Y, Z[, 3])`` per channel, then the progress with `counts`.
+        """Write the next x layers, ``(L, Y, Z[, 3])`` per channel, then the progress.
 
-        Raises InputError if channels or shapes differ from the plan.
+        counts: the baker's, recorded with it. Raises InputError if channels or shapes differ from the plan.
         """
         if slab.keys() != set(self.plan.channels):
             raise InputError(f"slab: expected the channels {', '.join(self.plan.channels)}, got {', '.join(slab)}")
@@ -324,9 +324,9 @@ def start_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
 
 
 def resume_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
-    """Return the store of an interrupted bake of this plan, or a new one.
+    """The store of an interrupted bake of this plan, or a new one.
 
-    Raises UsageError naming the differences for another plan, InputError for a damaged store.
+    Raises UsageError naming another plan's differences, InputError if damaged.
     """
     try:
         progress = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))

@@ -1,7 +1,6 @@
 """The zero surface of a baked distance as a triangle mesh: ``.ply``, ``.obj``, ``.stl``.
 
-Marching cubes of scikit-image (Lewiner et al. 2003) by slab of the grid; slabs share a layer of cells, where equal
-vertices are joined.
+Marching cubes of scikit-image (Lewiner et al. 2003) by slab; slabs share a layer of cells, where vertices are joined.
 """
 
 from dataclasses import dataclass
@@ -100,7 +99,7 @@ def _marching_cubes(slab: Float32, is_known: NDArray[np.bool_]) -> tuple[Float64
 
 
 def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> Surface:
-    """Merge equal vertices, in world, and drop triangles that lost a corner."""
+    """Merge equal vertices, in world; drop collapsed triangles."""
     unique, index = np.unique(np.round(vertices / STEP), axis=0, return_inverse=True)
     joined = index.reshape(-1)[faces]
     first, second, third = joined.T

@@ -51,8 +51,8 @@ def write_npz(path: Path, grid: DistanceGrid) -> None:
 def read_npz(path: Path) -> DistanceGrid:
     """Read the grid of `write_npz`; never unpickles.
 
-    Raises InputError if missing, damaged, of another version or not ours. It checks members, types, shapes, checksums
-    and finiteness (NaN is allowed in sdf and gradient if the header's ``unknown`` is ``nan``).
+    Raises InputError if missing, damaged, of another version or not ours; types, shapes, checksums and finiteness are
+    checked. NaN is allowed in sdf and gradient if the header's ``unknown`` is ``nan``.
     """
     with _opened(path) as archive:
         head = _head(path, archive, _members(archive))
@@ -90,7 +90,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _members(archive: zipfile.ZipFile) -> _Members:
-    """Type and shape by name. Raises ValueError if the archive's sizes disagree."""
+    """Type and shape by name. Raises ValueError if sizes disagree."""
     members: _Members = {}
     for entry in archive.infolist():
         name = entry.filename.removesuffix(".npy")

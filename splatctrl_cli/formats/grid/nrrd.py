@@ -1,9 +1,8 @@
 """Baked distance fields as ``.nrrd``, a file per channel, for 3D Slicer, ITK and pynrrd.
 
 Format: http://teem.sourceforge.net/nrrd/format.html (NRRD0005, attached header, raw little-endian values). x is
-fastest, so that `nrrd.read` gives ``values[x, y, z]``; a gradient is ``values[component, x, y, z]``. Header entries
-are pairs ``splatctrl.KEY`` of JSON text. pynrrd could write this, but adds a timestamp and needs whole channels in
-memory.
+fastest: `nrrd.read` gives ``values[x, y, z]``, for a gradient ``values[component, x, y, z]``. Header entries are
+pairs ``splatctrl.KEY`` of JSON text. pynrrd would add a timestamp and need whole channels in memory.
 """
 
 import json

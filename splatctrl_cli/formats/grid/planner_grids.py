@@ -1,19 +1,18 @@
 """Baked grids for other planners: NVIDIA's cuRobo and MoveIt.
 
-cuRobo: its voxel grid as ``field.curobo.npz``, which its user loads in a few lines. Follows its source
-(NVlabs/curobo, 0.7.5 to 0.7.7: geom/types.py `VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu `compute_voxel_index`),
-not tried on it. It flattens (x, y, z) with z fastest and places the grid by its middle's pose, ``x y z qw qx qy qz``.
-Values are positive inside; ``1 + floor(dims / voxel)`` cells a side.
+cuRobo's voxel grid is ``field.curobo.npz``, which a few lines load. It follows the source (NVlabs/curobo, 0.7.5 to
+0.7.7: geom/types.py `VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu `compute_voxel_index`), untested on it. (x, y, z)
+is flattened with z fastest; the grid is placed by its middle's pose, ``x y z qw qx qy qz``. Values are positive
+inside; ``1 + floor(dims / voxel)`` cells a side.
 
 The kernel truncates ``(x - pose + dims / 2) / voxel``: cell i spans ``pose - dims / 2 + [i, i + 1] voxel``, so the
-pose is half a voxel below our cells' middle. A sphere takes the value of its centre's cell. The first three and last
-two cells of an axis, and the outside, are free. (0.7.0 to 0.7.4 count cells otherwise, and add half a voxel to
-values.)
+pose is half a voxel below our cells' middle. A sphere takes its centre's cell. The first three and last two cells of
+an axis, and the outside, are free. (0.7.0 to 0.7.4 count cells otherwise, and add half a voxel to values.)
 
-MoveIt: occupied cells as its distance field's stream, which propagates distances itself: moveit_core,
+MoveIt's distance field reads occupied cells and propagates distances itself: moveit_core,
 distance_field/src/propagation_distance_field.cpp (`readFromStream`; the same in MoveIt 1 and 2) and voxel_grid.h.
-Seven lines of text, then a zlib stream of bits: x slowest, each run of z in whole bytes, lowest bit first. The reader
-takes ``int(size * (1 / resolution))`` cells a side; cell 0 has its centre at the origin.
+Seven lines of text precede a zlib stream of bits: x slowest, each run of z in whole bytes, lowest bit first. There
+are ``int(size * (1 / resolution))`` cells a side; cell 0 is centred at the origin.
 """
 
 import json
@@ -106,8 +105,8 @@ ROUNDING = 1e-6  # [m] of float32 values a metre or two from their origin
 def write_moveit(path: Path, grid: DistanceGrid) -> None:
     """Write occupied cells: a splat may reach the cell's cube, or sdf is not above 0.
 
-    The first is ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. The second includes the distance's zero
-    level, unknown space as obstacle, and NaN. Raises InputError without bound and hard.
+    A splat may reach if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. The sdf test includes unknown
+    space as obstacle, and NaN. Raises InputError without bound and hard.
     """
     shape = check_grid(grid)
     if not {"bound", "hard"} & grid.channels.keys():

@@ -1,7 +1,7 @@
 """Baked distance fields as ParaView's ``.vti``: VTK ImageData with points at cell centres.
 
 Raw appended little-endian blocks, x fastest, each after its length; the header is a string in FieldData. Format:
-VTK's user guide and the XML file formats page of its documentation.
+VTK's user guide and its page on XML file formats.
 """
 
 import re

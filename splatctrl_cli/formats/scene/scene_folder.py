@@ -96,9 +96,9 @@ class ViewCorrection:
 def run_value(
     run: Mapping[str, Any], keys: Sequence[str], kind: Callable[[Any], T], default: object = None, *, where: str
 ) -> T:
-    """Return `kind` of the value at `keys` of a ``run.json``, or of the default.
+    """`kind` of the value at `keys` of a ``run.json``, or of the default.
 
-    Raises InputError naming `where` for a missing value without a default, or of another kind.
+    Raises InputError naming `where` if missing without a default, or of another kind.
     """
     value: Any = run
     try:
@@ -178,10 +178,10 @@ class SceneFolder:
 
     @property
     def made_from(self) -> dict[str, Any]:
-        """The facts that tell if the scene belongs to a log and a robot.
+        """Facts that tell if the scene belongs to a log and a robot.
 
-        Digests of the files read (`inputs`), each camera's first frame, the robot's joints and links, the depth
-        correction, and how far off the cameras see the robot.
+        Digests of files read (`inputs`), first frames, joints and links, depth correction, and how far off the
+        cameras see the robot.
         """
         metrics = self.run.get("metrics", {})
         bend = {"depth_bend": metrics["depth_bend"]} if metrics.get("depth_bend") else {}
@@ -241,7 +241,7 @@ class SceneFolder:
         return read_world_splats(self._isotropic("splats.ply"))
 
     def _isotropic(self, name: str) -> Path:
-        """Return a checked file. Raises InputError if the splats are not isotropic."""
+        """A checked file. Raises InputError if the splats are not isotropic."""
         if self.is_anisotropic:
             raise InputError(
                 f"{self.path}: made by 3D Gaussian splatting; distances are defined on isotropic splats",
@@ -350,7 +350,7 @@ class SplatFile(SceneFolder):
 
     @cached_property
     def _found(self) -> SplatSet | GaussianSet:
-        """The file's splats. Raises InputError if damaged, empty, of unknown kind, or in another frame or unit."""
+        """Raises InputError if damaged, empty, of unknown kind, or in another frame or unit."""
         found, comments = read_splats(self.path)
         check_world(self.path, comments)
         if not len(found):

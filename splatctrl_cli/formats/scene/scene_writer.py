@@ -30,10 +30,9 @@ State = Mapping[str, NDArray[np.generic]]
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
-    """An interrupted run: `SceneWriter.checkpoint`'s `progress`, the fitter's `state`, and the files then.
+    """An interrupted run: `SceneWriter.checkpoint`'s `progress`, the fitter's `state`, and the files.
 
-    audit_bytes: size of the audit. snapshots: (stamp, number of splats). parts: sha256 of the snapshots' files by
-    name, None in an older checkpoint.
+    snapshots: (stamp, number of splats). parts: sha256 of the snapshots' files by name, None in an older checkpoint.
     """
 
     progress: dict[str, Any]
@@ -82,7 +81,6 @@ class SceneWriter:
             self._go_back_to(checkpoint)
 
     def _go_back_to(self, checkpoint: Checkpoint) -> None:
-        """Drop what was written after the checkpoint."""
         self.snapshots += [
             Snapshot(stamp_ns=stamp_ns, path=self._place(index), num_splats=num_splats)
             for index, (stamp_ns, num_splats) in enumerate(checkpoint.snapshots)
@@ -147,7 +145,7 @@ class SceneWriter:
         self._thread.shutdown()
 
     def _write_shell(self, path: Path, stamp_ns: int, shell: SplatSet | None) -> None:
-        """Write the shell into its own file, which readers of splats skip."""
+        """Write a separate file, which readers of splats skip."""
         if shell is not None and len(shell):
             write_ply(path, shell, self.comments | SHELL | {"stamp_ns": str(stamp_ns)})
 

@@ -51,7 +51,6 @@ def write_states(path: Path, known: KnownVoxels, states: UInt8) -> None:
 
 
 def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.generic]:
-    """The JSON header: `special` and the parts common to both files."""
     common = {
         "frame": "world",
         "units": "m",
@@ -69,7 +68,7 @@ def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.gen
 
 
 def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
-    """The arrays common to both files; last_seen in one byte if it fits: twice as fast."""
+    """Arrays common to both files; last_seen in one byte is twice as fast."""
     balls = known.unrepresented
     return {
         "last_seen": known.last_seen.astype(np.uint8 if len(known.step_stamps_ns) < FIRST_REASON else np.uint16),
@@ -81,7 +80,7 @@ def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
 
 @contextmanager
 def _refused(path: Path, what: str) -> Iterator[None]:
-    """Turn any error into an InputError; `what`: what the file is not."""
+    """Turn any error into an InputError."""
     try:
         yield
     except FileNotFoundError:
@@ -100,9 +99,9 @@ def read_states(path: Path) -> OccupancyGrid:
 
 
 def read_seen(path: Path) -> SeenVoxels | None:
-    """Read when voxels of either file were last seen, and no more, for replay speed.
+    """Read only when voxels were last seen, which a replay does five times a second.
 
-    A replay does so five times a second. None for an older file. Raises InputError for another one.
+    None for an older file. Raises InputError for another one.
     """
     with _refused(path, _OURS):
         header = _read_header(path)
@@ -174,9 +173,9 @@ def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
 
 
 def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) -> NDArray[Any]:
-    """`last_seen` as stored, in one byte or two; its largest numbers say why a voxel was never seen.
+    """`last_seen` in one byte or two; the largest numbers say why a voxel was never seen.
 
-    Raises ValueError for another shape, or time steps that do not exist.
+    Raises ValueError for another shape, or too many time steps.
     """
     is_short = stored.dtype == np.uint8
     stored = _voxels(stored, "last_seen", np.uint8 if is_short else np.uint16, header)
@@ -192,7 +191,6 @@ def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) 
 
 
 def _balls(arrays: Arrays, voxel: float) -> Balls:
-    """Raises ValueError for other types or shapes."""
     centers, labels = arrays["unrepresented"], arrays["unrepresented_labels"]
     if centers.dtype != np.float32 or labels.dtype != np.uint8 or centers.shape != (labels.size, 3):
         raise ValueError(
@@ -204,12 +202,11 @@ def _balls(arrays: Arrays, voxel: float) -> Balls:
 
 
 def _edges_in(header: Mapping[str, Any]) -> set[str]:
-    """The array of lost edges, absent in older files."""
+    """Empty for older files."""
     return {"edges"} & header.keys()
 
 
 def _edges(arrays: Arrays) -> LostEdges:
-    """Raises ValueError for other types or shapes."""
     if "edges" not in arrays:
         return NO_EDGES
     edges = arrays["edges"]
@@ -219,7 +216,6 @@ def _edges(arrays: Arrays) -> LostEdges:
 
 
 def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Mapping[str, Any]) -> NDArray[Any]:
-    """Return a voxel array. Raises ValueError if its type or shape is not the header's."""
     wanted = (np.dtype(kind), tuple(header["shape"]))
     if (values.dtype, values.shape) != wanted or len(values.shape) != 3:
         raise ValueError(f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}")
@@ -227,9 +223,9 @@ def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Map
 
 
 def known_space(grid: OccupancyGrid, thresholds: OccupancyConfig) -> dict[str, object]:
-    """Summarise a grid: extent [m], share of each `VoxelState`, robot and human voxels.
+    """A grid's extent [m], share of each `VoxelState`, robot and human voxels.
 
-    Keys are the states' names in lower case, as in other commands and files.
+    States are lower case, as in other commands and files.
     """
     states = grid.states(thresholds.free_below, thresholds.occupied_above)
     counts = np.bincount(states.ravel(), minlength=len(VoxelState))

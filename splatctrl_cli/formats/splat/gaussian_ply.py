@@ -1,9 +1,9 @@
 """Anisotropic Gaussians as 3D-GS PLY files: the reference implementation's 62 properties.
 
 ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``, all float. ``scale_*`` is log(sigma), ``rot_*``
-a quaternion w x y z, ``opacity`` a logit. ``f_dc_*`` and ``f_rest_*`` are harmonics of red, green and blue; f_rest
-has all of red first, then green, then blue. A ``label`` (uchar) follows only if some Gaussian is not an object, for
-readers of a fixed stride. A lone ``scale_0`` is for all axes.
+a quaternion w x y z, ``opacity`` a logit. ``f_dc_*`` and ``f_rest_*`` are harmonics; f_rest has all of red, then
+green, then blue. A ``label`` (uchar) follows only if some Gaussian is not an object, for readers of a fixed stride. A
+lone ``scale_0`` is for all axes.
 """
 
 from collections.abc import Mapping
@@ -49,8 +49,8 @@ HEADER_COMMENTS = {
 def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write `gaussians`, with frame, units and `comments` in the header. Same input, same bytes.
 
-    Harmonics above the set's degree are zeros; opacities 0 and 1 read back exactly. Raises InputError naming an
-    invalid value's index, UsageError for a comment of several lines.
+    Harmonics above the set's degree are 0; opacities 0 and 1 read back exactly. Raises InputError naming an invalid
+    index, UsageError for a comment of several lines.
     """
     check_gaussians("Gaussians to write", gaussians)
     has_labels = bool((gaussians.labels != Label.OBJECT).any())
@@ -76,8 +76,7 @@ def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """Read a 3D-GS PLY (binary or ASCII, any property order) and its ``key: value`` comments.
 
     Harmonics have the degree of ``f_rest_*`` (0, 9, 24 or 45), without all-zero degrees. Quaternions are normalised;
-    a missing label is 0 (object); other properties are ignored. Raises InputError if truncated, invalid or without a
-    property.
+    a missing label is 0 (object). Raises InputError if truncated, invalid or without a property.
     """
     ply = read_table(path, "vertex", REQUIRED)
     return gaussians_of(ply), ply.pairs()
@@ -111,9 +110,9 @@ def exact_centers(ply: PlyFile) -> Float64:
 
 
 def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
-    """Centres (N, 3) float32 [m]. Raises InputError if float32 moves, or has moved, the splats too far.
+    """Centres (N, 3) float32 [m]. Raises InputError if float32 moves, or moved, the splats too far.
 
-    Too far is relative to `sigmas` (N,) or (N, 3) [m] and the length of their box.
+    The measure is `sigmas` (N,) or (N, 3) [m] and their box's length.
     """
     exact = exact_centers(ply)
     centers = exact.astype(np.float32)
@@ -141,7 +140,7 @@ def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
 def log_sigmas(ply: PlyFile) -> Float64:
     """(N, 3) log(sigma [m]). Raises InputError for two scales, or scales that are no logarithms.
 
-    No logarithms: all above 0, which makes every splat SPARSEST times as large as the spacing.
+    Those are all above 0, with splats SPARSEST times as large as their spacing.
     """
     found = [name for name in SCALES if name in ply]
     if len(found) == 2:

@@ -1,8 +1,8 @@
 """Gaussians as glTF 2.0 in one binary file (``.glb``), with KHR_gaussian_splatting.
 
-One primitive of points with float32 attributes: centre, rotation (x y z w), sigmas (linear), opacity, and each
-harmonic's coefficient of red, green, blue; COLOR_0 serves plain point readers. Values are in world; glTF's up is y,
-so their node turns a z-up world. The container is a JSON document and one buffer of tables.
+One primitive of points with float32 centre, rotation (x y z w), sigmas (linear), opacity, and harmonics of red,
+green, blue; COLOR_0 serves plain point readers. Values are in world; their node turns z up to glTF's y. The container
+is a JSON document and one buffer of tables.
 """
 
 import json
@@ -37,7 +37,7 @@ PROPERTIES = {
 
 
 def _write(path: Path, document: Mapping[str, Any], tables: Sequence[NDArray[Any]]) -> None:
-    """Write a document and tables (N, 1 | 3 | 4), float32 or uint8 for 0 to 1."""
+    """Write tables (N, 1 | 3 | 4) of float32, or of uint8 for 0 to 1."""
     views, accessors, binary = list[dict[str, Any]](), list[dict[str, Any]](), bytearray()
     for table in tables:
         is_float, content = table.dtype == np.float32, np.ascontiguousarray(table).tobytes()
@@ -89,7 +89,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, width: int) -> Float32:
-    """Read an accessor as (N, width) float32. Raises InputError for another width or missing data."""
+    """An accessor as (N, width) float32. Raises InputError for another width or missing data."""
     accessor, where = document["accessors"][index], f"{path}: accessor {index}"
     dtype = np.dtype(COMPONENTS[accessor["componentType"]])
     if accessor["type"] != TYPES[width] or "sparse" in accessor or "bufferView" not in accessor:
@@ -111,8 +111,7 @@ def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, w
 def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write `gaussians`; `comments` become the asset's extras. Same input, same bytes.
 
-    Labels are the attribute ``_LABEL``, if some Gaussian is not an object. Raises InputError naming an invalid
-    value's index.
+    ``_LABEL`` is written if some Gaussian is not an object. Raises InputError naming an invalid index.
     """
     check_gaussians("Gaussians to write", gaussians)
     tables: dict[str, NDArray[Any]] = {  # the first has its range beside it
@@ -161,13 +160,12 @@ def coefficient_name(index: int) -> str:
 
 
 def _point_colors(gaussians: GaussianSet) -> NDArray[np.uint8]:
-    """(N, 4) red, green, blue, opacity in 0 to 255, for plain point clouds."""
+    """(N, 4) red, green, blue, opacity, 0 to 255, for plain point clouds."""
     colors = np.clip(0.5 + SH_C0 * gaussians.harmonics[:, 0].astype(np.float64), 0.0, 1.0)
     return np.rint(255.0 * np.column_stack([colors, gaussians.opacities])).astype(np.uint8)
 
 
 def _primitive(path: Path, document: Mapping[str, Any]) -> dict[str, Any]:
-    """The only primitive of Gaussians."""
     try:
         primitives = [primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"]]
         found = [primitive for primitive in primitives if EXTENSION in primitive.get("extensions", {})]

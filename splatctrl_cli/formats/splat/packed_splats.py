@@ -3,13 +3,13 @@
 ``.splat``: 32 bytes per Gaussian, no header: float32 centre and sigmas; bytes of red, green, blue, opacity (255 is
 1); a quaternion w x y z as 128 q + 128. No view-dependent colour, labels or comments.
 
-``.spz`` (Niantic): writes version 3, reads 2 to 4. A gzip stream: a header of 16 bytes, then by attribute the centres
-(24-bit fixed point), opacities, colours, log sigmas, rotations, and harmonics above degree 0. Version 4 has a plain
-header of 32 bytes that locates a table of two uint64 per attribute: bytes packed and unpacked. A zstd stream each
-follows; empty harmonics may be left out.
+``.spz`` (Niantic): writes version 3, reads 2 to 4. A gzip stream: a header of 16 bytes, then by attribute centres
+(24-bit fixed point), opacities, colours, log sigmas, rotations, harmonics above degree 0. Version 4 has a plain
+header of 32 bytes, a table of two uint64 per attribute (bytes packed and unpacked), and a zstd stream each; empty
+harmonics may be left out.
 
-The format names its axes right, up, back. We write world axes unchanged, so that they read back in world; a y-up
-viewer shows a z-up world lying on its back.
+The format's axes are right, up, back. World axes are written unchanged, so that they read back; a y-up viewer shows a
+z-up world lying on its back.
 """
 
 import gzip
@@ -43,8 +43,8 @@ ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("
 def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write what `.splat` can represent of `gaussians`, without `comments`. Same input, same bytes.
 
-    Of a rotation's two quaternions, the largest component is negative: -1 has a byte, +1 has none. Raises InputError
-    naming the index of an invalid value.
+    A quaternion's largest component is made negative: -1 has a byte, +1 has none. Raises InputError naming an invalid
+    index.
     """
     check_gaussians("Gaussians to write", gaussians)
     rows = np.zeros(len(gaussians), dtype=ROW)
@@ -115,7 +115,7 @@ SQRT_HALF = float(np.sqrt(0.5))  # no component but the largest exceeds it
 def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write what `.spz` can represent of `gaussians`, without `comments`. Same input, same bytes.
 
-    Raises InputError naming the index of an invalid value.
+    Raises InputError naming an invalid index.
     """
     check_gaussians("Gaussians to write", gaussians)
     held, bits = held_by_spz(gaussians), _fraction_bits(gaussians.centers)
@@ -134,9 +134,9 @@ def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
 
 
 def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
-    """Read an ``.spz`` file, in the file's axes; it has no comments.
+    """Read an ``.spz`` file, in its axes, and no comments.
 
-    Raises InputError if truncated, of another version than 2 to 4, or invalid.
+    Raises InputError if truncated, invalid, or not of version 2 to 4.
     """
     content = read_bytes(path)
     bits, (centers, opacities, colors, sigmas, quats, rest) = _columns(path, content)
@@ -181,7 +181,7 @@ def spz_bound(gaussians: GaussianSet) -> Differences:
 
 
 def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
-    """The fraction bits and each attribute's bytes, a row per Gaussian. Raises InputError for another length."""
+    """Fraction bits and bytes by attribute, a row per Gaussian. Raises InputError for another length."""
     start = content[:4]
     if start == PLAIN:
         num, bits, widths = _parsed(path, content, (4,), len(content))
@@ -196,7 +196,7 @@ def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
 
 
 def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
-    """Return the number of Gaussians, fraction bits and bytes per attribute; size: of the file."""
+    """Number of Gaussians, fraction bits, bytes per attribute; size: of the file."""
     if len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC:
         raise InputError(f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}")
     _, version, num, degree, bits, flags, _ = HEADER.unpack_from(head)
@@ -216,7 +216,7 @@ def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tu
 
 
 def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], bytes]:
-    """Return `_parsed` and a gzip stream's attributes, unpacking no more than its header says."""
+    """`_parsed` and all attributes, unpacking no more than the header says."""
     try:
         with gzip.GzipFile(fileobj=BytesIO(content)) as stream:
             num, bits, widths = _parsed(path, stream.read(HEADER.size), (2, 3), len(content))
@@ -253,7 +253,7 @@ def _streams(path: Path, content: bytes, sizes: list[int]) -> list[bytes]:
 
 
 def _fraction_bits(centers: Float32) -> int:
-    """Return the most fraction bits, up to 12, that fit every coordinate in 24 bits."""
+    """The most fraction bits, up to 12, that fit every coordinate in 24 bits."""
     largest = float(np.abs(centers).max(initial=0.0))
     bits = FRACTION_BITS
     while largest * 2.0**bits > 2**23 - 1:
@@ -264,10 +264,7 @@ def _fraction_bits(centers: Float32) -> int:
 
 
 def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
-    """Pack quaternions into (N,) little-endian words.
-
-    2 bits index the largest of x y z w, then 10 bits (sign, size) per other.
-    """
+    """(N,) little-endian words: 2 bits index the largest of x y z w, 10 (sign, size) per other."""
     quats = np.roll(quats_wxyz.astype(np.float64), -1, axis=1)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     largest = np.abs(quats).argmax(axis=1)
@@ -282,7 +279,7 @@ def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
 
 
 def _quaternions(table: UInt8) -> Float32:
-    """Return (N, 4) unit quaternions w x y z of 3 or 4 bytes (version 2 or 3)."""
+    """(N, 4) unit quaternions w x y z of 3 bytes (version 2) or 4."""
     if table.shape[1] == 3:
         xyz = table / 127.5 - 1.0
         quats = np.column_stack([xyz, np.sqrt(np.maximum(0.0, 1.0 - (xyz**2).sum(axis=1)))])

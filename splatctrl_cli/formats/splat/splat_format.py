@@ -19,7 +19,7 @@ Comments = dict[str, str]
 
 
 def logit(opacities: Float32) -> Float64:
-    """log(p / (1 - p)) of opacities (N,) in [0, 1]; finite for 0 and 1, which `sigmoid` restores exactly."""
+    """log(p / (1 - p)) of (N,) in [0, 1], finite for 0 and 1, which `sigmoid` restores."""
     inside = (opacities > 0) & (opacities < 1)
     p = np.where(inside, opacities, 0.5).astype(np.float64)
     return np.where(inside, np.log(p) - np.log1p(-p), np.where(opacities > 0.5, LOGIT_OF_ONE, LOGIT_OF_ZERO))
@@ -66,9 +66,9 @@ def check_finite(where: str, num: int, groups: Mapping[str, NDArray[Any]]) -> No
 
 @dataclass(frozen=True, kw_only=True)
 class Differences:
-    """The largest differences between Gaussians, or a format's bound on them.
+    """Largest differences between Gaussians, or a format's bound on them.
 
-    center [m]; sigma, relative; rotation [deg]; color and opacity, of 0 to 1; harmonics, coefficients above degree 0.
+    center [m]; sigma, relative; rotation [deg]; color and opacity, of 0 to 1; harmonics above degree 0.
     """
 
     center: float
@@ -127,9 +127,9 @@ def _angles(a: Float32, b: Float32) -> Float64:
 class SplatFormat:
     """A splat file format, in its module's ``ENTRIES``, for the program and its docs.
 
-    `held`: the representable part of a set, before rounding; `bound`: the largest rounding; `check` raises UsageError
-    without its library. `docs` are rows in docs/artefacts.md, cells between bars, an empty line between rows: suffix,
-    what it is, what it rounds to, what it does not hold.
+    `held`: the representable part of a set; `bound`: the largest rounding; `check` raises UsageError without its
+    library. `docs`: rows in docs/artefacts.md, cells between bars, an empty line between rows: suffix, what it is,
+    what it rounds to, what it does not hold.
     """
 
     name: str

@@ -1,9 +1,9 @@
 """Splat files: 3D-GS PLY, conversion from and to Gaussians, any format by suffix.
 
-The PLY has the reference implementation's names and order without ``f_rest_*`` (degree-0 colour): ``x y z nx ny nz
-f_dc_0..2 opacity scale_0..2 rot_0..3``, then ``label`` (uchar) and ``density`` (float). Normals are zeros, for
-readers that rely on the order. ``scale_*`` are three equal log(radius), ``rot`` is 1 0 0 0, ``opacity`` is a logit
-and ``f_dc`` is ``(colour - 0.5) / C0``.
+The PLY has the reference implementation's order without ``f_rest_*`` (degree-0 colour): ``x y z nx ny nz f_dc_0..2
+opacity scale_0..2 rot_0..3``, then ``label`` (uchar) and ``density`` (float). Normals are zeros, for readers that
+rely on the order. ``scale_*`` are three equal log(radius), ``rot`` is 1 0 0 0, ``opacity`` a logit, ``f_dc``
+``(colour - 0.5) / C0``.
 """
 
 from collections.abc import Mapping
@@ -82,7 +82,7 @@ def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
 
 
 def nearest_splats(gaussians: GaussianSet) -> SplatSet:
-    """Return splats of the Gaussians' volume (geometric mean of sigmas), opacity and mean colour.
+    """Splats of the Gaussians' volume (geometric mean of sigmas), opacity and mean colour.
 
     Loses orientation, flatness (a flat Gaussian becomes thicker and narrower) and view-dependent colour.
     """
@@ -110,8 +110,8 @@ def _is_stretched(gaussians: GaussianSet) -> Bool:
 def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None:
     """Write `splats`, with frame, units and `comments` in the header. Same input, same bytes.
 
-    Opacities 0 and 1 are finite logits that read back exactly. Raises InputError naming an invalid value's index,
-    UsageError for a comment of several lines.
+    Opacities 0 and 1 read back exactly. Raises InputError naming an invalid index, UsageError for a comment of
+    several lines.
     """
     check_splats("splats to write", splats)
     rows = rows_of(as_gaussians(splats), DTYPE)
@@ -122,9 +122,8 @@ def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None
 def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
     """Read a 3D-GS PLY (binary or ASCII, any property order) and its ``key: value`` comments.
 
-    A comment without a colon has an empty value. Ignores other properties (normals, higher harmonics, rotation); a
-    missing label is 0 (object), a missing density 0 (not computed). Raises InputError if truncated, anisotropic,
-    invalid or without a property.
+    Ignores other properties (normals, higher harmonics, rotation); a missing label is 0 (object), a missing density 0
+    (not computed). Raises InputError if truncated, anisotropic, invalid or without a property.
     """
     ply = read_table(path, "vertex", REQUIRED)
     return splats_of(ply), ply.pairs()
@@ -240,7 +239,7 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
 def read_source(path: Path) -> tuple[SplatSet | GaussianSet, Comments, Float64]:
     """Read as `read_splats`, with the centres (N, 3) float64 [m] in the file's precision.
 
-    If float32 would move them, an origin is subtracted, which the comment `ORIGIN` names.
+    If float32 would move them, an origin is subtracted, named by the comment `ORIGIN`.
     """
     if _known_format(path) is not FORMATS[".ply"]:
         splats, comments = read_splats(path)
@@ -274,7 +273,7 @@ def _splats_or_gaussians(ply: PlyFile) -> SplatSet | GaussianSet:
 
 
 def read_spheres(path: Path) -> SplatSet:
-    """Read any splat file as spheres in the world; harmonics above the constant one are dropped.
+    """Read any splat file as spheres in the world, without harmonics above the constant one.
 
     Raises InputError as `read_splats`, and for splats not round, or in another unit or frame.
     """

@@ -1,7 +1,7 @@
-"""Gaussians as an OpenUSD particle field (UsdVol ParticleField3DGaussianSplat, OpenUSD 26.3 and later), in world.
+"""Gaussians as OpenUSD particle fields (UsdVol ParticleField3DGaussianSplat, OpenUSD 26.3 and later), in world.
 
-Sigmas and opacities are linear; harmonics are ordered by Gaussian, then by coefficient. The stage has z up and
-metres. Needs usd-core, a separate extra.
+Sigmas and opacities are linear; harmonics go by Gaussian, then by coefficient. z is up; units are metres. Needs
+usd-core, a separate extra.
 """
 
 import errno
@@ -29,8 +29,8 @@ NAME = "field"  # of the file while the library has it: it goes by the suffix
 def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *, suffix: str) -> None:
     """Write `gaussians` as ``.usda`` (text) or ``.usdc`` (binary); `comments` become custom data.
 
-    Labels are the primvar ``label``, if some Gaussian is not an object. Raises InputError naming an invalid value's
-    index; UsageError without the library.
+    Primvar ``label`` is written if some Gaussian is not an object. Raises InputError naming an invalid index;
+    UsageError without the library.
     """
     check_gaussians("Gaussians to write", gaussians)
     usd, geometry, volume, arrays, kinds = _library()
@@ -63,9 +63,10 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
 
 
 def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
-    """Read a USD file's only particle field, in its own axes (no transforms), and its data.
+    """Read a USD file's only particle field, in its own axes, and its data.
 
-    Raises InputError if unreadable or without exactly one such field; UsageError without the library.
+    Transforms are not applied. Raises InputError if unreadable or without exactly one field; UsageError without the
+    library.
     """
     usd, geometry, *_ = _library()
     if not path.is_file():
@@ -87,7 +88,7 @@ def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def _library() -> tuple[Any, Any, Any, Any, Any]:
-    """Usd, UsdGeom, UsdVol, Vt and the types. Raises UsageError if missing or too old."""
+    """Raises UsageError if usd-core is missing or too old."""
     try:
         from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
     except ImportError:
@@ -103,7 +104,7 @@ def _library() -> tuple[Any, Any, Any, Any, Any]:
 
 
 def _extent(gaussians: GaussianSet) -> Float32:
-    """Corners (2, 3) of a box around three sigmas of every Gaussian, at any rotation."""
+    """Corners (2, 3) around three sigmas of every Gaussian, at any rotation."""
     reach = 3.0 * gaussians.scales.max(axis=1, keepdims=True)
     lower, upper = (gaussians.centers - reach).min(axis=0), (gaussians.centers + reach).max(axis=0)
     return np.stack([lower, upper]).astype(np.float32)
@@ -131,7 +132,7 @@ def _gaussians(path: Path, prim: Any, geometry: Any) -> GaussianSet:
 
 
 def _array(path: Path, prim: Any, name: str, width: int) -> Float32:
-    """An attribute (N, width) float32, or its half-precision twin, named with an h."""
+    """Float32 (N, width) of an attribute or its half-precision twin, named with an h."""
     for candidate in (name, f"{name}h"):
         values = prim.GetAttribute(candidate).Get()
         if values is not None and len(values):

@@ -41,8 +41,7 @@ _NOT_FOR_CAPTURES = (
 class CaptureSource(Recording):
     """Records of a capture folder; files with a wrong checksum are skipped and counted as damage.
 
-    joints: a robot's, merged from the topics that the capture kept, as from the log. Without them or kept topics, the
-    states are joints.npz's.
+    joints: a robot's, merged from the kept topics as from the log; without either, the states are joints.npz's.
     """
 
     def __init__(self, path: Path, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
@@ -154,7 +153,7 @@ class CaptureSource(Recording):
         return data
 
     def _checked(self, name: str) -> Path:
-        """The path of an unchanged file. Raises InputError for another."""
+        """The path. Raises InputError for a changed file."""
         file = self._path / name
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise InputError(f"{file}: lies outside the capture", remedy=AGAIN)
@@ -189,7 +188,6 @@ def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | N
 
 
 def _read_joints(path: Path) -> StateColumns:
-    """Read joints.npz, a block at a time. Raises InputError."""
     file = path / "joints.npz"
     try:
         content = NpzFile(file)

@@ -102,7 +102,7 @@ def read_capture_header(path: Path) -> dict[str, Any]:
 
 
 def _check_index(path: Path) -> None:
-    """Raise InputError if an index file was changed: nothing in it can be trusted."""
+    """Raise InputError for a changed index file."""
     sums = FileSums(path)
     for name in INDEX_FILES:
         if not (path / name).is_file():
@@ -157,7 +157,7 @@ class FrameRows:
 
 
 def _checked(row: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the row. Raises ValueError if it is no frame."""
+    """Return the row. Raises ValueError if invalid."""
     int(row["stamp_ns"])
     for key in COLUMNS[4:11]:
         float(row[key])
@@ -199,5 +199,5 @@ class FileSums:
 
 
 def _key(name: bytes) -> int:
-    """64 bits of a name; a collision would make a good file look damaged."""
+    """64 bits; a collision would make a good file look damaged."""
     return int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little")

@@ -1,6 +1,6 @@
 """A writer of capture folders (docs/capture.md) by frame, in bounded memory.
 
-A journal has a line per written frame, so that a killed run can continue.
+A journal lists written frames, so that a killed run can continue.
 """
 
 import csv
@@ -164,9 +164,8 @@ def write_capture(
     """Write all of `source` into `folder`, empty or of an interrupted run. Same input, same bytes.
 
     JPEG and PNG colour is kept byte for byte if it has the frame's pixels. Depth becomes 16-bit PNG in its recorded
-    unit, or .npy [m] if no unit fits. topics: joint states as recorded, next to `source`'s, which are of one topic.
-    robot: the log's URDF, "" for none. Raises InputError without a frame, UsageError if existing frames differ from
-    the source's.
+    unit, or .npy [m] if none fits. topics: all joint states as recorded, where `source` has one topic's. robot: the
+    log's URDF, or "". Raises InputError without a frame, UsageError if existing frames differ.
     """
     states = StateCollector(len(source.joint_names))
     cameras: dict[str, dict[str, Any]] = {}
@@ -215,7 +214,6 @@ def write_capture(
 def _write_index(
     folder: Path, header: dict[str, Any], journal: Journal, topics: JointTopics | None, robot: str
 ) -> None:
-    """Write the tables, joint topics, URDF, capture.json and SHA256SUMS of all but itself."""
     names = ["joints.npz", "frames.csv"]
     if robot:
         (folder / ROBOT).write_text(robot, encoding="utf-8", newline="")
@@ -235,15 +233,12 @@ def _write_index(
 
 
 def _is_of_lens(name: str) -> bool:
-    """True for a file shared by a lens's frames, so out of their order."""
+    """True if a lens's frames share the file, out of their order."""
     return name.startswith("valid/")
 
 
 def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None:
-    """Write a sorted line per file; the journal is read once per image folder to bound memory.
-
-    others: sha256 of the remaining files.
-    """
+    """Write sorted lines; the journal is read once per image folder to bound memory."""
     written = (name for entry in journal.entries() for _, name in entry.sums if not _is_of_lens(name))
     folders = {f"{name.rpartition('/')[0]}/" for name in written}
     with path.open("w", encoding="utf-8", newline="") as stream:
@@ -261,7 +256,7 @@ def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str,
 
 
 def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
-    """Return a frame's frames.csv row without file names, and count its camera."""
+    """The frames.csv row without file names; counts its camera."""
     if stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera):
         raise InputError(
             f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="rename the camera"
@@ -286,7 +281,6 @@ def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, s
 
 
 def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera: Mapping[str, Any]) -> Entry:
-    """Write a frame's images and complete its row."""
     stem, unit = f"{camera['num_frames'] - 1:06d}", float(camera["depth_scale"])
     color = stored.color_file or encoded(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
     color_name = f"color/{stored.camera}/{stem}.{'png' if is_png(color) else 'jpg'}"
@@ -313,7 +307,7 @@ def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera:
 
 
 def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
-    """Record where a frame's images were recorded; an unknown byte is empty."""
+    """Places of the recorded images; an unknown byte is empty."""
     if not stored.places:
         return {}
     found = {"color": color, "depth": depth}
@@ -324,7 +318,7 @@ def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
 
 
 def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
-    """Suffix and bytes of the depth image: the recorded PNG if in the camera's unit."""
+    """Suffix and bytes: the recorded PNG if in the camera's unit."""
     if stored.depth_file is not None and stored.depth_unit == unit:
         return "png", stored.depth_file
     counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)
@@ -355,7 +349,7 @@ def _npy(depth: Float32) -> bytes:
 
 
 def _write_joints(path: Path, states: StateColumns) -> None:
-    """Write joints.npz like numpy.savez, a block at a time."""
+    """Write as numpy.savez, a block at a time."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         with archive.open("stamp_ns.npy", "w", force_zip64=True) as stream:
             npy.write_array(stream, states.stamp_ns, allow_pickle=False)

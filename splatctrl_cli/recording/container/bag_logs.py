@@ -1,10 +1,10 @@
 """The messages of ROS bags: ROS 1, and ROS 2 sqlite3; damage is skipped and counted.
 
-A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is a sequence of records: a header of named fields and a body.
-They are read front to back in bounded memory, without the index: a cut or growing bag has none.
+A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body. They are read in order,
+in bounded memory, without the index: a cut or growing bag has none.
 
-rosbags' ROS 2 reader (rosbags/rosbag2/storage_sqlite3.py) counts all messages first, and so refuses a file with one
-bad page. Tables of rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions.
+rosbags' ROS 2 reader (rosbags/rosbag2/storage_sqlite3.py) counts messages first, so one bad page makes it refuse.
+Tables of rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions.
 """
 
 import shutil
@@ -88,7 +88,7 @@ class BagFile:
             return found
 
     def _record(self, stream: BinaryIO, offset: int) -> BagRecord | None:
-        """Read the record at `offset`, or None; the stream is left after it."""
+        """Read a record, or None; the stream is left after it."""
         head = self._head(stream)
         if head is None:
             return None
@@ -101,7 +101,7 @@ class BagFile:
         return BagRecord(offset, kind, fields, body, is_cut)
 
     def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
-        """Read kind, fields and body length of a record; the stream is left at the body."""
+        """Kind, fields and body length; the stream is left at the body."""
         length = self._length(stream)
         if length is None or length > min(1 << 20, self.size - stream.tell()):  # those of connections hold a name
             return None
@@ -111,7 +111,7 @@ class BagFile:
         return None if fields is None or kind not in _KINDS or length is None else (kind, fields, length)
 
     def _next_chunk(self, stream: BinaryIO, offset: int) -> int | None:
-        """Find the next whole chunk after `offset` by its header's fields."""
+        """Find the next whole chunk by its header."""
         stream.seek(offset + 1)
         kept = b""
         while block := stream.read(PIECE):
@@ -162,9 +162,9 @@ def number(fields: Fields, name: str) -> int:
 
 
 def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
-    """Yield kind, fields and body of an unpacked chunk's records, up to the first that does not fit.
+    """Yield kind, fields and body of an unpacked chunk's records.
 
-    Raises ValueError for bytes that are not a record.
+    Raises ValueError at bytes that are not a record.
     """
     at = 0
     while at < len(content):
@@ -186,7 +186,7 @@ def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
 class Bag1Log:
     """One ROS 1 bag, read without its index. Raises InputError without any record.
 
-    rosbags' reader (rosbags/rosbag1/reader.py) refuses a bag without index, and ends at the first damaged chunk.
+    rosbags (rosbags/rosbag1/reader.py) refuses a bag without index, and ends at the first damaged chunk.
     """
 
     container = "ROS 1 bag"
@@ -271,10 +271,9 @@ _FILE_FORMAT = slice(18, 20)  # of its header (sqlite.org/fileformat2.html)
 
 
 class Db3Log:
-    """One .db3 file, with the journal ("-wal") of a recorder that did not close the bag.
+    """One .db3 file, with the journal ("-wal") of a recorder that did not close it.
 
-    SQLite writes while it reads a journal, so both are copied first. Raises InputError for other or unreadable
-    tables.
+    SQLite writes while it reads a journal, so both are copied first. Raises InputError for other tables.
     """
 
     container = "ROS 2 bag (sqlite3)"
@@ -299,7 +298,7 @@ class Db3Log:
             raise InputError(f"{path}: not a readable {self.container}: {error}", remedy=remedy) from None
 
     def _merge(self) -> None:
-        """Merge the journal into a copy of the file. Raises InputError without room for one."""
+        """Merge the journal into a copy. Raises InputError without room for it."""
         folder = Path(tempfile.mkdtemp(prefix="splatctrl-", dir=scratch_folder()))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         try:
@@ -364,7 +363,7 @@ class Db3Log:
 
 
 def _topics(database: sqlite3.Connection) -> dict[object, Topic]:
-    """Topics by number. Raises ValueError if a table is missing."""
+    """Topics by number. Raises ValueError without the tables."""
     found = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if not {"topics", "messages"} <= found:
         raise ValueError("no tables named topics and messages")

@@ -1,8 +1,8 @@
 """Foxglove's schemas, and the RealSense SDK's texts, as the ROS messages they stand for.
 
-Foxglove's come as JSON, ROS twins, or protobuf, read by the log's FileDescriptorSet without generated code. Fields
-follow docs.foxglove.dev ("Schemas"): JSON times are {sec, nsec} and bytes base64, protobuf times
-google.protobuf.Timestamp. The SDK's .db3 has intrinsics, extrinsics and depth units as std_msgs/String (librealsense,
+Foxglove's are JSON, ROS twins, or protobuf, read by the log's FileDescriptorSet without generated code. Fields:
+docs.foxglove.dev ("Schemas"); JSON times are {sec, nsec} and bytes base64, protobuf times google.protobuf.Timestamp.
+The SDK's .db3 has intrinsics, extrinsics and depth units as std_msgs/String (librealsense,
 src/media/ros2/ros2_writer.cpp).
 """
 
@@ -116,14 +116,14 @@ def _types(definition: str) -> MessageTypes:
 
 
 def _object(value: Any) -> Any:
-    """Convert JSON objects to objects with fields."""
+    """JSON objects as objects with fields."""
     if isinstance(value, dict):
         return SimpleNamespace(**{key: _object(item) for key, item in value.items()})
     return [_object(item) for item in value] if isinstance(value, list) else value
 
 
 def _header(message: Any, frame_id: str | None = None) -> Any:
-    """Build a header; frame_id: for messages without that field."""
+    """A header; frame_id: for messages without that field."""
     frame_id = str(getattr(message, "frame_id", "")) if frame_id is None else frame_id
     time = getattr(message, "timestamp", None)
     seconds = _either(time, "sec", "seconds")
@@ -132,7 +132,7 @@ def _header(message: Any, frame_id: str | None = None) -> Any:
 
 
 def _either(message: Any, *names: str) -> Any:
-    """The first field that a message has; 0 if none, as JSON writers omit zeros."""
+    """The first present field; 0 if none, as JSON writers omit zeros."""
     return next((getattr(message, name) for name in names if hasattr(message, name)), 0)
 
 
@@ -171,7 +171,7 @@ def _calibration(message: Any) -> Any:
 
 
 def _numbers(values: Any, count: int) -> Any:
-    """Values as an array; `count` zeros if empty."""
+    """An array; `count` zeros if empty."""
     array = np.asarray([] if isinstance(values, int) else values, dtype=np.float64)
     return array if array.size else np.zeros(count)
 
@@ -189,7 +189,7 @@ def _transform(message: Any) -> Any:
 
 
 def _joint_states(message: Any) -> Any:
-    """Convert without velocities: an unset one looks like zero."""
+    """Joint states without velocities: an unset one looks like zero."""
     return SimpleNamespace(
         header=_header(message),
         name=[str(joint.name) for joint in message.joints],
@@ -199,7 +199,7 @@ def _joint_states(message: Any) -> Any:
 
 
 def _sdk_text(message: Any) -> Any:
-    """Convert an SDK text. Raises KeyError or ValueError for a missing field."""
+    """Raises KeyError or ValueError for a missing field."""
     said = dict(part.split("=", 1) for part in message.data.split(";") if "=" in part)
     values = {key: np.array(text.split(","), np.float64) for key, text in said.items() if key in _TEXT_FIELDS}
     if "fx" in said:

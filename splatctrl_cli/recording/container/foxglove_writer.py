@@ -151,7 +151,6 @@ def _new(schema: str, **values: Any) -> Any:
 
 
 def _fields(kind: np.dtype[Any]) -> Sequence[Any]:
-    """A PackedElementField per field of the structure."""
     field = import_module(f"{SCHEMAS}.PackedElementField_pb2").PackedElementField
     assert kind.names is not None and kind.fields is not None
     return [

@@ -111,8 +111,7 @@ class SessionLog(JoinedLog):
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield the messages of all parts by log time.
 
-        If parts share a topic, all topics are read: skipping some would change the order of its messages between
-        passes.
+        If parts share a topic, all are read: skipping would change its messages' order between passes.
         """
         pushed = None if names is None or self._share(names) else names
         parts = (part.messages(damage, pushed) for part in self._parts)
@@ -195,7 +194,7 @@ def told_formats(path: Path) -> set[str]:
 
 
 def _open_compressed(path: Path) -> RawLog:
-    """Open a .zstd log, unpacked into a temporary folder that lives as long as it."""
+    """Unpack into a temporary folder that lives as long as the log."""
     folder = Path(tempfile.mkdtemp(prefix="splatctrl-"))
     file = folder / path.stem
     with ExitStack() as stack:
@@ -218,7 +217,7 @@ def _open_compressed(path: Path) -> RawLog:
 
 
 def _ordered_files(path: Path, told: dict[str, Any]) -> list[Path]:
-    """Storage files in recording order: metadata.yaml's, else by numbers in names."""
+    """Files in recording order: metadata.yaml's, else by numbers in names."""
     names = told.get("relative_file_paths")
     if names:
         return [path / Path(name).name for name in dict.fromkeys(names)]
@@ -230,7 +229,7 @@ def _storage_files(path: Path) -> list[Path]:
 
 
 def _metadata(path: Path) -> tuple[dict[str, Any], str]:
-    """Read metadata.yaml and its fault, if any; a bag can be read without."""
+    """Metadata and its fault; a bag can be read without."""
     file = path / "metadata.yaml"
     if not file.is_file():
         return {}, ""

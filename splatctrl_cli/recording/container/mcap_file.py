@@ -1,7 +1,6 @@
 """The records of an MCAP file from front to back, despite damage, in bounded memory.
 
-Lengths must agree with the file's. An impossible record is skipped: to the next place in the summary, else to the
-next compressed chunk with consistent lengths.
+An impossible record is skipped, to the summary's next place or the next compressed chunk with consistent lengths.
 """
 
 import bisect
@@ -99,8 +98,6 @@ class McapFile:
 
 
 class _Walk:
-    """One pass over a file."""
-
     def __init__(
         self, stream: BinaryIO, name: str, size: int, damage: Damage, places: list[int], *, has_crc: bool
     ) -> None:
@@ -142,7 +139,7 @@ class _Walk:
                 return
 
     def _part(self, offset: int, opcode: int, length: int, head: bytes) -> Part:
-        """Read the record at `offset`, without content if too large or unknown."""
+        """Read a record, without content if too large or unknown."""
         self._count(head)
         if opcode == ATTACHMENT:
             self._check_attachment(offset, length)
@@ -155,7 +152,7 @@ class _Walk:
         return Part(offset, opcode, b"", opcode <= DATA_END)
 
     def _beyond(self, offset: int, opcode: int) -> Part | None:
-        """Go to the next readable place, or return the rest of the last record."""
+        """Go to the next readable place, or return the last record's rest."""
         start = self._next_place(offset)
         if start is not None:
             self._add(f"bytes {offset} to {start} are damaged and were left out")
@@ -186,7 +183,7 @@ class _Walk:
         return None
 
     def _chunks_in(self, block: bytes, base: int) -> Iterator[int]:
-        """Yield places in `block` (at `base` in the file) of chunks with consistent lengths."""
+        """Places in `block` (at `base` in the file) of chunks with consistent lengths."""
         for name in _COMPRESSIONS:
             at = block.find(name)
             while at >= 0:
@@ -200,7 +197,6 @@ class _Walk:
                 at = block.find(name, at + 1)
 
     def _check_data(self, opcode: int, length: int) -> None:
-        """Compare the data section's checksum with its last record's."""
         if opcode != DATA_END or length > PIECE:
             return
         here = self._stream.tell()
@@ -253,7 +249,7 @@ class _Walk:
             self._add("checksum of the summary differs")
 
     def _pass_over(self, length: int, crc: int = 0) -> int:
-        """Skip `length` bytes; return their checksum, continued from `crc`."""
+        """Skip bytes; return their checksum, continued from `crc`."""
         while length > 0 and (piece := self._take(min(length, PIECE))):
             crc = zlib.crc32(piece, crc)
             length -= len(piece)
@@ -273,7 +269,7 @@ class _Walk:
 
 
 def _footer(stream: BinaryIO, size: int) -> Footer | None:
-    """The footer right before the closing mark (later additions to it would hide it)."""
+    """The footer before the closing mark; later additions would hide it."""
     if size < 2 * len(MAGIC) + _FOOTER_SIZE:
         return None
     stream.seek(size - len(MAGIC) - _FOOTER_SIZE)
@@ -287,7 +283,7 @@ def _footer(stream: BinaryIO, size: int) -> Footer | None:
 
 
 def _attachment_length(head: bytes) -> int | None:
-    """Length of an attachment's record before its checksum; None if unknown."""
+    """Bytes before the checksum; None if unknown."""
     at = 16
     for _ in range(2):
         if at + 4 > len(head):

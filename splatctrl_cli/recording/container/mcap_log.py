@@ -1,7 +1,7 @@
 """An MCAP file's messages by its own records, and its index without a full read.
 
-Damage is skipped and counted. The `mcap` package's readers allocate what a record announces. Its indexed reader
-raises on valid files without a summary, and yields nothing from a truncated one.
+Damage is skipped and counted. The `mcap` package allocates what a record announces; its indexed reader raises on
+valid files without a summary, and yields nothing from a truncated one.
 """
 
 import struct
@@ -202,7 +202,7 @@ class McapLog:
                 self._declare(opcode, records[start:at], damage)
 
     def _records_in(self, content: bytes, offset: int, damage: Damage, *, is_cut: bool) -> bytes:
-        """A chunk's records, or its start if the file is cut; empty if damaged."""
+        """A chunk's records, its start if cut, empty if damaged."""
         try:
             chunk = parse_record(CHUNK, content)
             assert isinstance(chunk, Chunk)
@@ -221,7 +221,7 @@ class McapLog:
     def _message(
         self, records: bytes, start: int, end: int, offset: int, damage: Damage, names: Collection[str] | None
     ) -> RawMessage | None:
-        """Parse a message in `records`, found at `offset`; None if unwanted or invalid."""
+        """A message, None if unwanted or invalid."""
         if end - start < _MESSAGE.size:
             damage.add(f"{self.path.name}: a message record of {end - start} bytes")
             return None
@@ -241,7 +241,6 @@ class McapLog:
         )
 
     def _declare(self, opcode: int, content: bytes, damage: Damage) -> None:
-        """Take a schema, a channel or the statistics."""
         try:
             record = parse_record(opcode, content)
         except BadRecordError as error:

@@ -1,7 +1,6 @@
 """The MCAP records whose fields are read, each parsed within its own bytes.
 
-The `mcap` package reads the fields (mcap.dev/spec); lengths beyond the bytes are refused. Bytes after the last field
-are allowed, as the specification demands.
+The `mcap` package reads the fields (mcap.dev/spec). Bytes after the last field are allowed, as specified.
 """
 
 import struct
@@ -25,7 +24,7 @@ class BadRecordError(ValueError):
 
 
 class _Fields(ReadDataStream):  # type: ignore[misc]
-    """A reader of a record's fields, within its bytes."""
+    """A reader of fields within a record's bytes."""
 
     def read(self, length: int) -> bytes:
         """Read `length` bytes. Raises EndOfFile at a record's end (the package returns fewer)."""

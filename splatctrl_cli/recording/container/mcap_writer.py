@@ -1,8 +1,8 @@
-"""A writer of logs as one ROS 2 MCAP of standard messages (CDR, zstd chunks, CRCs on).
+"""A writer of ROS 2 MCAP logs of standard messages (CDR, zstd chunks, CRCs on).
 
 Topics: /CAM/color/image_raw/compressed (JPEG), /CAM/color/camera_info, /CAM/depth/image_raw (16UC1 millimetres, REP
-118, 0 = none, registered to colour), /CAM/people/mask (mono8, 255 = a person; only frames with a mask),
-/joint_states, /tf and /tf_static. No wall-clock time in the bytes.
+118, 0 = none, registered to colour), /CAM/people/mask (mono8, 255 = a person; only with a mask), /joint_states, /tf,
+/tf_static. No wall-clock time in the bytes.
 """
 
 from collections.abc import Iterator, Sequence

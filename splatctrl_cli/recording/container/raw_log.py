@@ -13,10 +13,9 @@ MAX_NOTES = 100  # a long log can be damaged in a million places
 class Topic:
     """A channel of a log.
 
-    type_name: ``package/msg/Type`` for ROS. encoding: ``cdr``, ``ros1`` or the file's name (json, protobuf, ...).
-    definition: the type's text ("" = none), in definition_format ``msg``, ``idl`` or ``protobuf`` (a
-    FileDescriptorSet, a byte a character). schema: the original type's name if type_name is the ROS message it stands
-    for (Foxglove), else "".
+    type_name: ``package/msg/Type`` for ROS. encoding: ``cdr``, ``ros1`` or the file's (json, protobuf, ...).
+    definition: the type's text or "", in definition_format ``msg``, ``idl`` or ``protobuf`` (a FileDescriptorSet, a
+    byte a character). schema: the original type if type_name is the ROS message it stands for (Foxglove), else "".
     """
 
     name: str

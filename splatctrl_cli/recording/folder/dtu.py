@@ -60,9 +60,9 @@ def read_dtu(
 ) -> DtuScan:
     """Read scan `scan` (default: the only one) of a DTU folder; `masks` contains NNN.png by view number.
 
-    `shrink` maps each view before the next is read. K is scaled to the images (the file's may be for 1600x1200 or for
-    a quarter). Depth of another size is sampled, not blended: a larger map at the image's pixels, a smaller one only
-    at its own. A view without depth is left out. Raises InputError naming the file.
+    `shrink` maps each view before the next is read. K is scaled to the images (the file's may be for 1600x1200 or a
+    quarter). Depth of another size is sampled, not blended: larger maps at the image's pixels, smaller ones only at
+    their own. Views without depth are left out. Raises InputError naming the file.
     """
     scan, folder = chosen_scan(root, scan_folders(root), scan)
 
@@ -109,7 +109,7 @@ def read_views(
     shrink: Shrink,
     keeps_without_depth: bool,
 ) -> DtuScan:
-    """Read the views of images by number, one at a time in memory before `shrink`.
+    """Read views by number, one at a time in memory before `shrink`.
 
     A view without a depth file has depth 0, or is left out. camera: intrinsics and T_world_camera by number and
     (width, height).
@@ -151,7 +151,7 @@ def read_views(
 def check_lengths(where: str, views: Sequence[DtuView]) -> None:
     """Raise InputError if depth or camera distances are not millimetres.
 
-    Plausible is a table seen from near, not from a thousandth or a thousand times as far.
+    Plausible is a table seen from near, not from a thousandth or thousand times that.
     """
     known = [view.depth[view.depth > 0] for view in views]
     medians = [float(np.median(depth)) for depth in known if depth.size]
@@ -207,7 +207,7 @@ def scan_folders(root: Path) -> dict[str, Path]:
 
 
 def _images(folder: Path) -> dict[int, Path]:
-    """Return each view number's image, light 3 if there is a choice."""
+    """Images by view number, light 3 if there is a choice."""
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         match = re.fullmatch(r"rect_(\d+)_(\d+|max)(_r5000)?\.(png|jpg)", path.name)
@@ -242,7 +242,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool:
 
 
 def _mask_file(folder: Path, number: int) -> Path:
-    """Find ``007.png`` or the like in the folder (RegNeRF) or its ``mask`` (IDR)."""
+    """``007.png`` or the like in the folder (RegNeRF) or its ``mask`` (IDR)."""
     for place in (folder, folder / "mask"):
         for path in sorted(place.glob("*.png")):
             if path.stem.isdecimal() and int(path.stem) == number:
@@ -253,7 +253,7 @@ def _mask_file(folder: Path, number: int) -> Path:
 
 
 def _camera_file(root: Path, number: int) -> Path:
-    """Return the training images' camera, else the full images'."""
+    """The training images' camera, else the full images'."""
     candidates = [root / "Cameras" / part / f"{number:08d}_cam.txt" for part in ("train", ".")]
     for path in candidates:
         if path.is_file():
@@ -285,9 +285,9 @@ def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
 def fitted_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
     """Fit K to an image of `size` (width, height), whichever common size it is for.
 
-    Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). In a shrunk image it moves to (u + 0.5)
-    scale - 0.5, as in `shrunk`. MVSNet's cameras for 640x512, and for a quarter, are instead multiples of those for
-    1600x1200: train/ has 4 x 82.9 = 823.2 / 2 - 80. Its loaders take them so.
+    Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). Shrinking moves it to (u + 0.5) scale -
+    0.5, as in `shrunk`. MVSNet's cameras for 640x512, and for a quarter, are instead multiples of those for 1600x1200
+    (train/ has 4 x 82.9 = 823.2 / 2 - 80), and its loaders agree.
     """
     width, height = size
     shift, crop = 0.0, (0, 0)
@@ -365,7 +365,7 @@ def _rows(matrix: Float64) -> list[str]:
 
 
 def _pairs(views: Sequence[DtuView]) -> str:
-    """List each view's nearest cameras first; the score falls with distance [mm]."""
+    """Nearest cameras first; the score falls with distance [mm]."""
     centers = np.array([view.T_world_camera[:3, 3] for view in views]) * MILLIMETRES
     lines = [str(len(views))]
     for number in range(len(views)):

@@ -29,9 +29,9 @@ class DtuSource:
     """A scan's views by number (view 0 is ``rect_001``), which is also the stamp.
 
     The scene is static, so there is no clock. Views in `holdout` belong to camera ``holdout``, others to ``camera``;
-    a `protocol` instead assigns or drops views. masks, depths: folders for what the layout does not have. downscale:
-    image shrink factor; None: the protocol's size, if a whole factor reaches it. layout: ``MVSNet`` or ``IDR``;
-    split: training and held-out views.
+    a `protocol` assigns or drops views instead. masks, depths: folders for what the layout does not have. downscale:
+    shrink factor; None: to the protocol's size, if whole. layout: ``MVSNet`` or ``IDR``; split: training and held-out
+    views.
     """
 
     joint_names: tuple[str, ...] = ()
@@ -114,9 +114,9 @@ class DtuSource:
 def shrunk(view: DtuView, factor: int) -> DtuView:
     """Merge every `factor` x `factor` pixels: mean colour, the middle's depth, the first's mask.
 
-    Colour and mask follow RegNeRF (regnerf/internal/datasets.py, downsample: cv2.INTER_AREA, and for masks
-    cv2.INTER_NEAREST, which takes the first pixel). Pixel (0, 0) has its centre at (0, 0), so u becomes (u + 0.5) /
-    factor - 0.5. Raises UsageError for a factor that does not divide the size.
+    Colour and mask follow RegNeRF (regnerf/internal/datasets.py, downsample: cv2.INTER_AREA; masks cv2.INTER_NEAREST,
+    which takes the first pixel). Pixel (0, 0) has its centre at (0, 0): u becomes (u + 0.5) / factor - 0.5. Raises
+    UsageError for a factor that does not divide the size.
     """
     k = view.intrinsics
     if factor < 1 or k.width % factor or k.height % factor:

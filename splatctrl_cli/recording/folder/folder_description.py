@@ -94,9 +94,9 @@ class SplitTable:
 
 @dataclass(frozen=True, kw_only=True)
 class ImagePart:
-    """An image inside a file, used like the path of an image file.
+    """An image inside a file, used like an image file's path.
 
-    number: its index there; size: (columns, rows); read_bytes: an image file of that suffix, empty if damaged.
+    number: its index; size: (columns, rows); read_bytes: an image file of that suffix, empty if damaged.
     """
 
     file: Path
@@ -133,7 +133,7 @@ class ListedView:
     """A view by its files, for layouts that list them.
 
     depth: None if no view has any. matrix: pose as written, or None. camera: None for [camera]. depth_scale: metres
-    per count, None for [depth]'s. valid: an 8-bit grey image, 0 on invalid pixels, or None.
+    per count, None for [depth]'s. valid: 8-bit grey, 0 on invalid pixels, or None.
     """
 
     name: str
@@ -151,9 +151,9 @@ class ListedView:
 class Description:
     """A whole description; transforms.json may give camera and frames, --camera-pose the poses.
 
-    listed: a layout's views, instead of frames. is_depth_resized: depth of another size shows the same view and takes
-    nearest pixels. unpaired: colour and depth files without partner. num_damaged: views lost to damaged files.
-    supply: how to add depth if no view has any. notes: assumptions that the layout leaves open.
+    listed: a layout's views, instead of frames. is_depth_resized: depth of another size takes nearest pixels.
+    unpaired: colour and depth files without partner. num_damaged: views lost to damage. supply: how to add depth if
+    none has it. notes: assumptions that the layout leaves open.
     """
 
     path: Path
@@ -223,10 +223,10 @@ def has_table(path: Path, name: str) -> bool:
 
 
 def read_rig(path: Path, root: Path | None = None) -> list[Description]:
-    """Return a description per ``[[cameras]]``; empty without them.
+    """A description per ``[[cameras]]``; empty without them.
 
-    Its keys are [camera]'s, and `color`, `depth` and `poses` for its files; the rest is common. Raises as
-    `read_description`, and for shared or missing names.
+    Keys are [camera]'s, and `color`, `depth`, `poses` for files; the rest is common. Raises as `read_description`,
+    and for shared or missing names.
     """
     content = _content(path)
     cameras = content.pop("cameras", [])

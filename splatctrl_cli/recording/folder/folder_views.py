@@ -61,8 +61,8 @@ class View:
 def length_unit(median: float, apart: float) -> float:
     """Metres per length of a recording with this median depth and camera distance.
 
-    1 unless depth is too large for metres and the cameras have the same unit. If depth alone is too large, its scale
-    is wrong, and the cameras are relatively close. `reconstruct` then compares the views.
+    1 unless depth is too large for metres and the cameras agree. If depth alone is too large, its scale is wrong, and
+    the cameras are relatively close. `reconstruct` then compares the views.
     """
     if median <= PLAUSIBLE_DEPTH[1] or apart < UNIT_APART * median:
         return 1.0
@@ -120,7 +120,7 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
 
 
 def _present(description: Description, loss: LossReport) -> list[ListedView]:
-    """Keep listed views with files; others count as unpaired. Raises InputError for a file outside."""
+    """Keep views with files; others count as unpaired. Raises InputError for a file outside."""
     root, present, absent = description.root.absolute(), [], []
     for view in description.listed:
         files = [path for path in (view.color, view.depth, view.valid) if path is not None]
@@ -177,7 +177,6 @@ def _scale(description: Description, view: ListedView, options: SourceOptions) -
 
 
 def _listed(description: Description, options: SourceOptions, loss: LossReport) -> list[ListedView]:
-    """Views by the globs of [frames]."""
     frames, camera = description.frames, description.camera
     assert frames is not None and camera is not None
     colors = dict(find_files(description.root, frames.color))
@@ -205,7 +204,7 @@ def _listed(description: Description, options: SourceOptions, loss: LossReport) 
 
 
 def _masks(description: Description, names: list[str], loss: LossReport) -> dict[str, Path]:
-    """Mask files by view name; missing ones are noted in `loss`."""
+    """Masks by view name; missing ones are noted in `loss`."""
     assert description.frames is not None
     pattern = description.frames.human_mask
     if not pattern:
@@ -251,7 +250,7 @@ def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float
 
 
 def _holdout(description: Description, names: list[str], options: SourceOptions) -> set[str]:
-    """Held-out names; an entry is a name, else a position among sorted pairs."""
+    """Held-out names; an entry is a name, else a position."""
     entries = description.split.holdout if options.holdout is None else options.holdout
     held = set()
     for entry in entries:
@@ -268,7 +267,7 @@ def _holdout(description: Description, names: list[str], options: SourceOptions)
 
 
 def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
-    """The stamp by layout, file name or frame number and rate; else one second a frame."""
+    """The stamp by layout, file name or frame rate; else one second a frame."""
     stamps = description.stamps
     if view.stamp_ns is not None:
         return view.stamp_ns

@@ -1,10 +1,10 @@
 """DTU scans in the layout of IDR and NeuS.
 
-SCAN/cameras_sphere.npz (or cameras.npz) with world_mat_I, the projection (4, 4) of world points to pixels of image I.
-scale_mat_I maps the unit sphere around the object to the world. SCAN/image/000000.png; SCAN/mask/000.png.
-Image I is the I-th by name (Totoro97/NeuS, models/dataset.py); if images are missing, the one named by that number.
-World lengths are millimetres there, metres here. The layout has no depth; ours may be in SCAN/depth as MVSNet's
-depth_map_0000.pfm (and depth_visual_0000.png).
+SCAN/cameras_sphere.npz (or cameras.npz) has world_mat_I, the projection (4, 4) of world points to pixels of image I,
+and scale_mat_I, the object's unit sphere to the world; SCAN/image/000000.png; SCAN/mask/000.png.
+Image I is the I-th by name (Totoro97/NeuS, models/dataset.py), or by number if some are missing. World lengths are
+millimetres there, metres here. SCAN/depth may have our depth as MVSNet's depth_map_0000.pfm (and
+depth_visual_0000.png).
 """
 
 import re
@@ -50,8 +50,7 @@ def read_idr(
 ) -> DtuScan:
     """Read scan `scan` (default: the only one); `depths` contains its depth maps (default: SCAN/depth).
 
-    `shrink` maps each view to the one kept. A view without a depth map has depth 0. Raises InputError naming the
-    file.
+    `shrink` maps each view. A view without a depth map has depth 0. Raises InputError naming the file.
     """
     scan, folder = chosen_scan(root, idr_scans(root), scan)
     path = next(folder / name for name in CAMERAS if (folder / name).is_file())
@@ -84,8 +83,7 @@ def read_idr(
 def write_idr(root: Path, scan: str, views: Sequence[DtuView]) -> Path:
     """Write views as one scan folder, with their masks; returns it.
 
-    The object's sphere is centred at the point nearest to the cameras' axes; its radius is half the distance to the
-    nearest camera.
+    The object's sphere is centred nearest to the cameras' axes, with half the nearest camera's distance as radius.
     """
     folder = root / scan
     (folder / "image").mkdir(parents=True)
@@ -139,10 +137,7 @@ def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
 
 
 def _numbered(folder: Path, num: int) -> dict[int, Path]:
-    """Images by camera number: in order if there are `num`, else by name.
-
-    Raises InputError for a name that is no such number.
-    """
+    """Images by camera number: in order if there are `num`, else by name. Raises InputError for another name."""
     paths = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
     if len(paths) == num:
         return dict(enumerate(paths))
@@ -160,7 +155,7 @@ def _numbered(folder: Path, num: int) -> dict[int, Path]:
 
 
 def _projections(path: Path) -> list[Float64]:
-    """Projections (3, 4) of world points [mm] to pixels, per camera."""
+    """World points [mm] to pixels, (3, 4) per camera."""
     try:
         arrays = read_arrays(path, most=1 << 24)  # bytes of cameras: 500 each
         num = sum(1 for name in arrays if re.fullmatch(r"world_mat_\d+", name))

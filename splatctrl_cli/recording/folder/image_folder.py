@@ -97,7 +97,7 @@ class ImageFolderSource(Recording):
         )
 
     def _in_metres(self) -> str:
-        """Convert lengths in millimetres or centimetres, if depth and camera positions agree; return a note."""
+        """Convert lengths in millimetres or centimetres; return a note."""
         places = [view.T_world_camera[:3, 3] for view in self._views]
         apart = float(np.linalg.norm(np.ptp(places, axis=0)))  # the diagonal of their box, in the unit of the poses
         for view in self._views if apart > UNIT_BASELINE / max(UNITS) else ():
@@ -226,7 +226,7 @@ class ImageFolderSource(Recording):
         return self._lenses[table.name]
 
     def _valid(self, view: View, lens: Lens) -> Bool | None:
-        """Pixels that the lens saw and the mask keeps; none if the mask is unreadable."""
+        """Pixels the lens saw and the mask keeps; none if it is unreadable."""
         seen = None if lens.undistortion is None else lens.undistortion.valid
         if view.valid is None:
             return seen
@@ -243,7 +243,7 @@ class ImageFolderSource(Recording):
         return lens.labels(human_mask(pixels, lens.intrinsics, str(path)))
 
     def _depth(self, view: View, lens: Lens) -> Float32 | None:
-        """Depth (H, W) [m] at colour's pixels, 0 without a return; None if unreadable."""
+        """Depth (H, W) [m] at colour's pixels, 0 = no return; None if unreadable."""
         if view.depth is None:
             return np.zeros((view.lens.height, view.lens.width), np.float32)
         depth = self._recorded_depth(view.depth, view.depth_scale)
@@ -279,7 +279,7 @@ class ImageFolderSource(Recording):
 
 
 def _is_float(encoding: str, path: ImageFile) -> bool:
-    """True for floats; a .npy always has them (nerfstudio)."""
+    """True for floats, which every .npy has (nerfstudio)."""
     return encoding == "float32" or path.suffix == ".npy"
 
 

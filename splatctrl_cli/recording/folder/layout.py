@@ -35,10 +35,10 @@ _IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"})
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """A dataset layout, in its module's ``ENTRIES``: its name, test and reader.
+    """A dataset layout, in its module's ``ENTRIES``.
 
-    The lowest `order` of matching layouts wins; a file that ends in `suffix` is one by itself. `docs` are rows in
-    docs/input.md, cells between bars, an empty line between rows: layout, marks, poses, depth, intrinsics.
+    The lowest matching `order` wins; a file with `suffix` is one by itself. `docs`: rows in docs/input.md, cells
+    between bars, an empty line between rows: layout, marks, poses, depth, intrinsics.
     """
 
     name: str
@@ -168,7 +168,7 @@ def described(
 ) -> Description:
     """Describe paired views with the lens of --intrinsics, else `lens` of the first image.
 
-    Without `lens` each view has its own. Raises InputError for an impossible camera.
+    Without `lens` each view has its own. Raises InputError if impossible.
     """
     first = pairs.views[0]
     camera = first.camera if lens is None else given_lens(options, first.color) or lens(first.color)

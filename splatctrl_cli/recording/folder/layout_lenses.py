@@ -1,19 +1,19 @@
 """Layouts with a lens per image: ARKitScenes, BOP scenes, and MVSNet scenes.
 
-ARKitScenes: ``lowres_wide/``, ``lowres_depth/``, ``lowres_wide_intrinsics/`` and ``lowres_wide.traj``. Images are
-named by video and seconds; depth in millimetres; a ``.pincam`` per image has width, height, fx, fy, cx, cy. A
-trajectory line is seconds, a rotation vector and a translation [m], world to camera, interpolated like tf
-(apple/ARKitScenes, DATA.md, and threedod/benchmark_scripts/utils/tenFpsDataLoader.py).
+ARKitScenes: ``lowres_wide/``, ``lowres_depth/``, ``lowres_wide_intrinsics/``, ``lowres_wide.traj``. Images are named
+by video and seconds; depth in millimetres; an image's ``.pincam`` has width, height, fx, fy, cx, cy. Trajectory lines
+are seconds, rotation vector, translation [m], world to camera, interpolated like tf (apple/ARKitScenes, DATA.md, and
+threedod/benchmark_scripts/utils/tenFpsDataLoader.py).
 
-BOP: ``scene_camera.json``, ``rgb/`` (or ``gray/``) and ``depth/``. Per image: cam_K by rows [px], depth_scale counts
-to millimetres, cam_R_w2c by rows and cam_t_w2c in millimetres (thodan/bop_toolkit, docs/bop_datasets_format.md). PNG,
-JPEG or TIFF. Several sensors have suffixes: ``scene_camera_cam1.json``, ``rgb_cam1/``, ``depth_cam1/``.
+BOP: ``scene_camera.json``, ``rgb/`` (or ``gray/``), ``depth/``. Per image: cam_K by rows [px], depth_scale counts to
+millimetres, cam_R_w2c by rows, cam_t_w2c in millimetres (thodan/bop_toolkit, docs/bop_datasets_format.md). PNG, JPEG
+or TIFF. Several sensors: ``scene_camera_cam1.json``, ``rgb_cam1/``, ``depth_cam1/``.
 
-MVSNet: ``cams/NUMBER_cam.txt``, ``pair.txt``, images, and optional depth (.pfm). A camera file is the world-to-camera
-matrix, K, and ``DEPTH_MIN DEPTH_INTERVAL [DEPTH_NUM [DEPTH_MAX]]`` (its README, "File Formats") or ``DEPTH_MIN
-DEPTH_MAX``. Images are in ``images/`` (DTU's test set, Tanks and Temples, ETH3D, colmap2mvsnet.py),
-``blended_images/`` (BlendedMVS) or next to ``cams/``. Depth, in the cameras' unknown length unit, is in
-``rendered_depth_maps/`` (BlendedMVS) or any folder with ``depth`` in its name.
+MVSNet: ``cams/NUMBER_cam.txt``, ``pair.txt``, images, optional depth (.pfm). A camera file is the world-to-camera
+matrix, K, and ``DEPTH_MIN DEPTH_INTERVAL [DEPTH_NUM [DEPTH_MAX]]`` (README, "File Formats") or ``DEPTH_MIN
+DEPTH_MAX``. Images: ``images/`` (DTU's test set, Tanks and Temples, ETH3D, colmap2mvsnet.py), ``blended_images/``
+(BlendedMVS) or next to ``cams/``. Depth, in the cameras' unknown unit: ``rendered_depth_maps/`` (BlendedMVS) or any
+folder with ``depth`` in its name.
 """
 
 import re
@@ -165,14 +165,13 @@ def read_bop(folder: Path, options: SourceOptions) -> Description:
 
 
 def _sensors(folder: Path) -> list[str]:
-    """Suffixes of each sensor's files, such as ``_cam1``; a single one's is empty."""
+    """Suffixes of the sensors' files, such as ``_cam1``; one sensor's is empty."""
     stem = Path(FILE).stem
     found = sorted(path.stem.removeprefix(stem) for path in folder.glob(f"{stem}*.json"))
     return [sensor for sensor in found if (folder / f"depth{sensor}").is_dir()]
 
 
 def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, Path]) -> list[ListedView]:
-    """Views of one sensor."""
     content = read_json(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected an object by image number, got {type(content).__name__}", remedy=_REMEDY)
@@ -262,7 +261,7 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
 
 
 def _images(folder: Path, stems: set[str]) -> dict[str, Path]:
-    """Each camera's image, from the folder with most of them."""
+    """Images from the folder with most of them."""
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and "depth" not in path.name.lower()]
     found = [{stem: path for stem, path in images_of(place).items() if stem in stems} for place in (*inner, folder)]
     most = max(found, key=len)

@@ -1,10 +1,10 @@
 """nerfstudio's and instant-ngp's ``transforms.json`` with depth: lens, files and pose per frame.
 
-Fields, defaults and axes (OpenGL) follow nerfstudio's documentation ("Data conventions"),
+Fields, defaults and axes (OpenGL): nerfstudio's documentation ("Data conventions"),
 nerfstudio/data/dataparsers/nerfstudio_dataparser.py and data/utils/data_utils.py. Masks are 0 on invalid pixels;
-depth of another size takes nearest pixels; scaled poses (``applied_scale``) are scaled back to fit metric depth.
-instant-ngp has ``depth_path``, ``integer_depth_scale`` [m per count], ``camera_angle_x``, ``is_fisheye``; without a
-centre it is the image's (NVlabs/instant-ngp, scripts/nerfcapture2nerf.py, and src/nerf_loader.cu).
+depth of another size takes nearest pixels; ``applied_scale`` is undone to fit metric depth. instant-ngp has
+``depth_path``, ``integer_depth_scale`` [m per count], ``camera_angle_x``, ``is_fisheye``; its default centre is the
+image's (NVlabs/instant-ngp, scripts/nerfcapture2nerf.py, and src/nerf_loader.cu).
 """
 
 import math
@@ -82,7 +82,7 @@ def _view(
     description: Description,
     matrices: dict[str, Float64],
 ) -> ListedView:
-    """A frame's view; its own values override the file's."""
+    """A frame's view; its values override the file's."""
     name, said = str(entry["file_path"]), {**content, **entry}
     color = _image(path.parent / _with_slashes(name))
     depth, scale = _only(entry, _DEPTHS, path), _only(said, _SCALES, path)
@@ -106,7 +106,7 @@ def _view(
 
 
 def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
-    """The value of any of the keys, or None. Raises InputError if two differ."""
+    """The value of any key, or None. Raises InputError if two differ."""
     found = {key: said[key] for key in keys if said.get(key) not in (None, "")}
     if len(set(found.values())) > 1:
         both = " and ".join(f"{key} = {value}" for key, value in found.items())
@@ -115,12 +115,11 @@ def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
 
 
 def _with_slashes(name: str) -> str:
-    """Turn Windows' backslashes into slashes."""
     return name.replace("\\", "/")
 
 
 def _image(path: Path) -> Path:
-    """Find an image whose name may omit `.png` or `.jpg`, as in Blender's scenes."""
+    """An image whose name may omit `.png` or `.jpg`, as in Blender's scenes."""
     if path.suffix:
         return path
     return next((file for end in (".png", ".jpg") if (file := path.with_name(path.name + end)).is_file()), path)

@@ -1,8 +1,8 @@
 """Organised PCL point clouds: a ``.pcd`` with a point per pixel, or a folder.
 
-The format is PCL's tutorial "The PCD file format" (v0.7; ascii, binary, binary_compressed), read by pypcd4 (extra
-`pcd`). It has no intrinsics, but its grid does: column u, row v is on that pixel's ray. VIEWPOINT is the camera's
-pose; points are in the camera's frame (z forward) or the world, whichever fits the grid.
+Format: PCL's tutorial "The PCD file format" (v0.7; ascii, binary, binary_compressed), read by pypcd4 (extra `pcd`).
+Intrinsics follow from the grid: column u, row v is on that pixel's ray. VIEWPOINT is the camera's pose; points are in
+the camera (z forward) or world, whichever fits.
 """
 
 import struct
@@ -77,7 +77,7 @@ def read_cloud(path: Path) -> Cloud:
 def pinhole_of(points: Float64) -> Intrinsics | None:
     """Fit a pinhole whose pixel (u, v) sees the point (H, W, 3) of row v, column u.
 
-    Least squares over u and v; None with too few points in front, or if none fits.
+    Least squares over u and v; None with too few points in front, or a bad fit.
     """
     valid = _is_seen(points)
     v, u = np.nonzero(valid)
@@ -144,7 +144,7 @@ def read(path: Path, options: SourceOptions) -> Description:
 
 
 def _fitted(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[str]]:
-    """The grid's or --intrinsics' camera, is_world of the points, and notes."""
+    """The camera, is_world of the points, and notes."""
     cloud, given = read_cloud(path), options.intrinsics.get(CAMERA)
     fits = []
     for is_world in (False, True):
@@ -176,7 +176,7 @@ def _library() -> Any:
 
 
 def _head(path: Path) -> Any:
-    """Read a header. Raises InputError for a cloud not organised or without colour."""
+    """Raises InputError for a cloud not organised or without colour."""
     lines: list[str] = []
     try:
         with path.open("rb") as stream:
@@ -211,7 +211,7 @@ def _unreadable(path: Path, error: Exception) -> InputError:
 
 
 def _viewpoint(said: Any) -> Float64:
-    """T_world_camera (4, 4) of VIEWPOINT: x, y, z, then qw, qx, qy, qz."""
+    """T_world_camera (4, 4) of x, y, z, qw, qx, qy, qz."""
     x, y, z, qw, qx, qy, qz = said.viewpoint
     return transform_from((x, y, z), (qx, qy, qz, qw))
 
@@ -221,7 +221,7 @@ def _is_seen(points: Float64) -> Bool:
 
 
 def _color_file(path: Path) -> bytes:
-    """A cloud's colour as PNG, empty if unreadable."""
+    """PNG, empty if unreadable."""
     try:
         color = read_cloud(path).color
     except InputError:
@@ -230,9 +230,9 @@ def _color_file(path: Path) -> bytes:
 
 
 def _depth_file(path: Path, camera: Intrinsics, first: Path, *, is_world: bool) -> bytes:
-    """A cloud's depth in its own length, 0 for none, as .npy, empty if unreadable.
+    """Depth in the cloud's length, 0 for none, as .npy, empty if unreadable.
 
-    Raises InputError if its camera is not the first cloud's.
+    Raises InputError if the camera is not the first cloud's.
     """
     try:
         points = read_cloud(path).in_camera(is_world=is_world)

@@ -1,10 +1,10 @@
 """ScanNet's sensor files: ``X.sens`` of version 4, alone or in its folder.
 
-As in ScanNet's SensReader (python/SensorData.py, c++/src/sensorData.h), little-endian: version (uint32), name (uint64
-and text), four 4x4 float32 matrices (intrinsics and extrinsics of colour, then depth). Then two int32 storage types
-of colour and depth, their sizes (four uint32), counts per metre (float32), number of frames (uint64). A frame: camera
-to world (16 float32, -inf if tracking was lost), stamps of colour and depth [us] and lengths of both images (four
-uint64), the images. IMU data after the frames is skipped.
+Layout of ScanNet's SensReader (python/SensorData.py, c++/src/sensorData.h), little-endian: version (uint32), name
+(uint64 and text), four 4x4 float32 matrices (intrinsics and extrinsics of colour, then depth). Storage of colour and
+depth (two int32), their sizes (four uint32), counts per metre (float32), number of frames (uint64). A frame: camera
+to world (16 float32, -inf if lost), stamps of colour and depth [us] and lengths of both images (four uint64), the
+images. IMU data follows, and is skipped.
 """
 
 import struct
@@ -55,7 +55,7 @@ _AGAIN = "copy the file again"
 
 @dataclass(frozen=True, kw_only=True)
 class _Sens:
-    """A file's head: lenses of both cameras (4, 4) [px], their poses in the rig's base.
+    """The head: lenses of both cameras (4, 4) [px], and poses in the rig's base.
 
     depth_scale: metres per count. is_packed: depth is zlib. first: the frames' offset.
     """
@@ -157,7 +157,6 @@ def _head(path: Path) -> _Sens:
 
 
 def _frames(path: Path, sens: _Sens) -> Iterator[ListedView]:
-    """Yield the frames up to the end of the file."""
     end = path.stat().st_size
     with path.open("rb") as stream:
         stream.seek(sens.first)
@@ -195,7 +194,7 @@ def _part(path: Path, first: int, length: int) -> bytes:
 
 
 def _png(read: Callable[[], bytes], sens: _Sens) -> bytes:
-    """Depth words as PNG; empty for another number of words."""
+    """A PNG, empty for another number of words."""
     data, (width, height) = read(), sens.depth_size
     num = 2 * width * height
     if sens.is_packed:

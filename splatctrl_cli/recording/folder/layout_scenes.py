@@ -3,22 +3,19 @@
 7-Scenes and its kin: ``frame-NNNNNN.color.*``, ``.depth.*``, ``.pose.txt``, in one folder, ``seq-NN/``, ``data/``.
 Depth in millimetres, 65535 for none; poses camera to world. Three calibrations:
 
-- an ``info.txt`` of ScanNet's SensReader (12-Scenes, BundleFusion, 3RScan), for which the user describes the folder;
+- ``info.txt`` of ScanNet's SensReader (12-Scenes, BundleFusion, 3RScan): the user describes the folder;
 - ``camera-intrinsics.txt``, one 3x3 matrix for both (3DMatch, Zeng et al., CVPR 2017);
-- none: 7-Scenes publishes the depth camera's default of 585, 585, 320, 240 and its poses; colour is not registered
-  (Shotton et al., CVPR 2013, and the dataset's page). Colour is taken as a Kinect's of focal length 525, placed by
-  another Kinect's calibration, as in ACE (nianticlabs/ace, datasets/setup_7scenes.py, after LIRIS' Kinect
-  calibration).
+- none: 7-Scenes publishes the depth camera's 585, 585, 320, 240 and poses; colour is not registered (Shotton et al.,
+  CVPR 2013, and the dataset's page). Colour is a Kinect's of focal length 525, placed by another Kinect's
+  calibration, as in ACE (nianticlabs/ace, datasets/setup_7scenes.py, after LIRIS' Kinect calibration).
 
-Open3D and Redwood: a colour folder, ``depth/``, ``trajectory.log`` and ``camera_intrinsic.json``, named as in
-Open3D's data classes (open3d.data: RedwoodIndoorLivingRoom1 with ``colors/``, LoungeRGBDImages, BedroomRGBDImages).
-Poses are camera to world: Open3D integrates with their inverse
-(examples/python/reconstruction_system/integrate_scene.py). Images match poses in natural order
-(examples/python/reconstruction_system/open3d_example.py, get_rgbd_file_lists); with more poses than images, by the
-number in the file name.
+Open3D and Redwood: a colour folder, ``depth/``, ``trajectory.log``, ``camera_intrinsic.json``, named as in
+open3d.data (RedwoodIndoorLivingRoom1 with ``colors/``, LoungeRGBDImages, BedroomRGBDImages). Poses are camera to
+world: Open3D integrates with their inverse (examples/python/reconstruction_system/integrate_scene.py). Images match
+poses in natural order (open3d_example.py there, get_rgbd_file_lists), or by number if there are more poses.
 
-Known, but described by hand (docs/input.md): Replica of NICE-SLAM and Semantic-NeRF, ICL-NUIM in TUM's form, ScanNet
-of SensReader.
+Described by hand (docs/input.md): Replica of NICE-SLAM and Semantic-NeRF, ICL-NUIM in TUM's form, ScanNet of
+SensReader.
 """
 
 import re

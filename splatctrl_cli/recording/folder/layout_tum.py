@@ -1,18 +1,18 @@
 """Layouts with images paired by stamp: TUM RGB-D and its kin, and SUN3D.
 
-TUM RGB-D: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``. Depth counts 1/5000 m. Files, factor and cameras follow
-the dataset's page (Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012; "File Formats" and
-"Intrinsic Camera Calibration"; the same in raulmur/ORB_SLAM2, Examples/RGB-D/TUM1.yaml to TUM3.yaml). Poses are of
-the colour camera. Depth is registered to the raw colour image, so both are undistorted alike.
+TUM RGB-D: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``. Depth counts 1/5000 m. Files, factor and cameras: the
+dataset's page (Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012; "File Formats" and
+"Intrinsic Camera Calibration"; the same in raulmur/ORB_SLAM2, Examples/RGB-D/TUM1.yaml to TUM3.yaml). Poses are the
+colour camera's. Depth is registered to raw colour, so both are undistorted alike.
 
-Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): its page gives the lens, and the camera in groundtruth.txt's marker
-frame, T_camera = T_ros^-1 T_groundtruth T_ros T_m. T_m's rotation has a scale of 1.059 there, which is dropped. ETH3D
-SLAM (Schöps et al., CVPR 2019): ``calibration.txt`` with fx, fy, cx, cy.
+Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): its page gives the lens, and T_camera = T_ros^-1 T_groundtruth T_ros
+T_m from groundtruth.txt's marker frame. T_m's rotation has a scale of 1.059, which is dropped. ETH3D SLAM (Schöps et
+al., CVPR 2019): ``calibration.txt`` with fx, fy, cx, cy.
 
-SUN3D: ``image/NUMBER-MICROSECONDS.jpg``, ``depth/NUMBER-MICROSECONDS.png``, ``intrinsics.txt``, ``extrinsics/``, read
-as its own reader does (SUN3DreaderWithAnnotation, readSUN3Dannotation.m). Depth has its bits rotated left by three,
-is in millimetres and registered to colour; an image takes the nearest in time. The last file of ``extrinsics/`` has a
-3x4 matrix per image in order, camera to world; the first pixel's centre is at 1.
+SUN3D: ``image/NUMBER-MICROSECONDS.jpg``, ``depth/NUMBER-MICROSECONDS.png``, ``intrinsics.txt``, ``extrinsics/``, as
+in its reader (SUN3DreaderWithAnnotation, readSUN3Dannotation.m). Depth has bits rotated left by three, in
+millimetres, registered to colour, nearest in time. The last file of ``extrinsics/`` has a 3x4 matrix per image in
+order, camera to world; the first pixel's centre is at 1.
 """
 
 import re
@@ -135,7 +135,7 @@ def listed(path: Path) -> list[tuple[int, Path]]:
 
 
 def _series(folder: Path) -> Series | None:
-    """The series in the folder's name, else in the heads of its lists."""
+    """The series in the folder's name, else in its lists' heads."""
     names = [folder.resolve().name]
     for file in ("rgb.txt", "depth.txt", "groundtruth.txt"):
         if (folder / file).is_file():

@@ -51,7 +51,7 @@ def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
 
 
 def _unlike(topic: TopicSurvey) -> str:
-    """Return the word in the topic or frame name that contradicts the image kind."""
+    """The word in a name that contradicts the image kind."""
     image, parts = topic.image, _parts(topic.topic.name)
     if image.kind == "depth":
         word = word_of(parts) or word_of((image.frame_id,))
@@ -63,8 +63,8 @@ def _unlike(topic: TopicSurvey) -> str:
 def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraTopics, ...]:
     """Pair colour and depth topics that share a namespace, deepest first, into named cameras.
 
-    /cam0/color/image_raw and /cam0/depth/image_raw make camera `cam0`. Registered depth is preferred to raw depth,
-    colour to grey, rectified images to raw ones, uncompressed to compressed. Skips the topics `without`.
+    /cam0/color/image_raw and /cam0/depth/image_raw make `cam0`. Prefers registered depth, colour to grey, rectified
+    to raw, uncompressed images. Skips topics `without`.
     """
     colors = [topic for topic in image_topics(survey, "color") if topic.topic.name not in without]
     depths = image_topics(survey, "depth")
@@ -116,16 +116,16 @@ def _camera(
 
 
 def _family(name: str) -> tuple[str, ...]:
-    """Return the topic parts that raw, rectified and compressed images of a sensor share."""
+    """Topic parts shared by raw, rectified and compressed images of a sensor."""
     parts = _parts(name)
     return (*parts[:-1], re.sub("_?(rect|raw)", "", parts[-1]))
 
 
 def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | None = None) -> str:
-    """Return the CameraInfo topic of an image topic, "" if none.
+    """The CameraInfo topic of an image topic, "" if none.
 
-    It shares more of its path than the camera's namespace, lies in the image's own folder or the namespace's, or has
-    the image's frame and size.
+    It shares more path than the camera's namespace, is in the image's or namespace's folder, or has the image's frame
+    and size.
     """
     folder = _parts(image.topic.name)[:-1]
     level = len(folder) - 1 if namespace is None else len(namespace)
@@ -161,7 +161,7 @@ def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info:
 
 
 def _same_distortion(one: Calibration, two: Calibration) -> bool:
-    """True if two lenses distort alike; missing coefficients are 0."""
+    """Compare two lenses; missing coefficients are 0."""
     bent = [is_distorted(c.distortion_model, c.distortion) for c in (one, two)]
     if not all(bent):
         return not any(bent)
@@ -175,7 +175,6 @@ def frame_of(survey: Survey, color: str, depth: str) -> str:
 
 
 def _is_of_file(topic: TopicSurvey) -> bool:
-    """True for a video file next to a log."""
     return topic.topic.encoding == VIDEO and topic.first_image is not None and not topic.first_image.frame_id
 
 
@@ -208,8 +207,7 @@ def _parts(name: str) -> tuple[str, ...]:
 def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
     """Name cameras by the namespace's last part if unique, else all of it; `camera` if empty.
 
-    A name becomes a folder: other characters than letters, digits, ``_``, ``-`` and ``.`` become ``_``; ``-`` and
-    ``.`` cannot be first.
+    Names are folders: characters but letters, digits, ``_``, ``-``, ``.`` become ``_``; the last two cannot be first.
     """
     short = [_folder_name(camera.name.rpartition("/")[2]) for camera in cameras]
     long = [_folder_name(camera.name.replace("/", "_")) for camera in cameras]
@@ -280,7 +278,7 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
 
 
 def _named_unlike(survey: Survey) -> str:
-    """List the ``unlike`` topics and why, after a semicolon."""
+    """Topics and why, after a semicolon."""
     found = []
     for topic in image_topics(survey, "unlike"):
         image, name = topic.image, topic.topic.name
@@ -312,7 +310,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def _kind(topic: Topic) -> str:
-    """Return a topic's message type, with an encoding that is not ROS."""
+    """The message type, with an encoding that is not ROS."""
     name = topic.schema or topic.type_name
     return name if is_ros(topic) and name else f"{name} ({topic.encoding})".strip()
 
@@ -336,8 +334,8 @@ def join_pose_topics(
     """Add pose topics to a survey's tf tree; those used unasked are noted.
 
     Options name topics by camera. Otherwise an odometry is used if tf misses its child, a camera's frame, or if its
-    parent is the requested world frame. only_first: the first pose alone, enough to see what joins what. Raises
-    InputError if a topic cannot place its camera, or several odometries could.
+    parent is the requested world frame. only_first: one pose, enough to see connections. Raises InputError if a topic
+    cannot place its camera, or several odometries could.
     """
     frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
     asked = {name: given for name, given in options.camera_pose_topics.items() if name in frames}
@@ -354,7 +352,7 @@ def pose_topics(survey: Survey) -> list[str]:
 
 
 def _child_of(log: RawLog, survey: Survey, camera: str, given: PoseTopic, frame: str) -> str:
-    """Return the frame that a topic poses. Raises InputError if that does not place the camera."""
+    """The posed frame. Raises InputError if it does not place the camera."""
     where = f"{log.path}: --camera-pose {camera}={given.topic}"
     if given.topic not in pose_topics(survey):
         raise InputError(
@@ -378,7 +376,7 @@ def _child_of(log: RawLog, survey: Survey, camera: str, given: PoseTopic, frame:
 
 
 def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set[str]) -> dict[str, str]:
-    """Return by odometry the frame that only it places."""
+    """Frames by the odometry that alone places them."""
     known = set(survey.tf.frames)
     found: dict[str, str] = {}
     for topic in survey.of_type(ODOMETRY):
@@ -418,7 +416,6 @@ def _add(log: RawLog, survey: Survey, topic: str, child: str, *, only_first: boo
 
 
 def _poses(log: RawLog, survey: Survey, topic: str, damage: Damage) -> Iterator[StampedPose]:
-    """Yield a topic's poses; messages that do not decode go to `damage`."""
     decoder = MessageDecoder()
     for message in log.messages(Damage(), {topic}):  # the survey has counted this damage
         try:

@@ -1,12 +1,12 @@
 """Decoded messages of the standard types, by the definitions in the log; and RealSense extras.
 
-RealSense bags have extrinsics and depth units in messages on ``/device_D/sensor_S/STREAM_N/...`` (librealsense,
+RealSense bags have extrinsics and depth units on ``/device_D/sensor_S/STREAM_N/...`` (librealsense,
 src/media/ros/ros_file_format.h). ``tf/R`` maps points of group R's reference stream to this stream: T_color_depth =
-T_color_R T_R_depth. This direction makes the edges of depth and colour meet (docs/formats.md).
+T_color_R T_R_depth, the direction in which edges of depth and colour meet (docs/formats.md).
 
-In newer bags (2.5x) an image's frame is "1", and a float32 (little-endian) follows the message: metres per count of
-depth, 0 for others. See librealsense, src/media/ros/ros_writer.cpp,
-third-party/realsense-file/rosbag/msgs/sensor_msgs/Image.h.
+In newer bags (2.5x) an image's frame is "1", and a little-endian float32 follows the message: metres per count of
+depth, 0 for others (librealsense, src/media/ros/ros_writer.cpp,
+third-party/realsense-file/rosbag/msgs/sensor_msgs/Image.h).
 """
 
 import re
@@ -108,8 +108,8 @@ class MessageDecoder:
 def header_stamp_ns(message: RawMessage) -> int:
     """Stamp of a message that begins with a std_msgs/Header, without decoding the rest.
 
-    It follows four bytes (CDR's encapsulation, or ROS 1's `seq`) as two 32-bit words. Foxglove's messages are
-    decoded. Raises UndecodableMessageError if too short.
+    It is two 32-bit words after four bytes (CDR's encapsulation, or ROS 1's `seq`). Foxglove's are decoded. Raises
+    UndecodableMessageError if too short.
     """
     if message.topic.schema == TEXT:
         return message.log_time_ns
@@ -132,7 +132,7 @@ def pack_image(header: Any, pixels: NDArray[np.uint8]) -> bytes:
 
 
 def _unpack_image(data: bytes) -> Any:
-    """Unpack it as a sensor_msgs/Image."""
+    """Undo `pack_image`."""
     _, seconds, nanoseconds, height, width, length = _IMAGE_HEAD.unpack_from(data)
     start, stamp = _IMAGE_HEAD.size + length, SimpleNamespace(sec=seconds, nanosec=nanoseconds)
     return SimpleNamespace(
@@ -166,7 +166,7 @@ def _type_store(topic: Topic) -> Any:
 
 @lru_cache(maxsize=32)
 def _store_of(definition: str, form: str, type_name: str) -> Any:
-    """Types of a definition, cached as compiling takes some ten milliseconds."""
+    """Cached types: compiling takes some ten milliseconds."""
     store = get_typestore(Stores.EMPTY)
     if form == "idl":
         parts = [part for part in definition.split("=" * 80 + "\n") if part.strip()]
@@ -183,13 +183,12 @@ def _store_of(definition: str, form: str, type_name: str) -> Any:
 
 
 def _names(description: Any) -> list[str]:
-    """Types that a field names."""
     kind, detail = description
     return [detail] if kind == Nodetype.NAME else [] if kind == Nodetype.BASE else _names(detail[0])
 
 
 def _check_fields(store: Any) -> None:
-    """Raise ValueError if a standard type misses a standard field; case, lengths and extra fields are free."""
+    """Raise ValueError for a missing standard field; case, lengths and extra fields are free."""
     standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
     for name in sorted(_KNOWN & store.fielddefs.keys()):
         there = {key.lower(): _kind(description) for key, description in store.fielddefs[name][1]}
@@ -207,7 +206,7 @@ def _foxglove_store() -> Any:
 
 
 def _kind(description: Any) -> object:
-    """A field's type, without array, sequence and string lengths."""
+    """A field's type without array, sequence and string lengths."""
     kind, detail = description
     if kind == Nodetype.NAME:
         return detail
@@ -285,7 +284,7 @@ def device_of(topic: str) -> str:
 
 
 def _unit(value: float, topic: str) -> float:
-    """Metres per count, rounded as 0.001 was written as a float32."""
+    """Metres per count; 0.001 was written as a float32."""
     unit = float(f"{float(value):.6g}")
     if not 0 < unit < 1:
         raise ValueError(f"{topic}: expected metres per count, got {unit}")

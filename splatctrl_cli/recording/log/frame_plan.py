@@ -84,7 +84,6 @@ class FramePlan:
         return num
 
     def _keep(self, T: Float64 | None) -> bool:
-        """Store a known pose; return if it is known."""
         if T is not None:
             self._poses.append(T[None])
         return T is not None

@@ -1,7 +1,7 @@
 """The image kind in a topic's name: 16-bit infrared has the encoding of depth.
 
-Driver names: /ir (Azure Kinect, Orbbec), /infra1 (RealSense), image_ir (Kinect 2), confidence (ZED, L515), amplitude
-and noise (time of flight), aux (MultiSense), signal, reflec and nearir (Ouster).
+Drivers: /ir (Azure Kinect, Orbbec), /infra1 (RealSense), image_ir (Kinect 2), confidence (ZED, L515), amplitude and
+noise (time of flight), aux (MultiSense), signal, reflec and nearir (Ouster).
 """
 
 import re

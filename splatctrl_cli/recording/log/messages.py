@@ -78,8 +78,8 @@ _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
 class ImageMessage:
     """An image as recorded; a JPEG or PNG is decoded only for its pixels.
 
-    width, height [px]. decode returns pixels (H, W[, channels]) in `encoding`, or raises UndecodableMessageError.
-    compressed: the JPEG or PNG bytes that decode to `pixels`, if any. remark: a deviation from the format.
+    width, height [px]. decode: pixels (H, W[, channels]) in `encoding`, or UndecodableMessageError. compressed: JPEG
+    or PNG bytes of `pixels`, if any. remark: a deviation from the format.
     """
 
     stamp_ns: int
@@ -120,7 +120,7 @@ class ImageMessage:
 def read_image(message: Any, type_name: str, *, lazily: bool = False) -> ImageMessage:
     """Read a decoded sensor_msgs/Image or CompressedImage. Raises UndecodableMessageError.
 
-    lazily: leave a plain JPEG or PNG undecoded until its pixels are read; only its markers and checksums are checked.
+    lazily: a plain JPEG or PNG stays undecoded; only its markers and checksums are checked.
     """
     if type_name == IMAGE:
         pixels = raw_pixels(message)
@@ -154,7 +154,7 @@ def _image(
 
 
 class _Packed(NamedTuple):
-    """An image file, and the bytes that compressedDepth puts before it."""
+    """An image file, and compressedDepth's bytes before it."""
 
     form: str
     file: bytes
@@ -174,7 +174,7 @@ class _Packed(NamedTuple):
 
 
 def _packed(form: str, data: bytes) -> _Packed:
-    """Find the image file by its first bytes: not all publishers follow `format`.
+    """Find the image file by its first bytes, as publishers misuse `format`.
 
     Raises UnreadFormError for depth in a JPEG, and for RVL under another name.
     """
@@ -204,7 +204,7 @@ def _is_rvl(file: bytes) -> bool:
 
 
 def _plain(packed: _Packed) -> tuple[str, tuple[int, int], bool] | None:
-    """Return encoding, (height, width) and is_color; None if it must be decoded to be kept."""
+    """Encoding, (height, width) and is_color; None if it must be decoded."""
     is_depth = packed.is_depth
     if is_depth and (packed.is_rvl or packed.recorded == "32FC1"):
         return None
@@ -226,7 +226,7 @@ def _decoded(packed: _Packed, *, color: bool) -> NDArray[Any]:
 
 
 def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
-    """Convert pixels of `raw_pixels` to colour (H, W, 3) uint8; a Bayer mosaic is interpolated linearly.
+    """Convert pixels of `raw_pixels` to colour (H, W, 3) uint8; Bayer mosaics are interpolated linearly.
 
     Of 16 bits, 65535 becomes 255, as in cv_bridge (src/cv_bridge.cpp), whatever the sensor's depth.
     """
@@ -238,9 +238,9 @@ def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
 
 
 def raw_pixels(message: Any) -> NDArray[Any]:
-    """Return the pixels (H, W[, channels]) of a sensor_msgs/Image; no channel for an unknown encoding.
+    """Pixels (H, W[, channels]) of a sensor_msgs/Image; no channel for an unknown encoding.
 
-    Skips row padding and trailing bytes; reads either byte order. Raises UndecodableMessageError for too few data.
+    Skips padding; reads either byte order. Raises UndecodableMessageError for too few data.
     """
     width, height, step = int(message.width), int(message.height), int(message.step)
     name = f"image {width}x{height} {message.encoding}"
@@ -271,7 +271,7 @@ def raw_pixels(message: Any) -> NDArray[Any]:
 
 
 def _nv24(message: Any, name: str) -> UInt8:
-    """Return RGB (H, W, 3) by BT.601 limited range, as OpenCV's nv12."""
+    """RGB (H, W, 3), BT.601 limited range, as OpenCV's nv12."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     data = np.asarray(message.data, dtype=np.uint8)
     if not 0 < width * height * 3 == data.size or step not in {width, 2 * width, 3 * width}:
@@ -372,10 +372,10 @@ def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
     """Decode an RVL stream of little-endian words to pixels (num_pixels,).
 
     A. D. Wilson, Fast Lossless Depth Image Compression, ISS 2017 (its listing is the definition). Runs of zeros and
-    of values alternate; a value is the zigzag-coded difference to the last nonzero one. Numbers are groups of three
-    bits, low ones first, in nibbles whose high bit marks a continuation. Nibbles fill 32-bit words from the top.
+    of values alternate; a value is the zigzag-coded difference to the last nonzero one. Numbers are three-bit groups,
+    low first, in nibbles whose high bit marks a continuation; nibbles fill 32-bit words from the top.
 
-    Raises ValueError without such an image. Memory is the image and a few times `data`.
+    Raises ValueError if invalid. Memory is the image and a few times `data`.
     """
     numbers = _numbers(data)
     runs: list[tuple[int, int, int]] = []  # first pixel, first number, length
@@ -402,7 +402,7 @@ def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
 
 
 def _numbers(data: bytes) -> NDArray[np.int64]:
-    """Return all numbers of a stream, its padding included."""
+    """All numbers of a stream, padding included."""
     words = np.frombuffer(data, dtype="<u4", count=len(data) // 4)
     nibbles = ((words[:, None] >> np.arange(28, -4, -4, dtype=np.uint32)) & 15).astype(np.int64).ravel()
     ends = np.flatnonzero(nibbles < 8)

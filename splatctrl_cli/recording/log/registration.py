@@ -107,8 +107,8 @@ class TfTree:
     ) -> None:
         """Add T_parent_child at a time; one that `holds` is valid always while it is the only one.
 
-        A frame keeps its first parent; an edge that would close a loop is left out. Differing static transforms are
-        valid from their stamps on: the first also before, the last of equal stamps. Each case is noted. Raises
+        A frame keeps its first parent; edges that would close a loop are left out. Differing static transforms are
+        valid from their stamps on, the first also before; of one stamp the last wins. All are noted. Raises
         ValueError for no rigid transform (a zero quaternion, NaN).
         """
         parent, child = parent.strip("/"), child.strip("/")
@@ -229,9 +229,9 @@ class DepthToColor:
     undistortion: "Undistortion | None" = None
 
     def warp(self, depth: Float32) -> Float32:
-        """Warp depth (H', W') [m] of the depth camera into the colour camera, (H, W) [m], 0 = none.
+        """Warp depth (H', W') [m] into the colour camera, (H, W) [m], 0 = none.
 
-        Each depth pixel covers its square's image, so finer colour pixels get no holes; the nearest on a pixel wins.
+        Each depth pixel covers its square's image, so finer colour pixels get no holes; the nearest wins.
         """
         target = self.color_intrinsics
         depth = depth if self.undistortion is None else self.undistortion.depth(depth)
@@ -259,9 +259,9 @@ class DepthToColor:
 class Undistortion:
     """A remap that removes lens distortion.
 
-    intrinsics: of the result, equal to the lens's unless `lens` differs. R (3, 3) turns the lens's axes into the
-    result's. valid: (H, W), False where the lens did not see the pixel, as in a pincushion's corners; None if it saw
-    all. There colour is black, and depth and labels are 0.
+    intrinsics: of the result, the lens's own unless `lens` differs. R (3, 3): the lens's axes to the result's. valid:
+    (H, W), False where the lens saw nothing, as in a pincushion's corners; None if it saw all. There colour is black,
+    depth and labels 0.
     """
 
     def __init__(
@@ -340,7 +340,7 @@ class Lens:
 def _maps(
     lens: Intrinsics, model: str, coefficients: Float64, R: Float64, result: Intrinsics
 ) -> tuple[Float32, Float32]:
-    """Return column and row in the distorted image of each result pixel."""
+    """Column and row in the distorted image, by result pixel."""
     K, P = (np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]], dtype=np.float64) for k in (lens, result))
     size = (result.width, result.height)
     if model == "equidistant":
@@ -351,7 +351,7 @@ def _maps(
 
 
 def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
-    """Return distances from the axis at depth one, undistorted and distorted, in focal lengths."""
+    """Undistorted and distorted radii at depth one, in focal lengths."""
     r = np.linspace(0.0, FARTHEST_RAY, 20001)
     k = np.zeros(8)
     k[: min(len(coefficients), 8)] = coefficients[:8]
@@ -363,10 +363,10 @@ def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
 
 
 def undistortion_of(lens: Intrinsics, model: str, coefficients: Float64) -> Undistortion | None:
-    """Build a lens's undistortion, None for a pinhole. Raises InputError for an impossible lens.
+    """A lens's undistortion, None for a pinhole. Raises InputError for an impossible lens.
 
-    The result has the lens's focal lengths. An equidistant lens's are shortened to show all on the image's axes, up
-    to `WIDEST_RAY`: beyond it the middle would keep few pixels.
+    It keeps focal lengths. An equidistant lens's are shortened to show all on the image's axes, up to `WIDEST_RAY`:
+    beyond it the middle would keep few pixels.
     """
     if not is_distorted(model, coefficients):
         return None

@@ -165,9 +165,9 @@ ImageLens = Literal["pinhole", "distorted", "rectified", "contradicted"]  # by C
 def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> ImageLens:
     """Decide if images are rectified, by topic name and CameraInfo.
 
-    A CameraInfo with distortion may describe rectified images next to the raw ones (image_proc): by a P unlike K, or
-    raw images in the same folder. RealSense's ``image_rect_raw`` is distorted. Depth is computed in rectified images.
-    Otherwise name and CameraInfo contradict each other.
+    A distorted CameraInfo may describe rectified images next to raw ones (image_proc): by a P unlike K, or raw images
+    in the same folder. RealSense's ``image_rect_raw`` is distorted; depth is computed in rectified images. Otherwise
+    name and CameraInfo contradict each other.
     """
     says_rectified = not _RECTIFIED.isdisjoint(re.split("[/_]", image_topic.lower()))
     if not is_distorted(calibration.distortion_model, calibration.distortion):
@@ -182,8 +182,6 @@ def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> Im
 
 
 class _Builder:
-    """A builder of one camera."""
-
     def __init__(self, log: RawLog, survey: Survey, options: SourceOptions, topics: CameraTopics) -> None:
         self._path = log.path
         self._where = f"{log.path}: camera {topics.name}"
@@ -296,7 +294,6 @@ class _Builder:
         )
 
     def _given(self, intrinsics: tuple[float, ...], image_topic: str) -> Calibration:
-        """A calibration from --intrinsics in the images' size."""
         image = self._survey.topics[image_topic].image
         fx, fy, cx, cy, *distortion = intrinsics
         return Calibration(
@@ -311,7 +308,7 @@ class _Builder:
         )
 
     def _check_depth(self) -> None:
-        """Raise InputError if the depth topic is not depth, or ambiguous."""
+        """Raise InputError if not depth, or ambiguous."""
         topics = self._topics
         image = self._survey.topics[topics.depth].image
         if image.kind != "depth":
@@ -326,7 +323,7 @@ class _Builder:
             )
 
     def _check_clock(self) -> None:
-        """Raise InputError if a clock went back: then stamps of images and tf are ambiguous."""
+        """Raise InputError if a clock went back: stamps are then ambiguous."""
         for name in (self._topics.color, self._topics.depth):
             clock = self._survey.topics[name].clock
             if clock.went_back:
@@ -338,7 +335,7 @@ class _Builder:
                 )
 
     def _check_world(self) -> str:
-        """Return the world frame, checking that tf joins the camera to it."""
+        """The world frame, if tf joins the camera to it."""
         tf, frame_id = self._survey.tf, self._frame_id
         if self._topics.name in self._options.camera_poses:
             return self._options.world_frame or "world"
@@ -366,7 +363,7 @@ class _Builder:
             raise InputError(f"{self._where}: {info}: {error.message}", remedy=error.remedy) from None
 
     def _registration(self, color: Intrinsics) -> DepthToColor:
-        """The warp of raw depth into colour. Raises InputError if K or the transform is unknown."""
+        """Depth's warp into colour. Raises InputError if K or the transform is unknown."""
         topics, tf, color_frame = self._topics, self._survey.tf, self._frame_id
         depth_image = self._survey.topics[topics.depth].image
         size = f"{depth_image.encoding} {depth_image.width}x{depth_image.height}"
@@ -413,7 +410,6 @@ class _Builder:
 
 
 def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    """The topics of --camera, with CameraInfo found where missing."""
     cameras = []
     for given in options.camera_topics:
         for topic, kind in ((given.color, "colour"), (given.depth, "depth")):

@@ -1,8 +1,7 @@
 """A ROS log as records: paired images, poses from tf, joints in one order.
 
-The first pass takes all but the images, as transforms may follow images that need them, and plans every frame. The
-second takes only planned images, as few at once as the log's order allows. For `ingest`, files that a capture can
-keep stay undecoded.
+The first pass skips images, as transforms may follow them, and plans every frame. The second takes planned images, as
+few at once as the log's order allows. For `ingest`, files that a capture can keep stay undecoded.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,7 +37,7 @@ from splatctrl_cli.records import SECOND_NS, Float64, Index, LossReport, Record,
 
 @dataclass(kw_only=True)
 class _Pass:
-    """Findings of one pass over the images; incomplete if it ends early."""
+    """Findings of one pass, incomplete if it ends early."""
 
     damage: Damage = field(default_factory=Damage)
     num_invalid: int = 0
@@ -131,7 +130,7 @@ class RosLogSource(Recording):
         return plan
 
     def _images(self, found: Survey, topic: str) -> tuple[Index, Index]:
-        """Numbers and stamps of images without repeats; repeated and missing ones are counted."""
+        """Numbers and stamps without repeats; counts repeated and missing images."""
         stamps = np.array(found.topics[topic].stamps_ns, dtype=np.int64)
         if len(stamps) > 1 and not stamps.any():
             raise InputError(
@@ -152,7 +151,7 @@ class RosLogSource(Recording):
     def _add(
         self, plan: FramePlan, found: Survey, camera: Camera, stamp_ns: Index, color: Index, depth: Index
     ) -> None:
-        """Plan a camera's pairs, counting those without a pose. Raises InputError if none has one."""
+        """Plan posed pairs. Raises InputError without any."""
         tolerance_ns = round(self._options.pose_tolerance_s * SECOND_NS)
         pairing_ns = round(self._options.pairing_tolerance_s * SECOND_NS)
         masks = _mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
@@ -167,7 +166,7 @@ class RosLogSource(Recording):
         self._loss.without_pose += len(color) - num
 
     def _frames(self, *, lazily: bool = True) -> Iterator[StoredFrame]:
-        """Yield frames; lazily: image files that need no change are decoded on demand."""
+        """Yield frames; lazily: unchanged image files are decoded on demand."""
         lost, decoder, checked = _Pass(), MessageDecoder(), set[str]()
         self._passes.append(lost)
         for planned, messages in planned_images(self._log, self._plan, lost.damage, HeldMessages()):
@@ -193,9 +192,9 @@ class RosLogSource(Recording):
 def _images(
     decoder: MessageDecoder, camera: Camera, messages: Sequence[RawMessage], *, is_whole: bool
 ) -> list[ImageMessage]:
-    """Read colour, depth and mask. Raises UndecodableMessageError.
+    """Colour, depth and mask; is_whole: all decoded, not only what a capture cannot keep.
 
-    is_whole: decode all, else only what a capture cannot keep.
+    Raises UndecodableMessageError.
     """
     kept = (False,) * 3 if is_whole else (*_keeps_files(camera), False)
     images = [
@@ -213,7 +212,7 @@ def _images(
 
 
 def _keeps_files(camera: Camera) -> tuple[bool, bool]:
-    """True for colour and for depth if a capture keeps its files."""
+    """True for colour and depth whose files a capture keeps."""
     is_plain = camera.undistortion is None
     return is_plain, is_plain and camera.depth_to_color is None
 
@@ -242,7 +241,7 @@ def _stored_frame(
 
 
 def _rig(log: RawLog, found: Survey, options: SourceOptions) -> tuple[Camera, ...]:
-    """Build the cameras. Raises InputError, which mentions damage that may be the cause."""
+    """Raises InputError, naming damage that may be the cause."""
     try:
         return build_cameras(log, found, options)
     except InputError as error:
@@ -264,7 +263,7 @@ def _times(found: Survey, camera: Camera) -> str:
 def _mask_by_color(
     survey: Survey, color_topic: str, mask_topic: str, tolerance_ns: int, camera: str, loss: LossReport
 ) -> dict[int, int]:
-    """Mask number by colour number, closest stamps paired; images without one are noted in `loss`."""
+    """Mask number by colour number, closest stamps paired; missing ones are noted."""
     if not mask_topic:
         return {}
     color_ns, mask_ns = survey.topics[color_topic].stamps_ns, survey.topics[mask_topic].stamps_ns

@@ -19,8 +19,8 @@ COLUMNS = (*OF_JOINTS, "T_base_ee", "T_world_ee")
 class StateColumns(Sequence[JointState]):
     """T states by stamp: stamp_ns (T,); position, velocity (T, J).
 
-    commanded_velocity (T, J), T_base_ee and T_world_ee (T, 4, 4) are None if absent, NaN where a state has none.
-    ``columns[i]`` and iteration give states, read a block at a time.
+    commanded_velocity (T, J), T_base_ee, T_world_ee (T, 4, 4): None if absent, NaN where a state has none. Indexing
+    and iteration give states, read a block at a time.
     """
 
     stamp_ns: Stamps
@@ -112,7 +112,6 @@ class StateColumns(Sequence[JointState]):
         return {name: table for name in COLUMNS if (table := getattr(self, name)) is not None}
 
     def _changed(self, change: Callable[[Table, str], Table], names: Collection[str], **others: Any) -> Self:
-        """Copy with `change` applied to the named present columns."""
         changed: dict[str, Any] = {
             name: change(table, name) for name, table in self.tables().items() if name in names
         }
@@ -189,7 +188,7 @@ class StateCollector:
 
 
 def _optional(values: Table | None, first: int, last: int) -> list[Float64 | None]:
-    """A value per state of a range, None if not finite."""
+    """Values of a range, None if not finite."""
     if values is None:
         return [None] * (last - first)
     return [value if np.isfinite(value).all() else None for value in values[first:last]]

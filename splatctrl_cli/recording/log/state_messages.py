@@ -32,7 +32,7 @@ class RawJoints:
     """A joint state as recorded, in the order of its names.
 
     position (J,); velocity, commanded_velocity (J,) or empty; T_base_ee (4, 4): the controller's end effector; note:
-    what is not used, and why.
+    what is unused, and why.
     """
 
     stamp_ns: int
@@ -78,7 +78,7 @@ def pose_of_quat(position: Float64, quat_xyzw: Float64) -> Float64 | None:
 
 
 def _franka(message: Any, log_time_ns: int) -> RawJoints:
-    """FrankaRobotState of franka_ros2 (named states, PoseStamped), or the older bare arrays."""
+    """franka_ros2's FrankaRobotState (named states, PoseStamped), or the older bare arrays."""
     fields = {name.lower(): getattr(message, name) for name in message.__dataclass_fields__}
     if "measured_joint_state" in fields:
         measured, desired, pose = fields["measured_joint_state"], fields["desired_joint_state"], fields["o_t_ee"].pose
@@ -138,7 +138,7 @@ def _checked(
 
 
 def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
-    """Every point of a planned motion; without a header stamp it begins at log time."""
+    """Every point of a planned motion, from log time without a header stamp."""
     names = tuple(str(name) for name in message.joint_names)
     start_ns = stamp_ns(message.header) or log_time_ns
     states = []

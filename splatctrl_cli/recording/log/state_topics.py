@@ -35,7 +35,7 @@ _COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoi
 
 @dataclass(frozen=True, kw_only=True)
 class _Stream:
-    """States of one topic with the same joints; `names` may be renamed."""
+    """States of a topic with equal joints; `names` may be renamed."""
 
     where: str
     names: tuple[str, ...]
@@ -45,10 +45,10 @@ class _Stream:
 def joint_records(
     survey: Survey, options: SourceOptions, loss: LossReport, wanted: Sequence[str] | None = None
 ) -> tuple[tuple[str, ...], StateColumns]:
-    """Return joint names and states by stamp; both empty if the log has none.
+    """Joint names and states by stamp; both empty if the log has none.
 
-    With `wanted` (a robot's joints), the topics that have them are merged. Otherwise one topic is used; states
-    without all joints of its fullest (a gripper that publishes alone) are left out with a note.
+    With `wanted` (a robot's joints), their topics are merged. Otherwise one topic is used; states without all of its
+    joints (a gripper that publishes alone) are left out with a note.
     """
     topics = state_topics(survey, options, loss)
     if not topics:
@@ -119,9 +119,8 @@ def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
 def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: LossReport) -> RawTrack:
     """Merge the states of the joints `wanted` from as few topics as possible.
 
-    The topic with the most of them gives the stamps; ties prefer end-effector poses, then /joint_states. Other joints
-    are interpolated. States outside their topics' times, or in a gap over `STATES_BRIDGED` in which a joint moved,
-    are left out with a note.
+    The topic with most of them gives the stamps; ties prefer end-effector poses, then /joint_states. Other joints are
+    interpolated. States outside their times, or in gaps over `STATES_BRIDGED` with motion, are left out with a note.
     """
     streams = _renamed(_streams(topics), wanted, loss)
     base = _base(streams, wanted)
@@ -152,7 +151,7 @@ def _streams(topics: Sequence[TopicSurvey]) -> list[_Stream]:
 
 
 def _base(streams: Sequence[_Stream], wanted: Sequence[str]) -> _Stream:
-    """Return the stream with most joints `wanted`; ties prefer end-effector poses, then /joint_states."""
+    """The stream with most `wanted`; ties prefer end-effector poses, then /joint_states."""
     return max(
         streams,
         key=lambda stream: (
@@ -173,8 +172,8 @@ def _is_command(topic: str) -> bool:
 def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | None) -> None:
     """Raise if the states of joints `wanted` (None: all) come from two robots.
 
-    InputError if another topic, not of commands, has the same joints over `STATES_RIVAL` apart; NotEvaluableError if
-    two publishers take turns on one topic.
+    InputError if another topic, not of commands, has them over `STATES_RIVAL` apart; NotEvaluableError if two
+    publishers take turns on one topic.
     """
     streams = _streams(topics)
     if wanted is None:
@@ -203,7 +202,7 @@ def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | 
 
 
 def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
-    """Return the median distance [rad or m] of shared joints at equal times; 0 without overlap."""
+    """Median distance [rad or m] of shared joints at equal times; 0 without overlap."""
     stamps, its = base.states.stamp_ns, other.states.stamp_ns
     at, at_other = np.argsort(stamps, kind="stable"), np.argsort(its, kind="stable")
     its = its[at_other]
@@ -219,7 +218,7 @@ def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
 
 
 def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
-    """Count states far from both neighbours, which are close together: no joint returns so fast."""
+    """Count states far from both neighbours, which are close: no joint returns so fast."""
     position = stream.states.columns().get("position")
     columns = [stream.names.index(name) for name in names]
     if position is None or not columns:
@@ -237,7 +236,7 @@ def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
 
 
 def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
-    """Rename unknown joints to the robot's missing ones if only a prefix differs."""
+    """Rename the robot's missing joints if only a prefix differs."""
     found = dict.fromkeys(name for stream in streams for name in stream.names)
     unknown, missing = [n for n in found if n not in wanted], [name for name in wanted if name not in found]
     names = with_prefix(unknown, missing)
@@ -263,7 +262,6 @@ def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
 
 
 def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
-    """Return a stream's states of `names`."""
     states, columns = stream.states, stream.states.columns()
     return RawTrack(
         where=stream.where,
@@ -274,7 +272,7 @@ def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
 
 
 def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
-    """Add the joints of `other`, interpolated at the stamps of `track`; other states are left out."""
+    """Add the joints of `other`, interpolated; states without them are left out."""
     order = np.argsort(other.stamp_ns, kind="stable")
     at = other.stamp_ns[order]
     stamps = track.stamp_ns
@@ -318,15 +316,15 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
 
 
 def _is_still(table: Table, before: Index, after: Index) -> Bool:
-    """True (T,) for pairs of states without a moved joint."""
+    """True (T,) for pairs without a moved joint."""
     changes = (table[after[first:last]] - table[before[first:last]] for first, last in ranges(len(before)))
     return np.concatenate([np.zeros(0, np.bool_), *(np.abs(c).max(axis=1) < STATES_STILL for c in changes)])
 
 
 def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossReport) -> Stamps:
-    """Return stamps (T,) [ns] in file order: the headers', or the log's if no header has one.
+    """Stamps (T,) [ns] in file order: the headers', or the log's if no header has one.
 
-    Notes another clock, a drift and steps in `loss`. Raises InputError for states of two clocks.
+    Notes another clock, drift and steps in `loss`. Raises InputError for two clocks.
     """
     is_unset = stamp_ns == 0
     if is_unset.all():
@@ -381,10 +379,9 @@ def _mixed(where: str, step: float, state: int) -> InputError:
 
 
 def _drift(late: Float64, seconds: Float64) -> tuple[float, float]:
-    """Return the growth [s] of the log delay from first to last quarter, and the seconds between.
+    """Growth [s] of the log delay from first to last quarter, and the seconds between.
 
-    Takes each quarter's tenth percentile: a message may be logged late, but not early. 0 if the change is not spread
-    over the log (a step, a stall).
+    Each quarter's tenth percentile counts: a message may be logged late, not early. 0 if it is a step or a stall.
     """
     quarter = len(late) // 4
     span = float(np.median(seconds[-quarter:]) - np.median(seconds[:quarter])) if quarter >= 10 else 0.0

@@ -1,6 +1,6 @@
 """Joint states of one source, cleaned: in time order, one per stamp, with velocities.
 
-Missing velocities come from positions, with the stamps' jitter removed; every fault is counted.
+Missing velocities come from positions, without the stamps' jitter; faults are counted.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,8 +29,8 @@ def gaps_of(stamp_ns: Stamps) -> NDArray[np.intp]:
 def smoothed_seconds(stamp_ns: Stamps) -> Float64:
     """Times (T,) [s] since the first stamp, without the sender's jitter.
 
-    A line is fitted through neighbouring stamps over their numbers, counting lost ones. Stamps without a fixed rate
-    (residuals above a quarter period), or that would not rise, return unchanged.
+    A line is fitted through neighbouring stamps over their numbers, lost ones counted. Stamps without a fixed rate
+    (residuals above a quarter period), or that would not rise, are unchanged.
     """
     seconds = np.asarray((stamp_ns - stamp_ns[0]) * 1e-9, dtype=np.float64)
     if len(seconds) < 3:
@@ -55,7 +55,7 @@ def smoothed_seconds(stamp_ns: Stamps) -> Float64:
 
 
 class _Sums:
-    """Running sums of k, r, k^2 and k r over all states, of which the newest are kept."""
+    """Running sums of k, r, k^2 and k r; only recent ones are kept."""
 
     def __init__(self) -> None:
         self._sums = np.zeros((4, 1))  # up to but not with state `_start` and those after it
@@ -84,8 +84,7 @@ class _Sums:
 def _numbers(seconds: Float64, period: float) -> Float64:
     """Number (T,) of each state since the first, lost ones counted.
 
-    A clock that ticks with the period follows the stamps slowly, so that jitter up to half a period counts as no
-    loss.
+    A clock that slowly follows the stamps takes jitter up to half a period for no loss.
     """
     numbers = np.zeros(len(seconds))
     clock, number = 0.0, 0
@@ -104,8 +103,8 @@ def _numbers(seconds: Float64, period: float) -> Float64:
 def differentiated(stamp_ns: Stamps, position: Float64) -> Float64:
     """Velocities (T, J) [1/s] of positions (T, J) at rising stamps (T,) [ns].
 
-    Each is the slope of a parabola through the state and two neighbours on either side: Savitzky-Golay for uneven
-    steps. It uses the smoothed clock and never spans a gap. A lone state has velocity 0.
+    The slope of a parabola through the state and two neighbours on either side (Savitzky-Golay for uneven steps), on
+    the smoothed clock, never across a gap. A lone state has 0.
     """
     return np.concatenate([np.zeros((0, *position.shape[1:])), *(v for _, v in slopes_by_block(stamp_ns, position))])
 
@@ -152,8 +151,8 @@ class RawTrack(StateColumns):
 def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
     """Sort states by stamp, each stamp once, each with velocities; changes are noted in `loss`.
 
-    States with positions that are not finite are dropped as damage; of equal stamps the first is kept. Velocities
-    that are absent, NaN, or always zero for a moving joint become position differences.
+    Positions that are not finite are damage; of equal stamps the first is kept. Velocities that are absent, NaN, or
+    always zero for a moving joint become position differences.
     """
     ordered = unwrapped(_in_order(_finite(raw, loss), loss), loss)
     gaps = gaps_of(ordered.stamp_ns)
@@ -232,7 +231,7 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
 
 
 def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
-    """Velocity (T, J), missing ones from the positions."""
+    """Velocity (T, J), missing ones from positions."""
     num_taken, is_zero, why = _missing_velocities(raw)
     if not num_taken:
         thinned = raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // fixed.STATES_COMPARED))
@@ -248,7 +247,7 @@ def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
 
 
 def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
-    """The number of states with velocities from positions, joints (J,) that move at velocity 0, and the note."""
+    """Number of states without velocity, joints (J,) that move at velocity 0, and the note."""
     num, num_joints = raw.position.shape[:2]
     low, high = np.full(num_joints, np.inf), np.full(num_joints, -np.inf)
     is_still, is_missing, is_there = (np.full(num_joints, first) for first in (True, False, False))
@@ -272,7 +271,7 @@ def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
 
 
 def _compare_units(raw: RawTrack, loss: LossReport) -> None:
-    """Note velocities in another unit; reads all states at once."""
+    """Note other units; reads all states at once."""
     position, velocity = raw.position[: len(raw.stamp_ns)], raw.velocity[: len(raw.stamp_ns)]
     slopes: Float64 = differentiated(raw.stamp_ns, position)
     is_fast = np.abs(slopes) > fixed.STATES_SPEED

@@ -1,8 +1,8 @@
 """Frames and joint states as their source stored them, which `ingest` keeps without decoding.
 
-A log's joint states are kept as recorded, so that any joints can be read later. joint_topics/K/ has stamp_ns.npy,
-log_time_ns.npy (T,) int64; position.npy and, if any, velocity.npy, commanded_velocity.npy (T, J), T_base_ee.npy (T,
-4, 4) float64; capture.json describes each K.
+All recorded joint states are kept, for any joints. joint_topics/K/: stamp_ns.npy, log_time_ns.npy (T,) int64;
+position.npy and, if any, velocity.npy, commanded_velocity.npy (T, J), T_base_ee.npy (T, 4, 4) float64; capture.json
+describes each K.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -140,7 +140,7 @@ def write_rows(stream: IO[bytes], rows: Table) -> None:
 
 
 def _blocks(path: Path) -> Iterator[Float64]:
-    """Read a .npy of `write_rows`. Raises ValueError for another one."""
+    """Raises ValueError for a file not of `write_rows`."""
     with path.open("rb") as stream:
         shape, is_by_columns, dtype = npy_head(stream)
         if dtype != np.dtype("<f8") or is_by_columns or not shape:
@@ -159,10 +159,10 @@ def _blocks(path: Path) -> Iterator[Float64]:
 class StoredFrame:
     """A frame whose images decode on demand, with their files as the source stored them.
 
-    read_color, read_depth: return the image, or raise UndecodableMessageError. color_file: JPEG or PNG bytes that
-    decode to exactly the color. depth_file: a 16-bit PNG whose ``counts * float32(depth_unit)`` is exactly the depth.
-    depth_unit: [m] of which every depth is a uint16 multiple. Each is None if there is none. origin: the source in
-    words. places: the colour and depth messages without bytes, may be empty.
+    read_color, read_depth: the image, or UndecodableMessageError. color_file: JPEG or PNG bytes of exactly the color.
+    depth_file: 16-bit PNG whose ``counts * float32(depth_unit)`` is exactly the depth. depth_unit: [m] of which every
+    depth is a uint16 multiple. Each is None if there is none. origin: the source in words. places: the messages
+    without bytes, if any.
     """
 
     stamp_ns: int

@@ -1,7 +1,7 @@
 """A first pass over a log: topics, stamps, frames, calibrations, joints and first images.
 
-Also pairs images by stamp, counts repeated and missing ones and clocks that went back, and finds a log's
-``robot_description``, latched or a node's parameter.
+Pairs images by stamp, counts repeats, gaps and clocks that went back, and finds ``robot_description``, latched or a
+node's parameter.
 """
 
 from array import array
@@ -70,8 +70,7 @@ def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.
 class StampClock:
     """A detector of header clocks that go back during logging: a bag in a loop, a reset.
 
-    num_back: stamps over a second behind an earlier logged one; back_ns: the first one's distance, at log time
-    back_log_ns.
+    num_back: stamps over a second behind an earlier one; back_ns: the first one's distance, at log time back_log_ns.
     """
 
     num_back: int = 0
@@ -101,9 +100,9 @@ def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
 
 
 def dropped(stamps_ns: Stamps) -> tuple[int, int, float]:
-    """Return the number of gaps, images missing in them, and the period [ns]; 0 if unsteady or few.
+    """Number of gaps, missing images, and the period [ns]; 0 if unsteady or few.
 
-    The period is the median interval; three of four intervals must be within a quarter of it.
+    The period is the median interval; three of four must be within a quarter of it.
     """
     intervals = np.diff(np.unique(stamps_ns)).astype(np.float64)
     if len(intervals) < IMAGES_FEWEST:
@@ -125,11 +124,11 @@ class Calibration:
     """A CameraInfo's contents.
 
     size [px]; K (3, 3) of the raw image with its distortion; projection (3, 3) of the rectified image (left part of
-    P; zero if unset); rotation (3, 3) from the raw camera's axes to the rectified (zero if unset); valid (H, W):
-    False where the lens did not see a rectified pixel.
+    P); rotation (3, 3) from the raw axes to the rectified; both zero if unset. valid (H, W): False where the lens did
+    not see a rectified pixel.
 
-    They are for binned or cropped images, sensor_K (3, 3) for the whole sensor; cut says how ("" if whole),
-    is_possible if the region is inside the sensor.
+    They fit binned or cropped images, sensor_K (3, 3) the whole sensor; cut says how ("" if whole), is_possible if
+    the region is inside.
     """
 
     width: int
@@ -300,7 +299,7 @@ def _calibration(message: Any) -> Calibration | None:
 
 
 def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints]:
-    """Return joint states; by log time, a message's all shift with its stamp."""
+    """Joint states; log time shifts all of a message."""
     states = read_states(decoded, message.topic.type_name, message.log_time_ns)
     if not result.by_log_time:
         return states
@@ -342,7 +341,7 @@ def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:
 
 
 def _first_chunks(index: LogIndex) -> list[ChunkIndex]:
-    """Return each channel's first chunk and the file's first ones, within bounds."""
+    """Each channel's first chunk and the file's first ones, within bounds."""
     wanted = {chunk.chunk_start_offset: chunk for chunk in index.chunks[:4]}
     for channel in sorted(index.counts):
         first = next((c for c in index.chunks if channel in c.message_index_offsets), None)

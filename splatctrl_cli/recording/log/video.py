@@ -1,9 +1,9 @@
 """Compressed video, decoded as a log with its images; in messages, or a file with stamps.
 
 Reads H.264 and H.265 of foxglove.CompressedVideo (Annex B, an image per message; docs.foxglove.dev, CompressedVideo)
-and of ffmpeg_image_transport's FFMPEGPacket. An image needs those before it, back to a key frame. Images without one,
-or after a missing image, are dropped and counted until the next. FFmpeg would show them with wrong blocks; its
-messages on a packet reveal a missing one.
+and ffmpeg_image_transport's FFMPEGPacket. Images without a key frame before them, or after a missing image, are
+dropped and counted until the next key frame. FFmpeg would show them with wrong blocks; its log reveals a missing
+packet.
 """
 
 import re
@@ -43,10 +43,10 @@ def is_video(topic: Topic) -> bool:
 
 @dataclass(kw_only=True)
 class _Stream:
-    """One topic's decoder: its packet count, and those waiting for their image, by number.
+    """A topic's decoder.
 
-    waiting: (message without data, header). key: the last key frame; broken: packets since then with losses;
-    num_early, num_late: images lost before and after it.
+    num: packets. waiting: (message without data, header) by packet. key: last key frame. broken: packets since then
+    with losses. num_early, num_late: images lost before and after it.
     """
 
     context: Any
@@ -116,10 +116,7 @@ def _decoded_topic(topic: Topic) -> Topic:
 
 
 def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[RawMessage]:
-    """Yield the whole images that a packet releases, by packet number; without data, the rest.
-
-    A stream that reorders releases earlier ones.
-    """
+    """Yield whole images that a packet releases, perhaps earlier ones; without data, the rest."""
     frames, is_broken = _decode(stream.context, data, number)
     if is_broken:
         stream.broken.append(number)
@@ -141,7 +138,7 @@ def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[Ra
 
 
 def _decode(context: Any, data: bytes | None, number: int) -> tuple[list[Any], bool]:
-    """The decoded images, and if the decoder reported a loss."""
+    """The images, and True if the decoder reported a loss."""
     av = of_extra(LIBRARY, EXTRA, "video topics")
     packet = None if data is None else av.Packet(data)
     if packet is not None:
@@ -169,7 +166,6 @@ def _lose(stream: _Stream, numbers: list[int]) -> None:
 
 
 def _count(topic: str, stream: _Stream, damage: Damage) -> None:
-    """Report lost images to `damage`."""
     _lose(stream, list(stream.waiting))
     for num, where in ((stream.num_early, _EARLY), (stream.num_late, _LATE)):
         if num:
@@ -197,11 +193,10 @@ def open_log(path: Path) -> RawLog:
 
 
 class VideoFileLog:
-    """The images of ``X.mp4`` as topic ``/X``, stamped and logged at the times in ``X.csv`` or its kin.
+    """The images of ``X.mp4`` as topic ``/X``, at the times in ``X.csv`` or its kin.
 
-    That file has a line per image: a stamp, or a table with a column named time or stamp. Before the point, 10 digits
-    are seconds since 1970, 13 milliseconds, 16 microseconds and 19 nanoseconds; fewer than ten are seconds. Images
-    have no frame.
+    That file has a stamp per line, or a column named time or stamp. Before the point, 10 digits are seconds since
+    1970, 13 milliseconds, 16 microseconds, 19 nanoseconds; fewer than ten are seconds. Images have no frame.
     """
 
     container = "video"
@@ -242,7 +237,7 @@ class VideoFileLog:
             )
 
     def _frames(self, damage: Damage) -> Iterator[Any]:
-        """Yield images in display order, None for a damaged one."""
+        """Images in display order, None if damaged."""
         try:
             with self._av.open(str(self.path)) as container:
                 if not container.streams.video:
@@ -265,7 +260,7 @@ class VideoFileLog:
 
 
 def _read_stamps(path: Path) -> Stamps:
-    """Read the images' stamps [ns] in order. Raises InputError."""
+    """Stamps [ns] in order. Raises InputError."""
     text = path.read_text(encoding="utf-8", errors="replace")
     lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     rows, column = [re.split(r"[,;\s]+", line) for line in lines], 0

@@ -1,8 +1,8 @@
 """LeRobot datasets as a preset of [states]: an episode's file and its columns.
 
-Datasets v2 and v3 (huggingface/lerobot, lerobot_dataset.py, utils.py) have features in ``meta/info.json``. v2 has a
-file per episode, ``data/chunk-000/episode_000000.parquet``; v3 shares files, ``data/chunk-000/file-000.parquet``, by
-column ``episode_index``. ``observation.state`` is the position, ``timestamp`` seconds since the episode began.
+Versions 2 and 3 (huggingface/lerobot, lerobot_dataset.py, utils.py) list features in ``meta/info.json``. v2 has
+``data/chunk-000/episode_000000.parquet`` per episode; v3 shares ``data/chunk-000/file-000.parquet`` by column
+``episode_index``. ``observation.state`` is position, ``timestamp`` seconds of the episode.
 """
 
 from collections.abc import Mapping
@@ -46,7 +46,6 @@ def preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
 
 
 def _file(folder: Path, episode: int) -> Path:
-    """Find an episode's file. Raises InputError without one."""
     files = sorted((folder / "data").glob("*/*.parquet"))
     of_one = [file for file in files if file.stem == f"episode_{episode:06d}"]
     shared = (file for file in files if file.stem.startswith("file") and len(ParquetFile(file, (EPISODE, episode))))

@@ -39,8 +39,8 @@ class CsvTable:
     ) -> tuple[Stamps, dict[str, Rows]]:
         """Read stamps (T,) [ns] and each group's numbers (T, K), NaN for an empty cell.
 
-        Times are in units of `unit_ns`, every digit kept; columns are names or numbers. Raises InputError naming line
-        and column, for a line of another length than the first, and without states.
+        Times are in `unit_ns`, every digit kept; columns are names or numbers. Raises InputError naming line and
+        column, for a line of another length, and without states.
         """
         chosen = {name: [self.index(column) for column in columns] for name, columns in groups.items()}
         at, stamps = self.index(time), array("q")
@@ -54,7 +54,7 @@ class CsvTable:
         return np.array(stamps, dtype=np.int64), {name: Rows(file) for name, file in files.items()}
 
     def _blocks(self) -> Iterator[tuple[int, list[list[str]]]]:
-        """Yield a first line's number and rows of cells; empty lines are not counted."""
+        """Yield a first line's number and rows; empty lines do not count."""
         with self.path.open(newline="", encoding="utf-8-sig") as stream:
             lines = (line for line in csv.reader(stream) if line)
             next(lines, None)
@@ -123,10 +123,10 @@ def is_libfranka(table: CsvTable) -> bool:
 def libfranka_track(table: CsvTable) -> RawTrack:
     """The states of a log by franka::logToCSV, joints named joint1 ... joint7.
 
-    Its first column counts milliseconds since power-on. Measured positions are ``q[0]`` to ``q[6]``, velocities
-    ``dq[0]``..., prefixed with ``state.`` since libfranka 0.14. The control loop's command is ``cmd.dq_d``, before
-    that the second columns named ``dq_d`` (libfranka, src/log.cpp and src/logging/robot_state_log.cpp). An added
-    O_T_EE is the end effector's pose, column by column.
+    The first column counts milliseconds since power-on. Positions are ``q[0]`` to ``q[6]``, velocities ``dq[0]``...,
+    prefixed with ``state.`` since libfranka 0.14. Commands are ``cmd.dq_d``, earlier the second columns ``dq_d``
+    (libfranka, src/log.cpp and src/logging/robot_state_log.cpp). An added O_T_EE is the end effector's pose by
+    columns.
     """
     num = len(NAMELESS)
     position = _block(table, "q", num)
@@ -172,7 +172,7 @@ def _block(table: CsvTable, name: str, num: int) -> list[int] | None:
 
 
 def _sent(table: CsvTable, num: int) -> list[int] | None:
-    """Columns of the velocity command; the state's desired velocities if none was sent."""
+    """The commanded velocities' columns, else the desired ones'."""
     sent = [table.names.index(n) for i in range(num) if (n := f"cmd.dq_d[{i}]") in table.names]
     if not sent:
         sent = [_last(table.names, n) for i in range(num) if table.names.count(n := f"dq_d[{i}]") == 2]

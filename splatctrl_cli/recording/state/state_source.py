@@ -87,7 +87,7 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
 
 
 def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]) -> FrameSource | StateSource:
-    """Open with frames if the cameras are usable; else the states, with a note why."""
+    """Open with frames if possible; else the states, with a note."""
     default = SourceOptions()
     try:
         return calibrated(RosLogSource(log, options, joints), options)

@@ -33,8 +33,8 @@ _SEE = "see splatctrl help replay, Logs"
 class StatesTable:
     """``[states]``: a file and its columns; an array (T, K) gives K columns.
 
-    epoch_ns: Unix time of time 0. pose: x, y, z, qx, qy, qz, qw, or the 16 numbers of a matrix by pose_order. preset:
-    one of `PRESETS`, which fills missing keys for the dataset `file`; episode: of that dataset.
+    epoch_ns: Unix time of time 0. pose: x, y, z, qx, qy, qz, qw, or a matrix's 16 numbers by pose_order. preset: one
+    of `PRESETS`, which fills missing keys for the dataset `file`; episode: of it.
     """
 
     file: str

@@ -20,9 +20,9 @@ _SEE = "see splatctrl help replay, Twists"
 
 @dataclass(frozen=True, kw_only=True)
 class LoggedTwists:
-    """N twists by time: stamp_ns (N,) that rise, twist (N, 6) [m/s, rad/s], linear first, in the axes of `frame`.
+    """N twists by time: stamp_ns (N,) rising, twist (N, 6) [m/s, rad/s], linear first, in `frame`.
 
-    frame: the log's name, "" if none. notes: dropped twists and the stamps' clock.
+    frame: the log's name, or "". notes: dropped twists and the stamps' clock.
     """
 
     where: str
@@ -46,10 +46,10 @@ class TwistsTable:
 
 
 def read_twists(path: Path, topic: str) -> LoggedTwists:
-    """Read the twists of a log's topic, or of a TOML file's table `topic` (always ``twists``).
+    """Read the twists of a log's topic, or of a TOML file's table (always ``twists``).
 
-    Stamps are the headers', or log times if no header has one. Non-finite twists are dropped with a note; of equal
-    stamps the last is kept. Raises InputError without twists, or in several frames.
+    Stamps are headers', or log times if no header has one. Non-finite twists are dropped with a note; of equal stamps
+    the last is kept. Raises InputError without twists, or in several frames.
     """
     if path.suffix == ".toml":
         return _of_table(path, topic)
@@ -111,7 +111,7 @@ def _of_table(path: Path, name: str) -> LoggedTwists:
 
 
 def _checked(where: str, stamps: Stamps, twists: Float64, frames: list[str], notes: list[str]) -> LoggedTwists:
-    """Keep finite twists, each stamp once and sorted, in one frame."""
+    """Finite twists, sorted, one per stamp, in one frame."""
     if len(set(frames)) > 1:
         raise InputError(
             f"{where}: expected twists in one frame, got {', '.join(sorted(set(frames)))}",
