@@ -34,7 +34,7 @@ DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a 
 
 @dataclass(frozen=True, kw_only=True)
 class Pieces:
-    """An array made while written: dtype, shape, and values in C order by piece."""
+    """An array made while written; its values in C order, by piece."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -42,7 +42,7 @@ class Pieces:
 
 
 def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, level: int = 6) -> None:
-    """Write as `np.savez_compressed`, at zlib's `level` (0: stored), one array at a time."""
+    """Write as `np.savez_compressed`, at zlib's `level` (0: stored), by array."""
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     with zipfile.ZipFile(path, "w", method, compresslevel=level) as archive:
         for name, array in arrays.items():
@@ -75,7 +75,7 @@ def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) 
 
 
 def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
-    """True if a file, beginning with `head`, is a ``.npz`` with these arrays."""
+    """True for a ``.npz`` with these arrays; head: its first bytes."""
     if not head.startswith(b"PK\x03\x04"):
         return False
     try:
@@ -86,9 +86,9 @@ def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
 
 
 def npy_head(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read a ``.npy`` header: shape, is_by_columns and dtype; the stream is left after it.
+    """Read a ``.npy`` header: shape, is_by_columns and dtype. Raises ValueError for none.
 
-    Raises ValueError for none.
+    The stream is left after it.
     """
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -136,7 +136,7 @@ MOST_RATIO = 100  # times the file's size; joint states as recorded compress 2 t
 
 
 class ArrayFile(ABC):
-    """A file of named arrays (T, ...), whose flattened rows are columns."""
+    """A file of arrays (T, ...); flattened rows are columns."""
 
     names: Sequence[str]
 
@@ -145,11 +145,11 @@ class ArrayFile(ABC):
 
     @abstractmethod
     def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
-        """Return shape and dtype, None if missing. Raises InputError if unreadable."""
+        """Shape and dtype, None if missing. Raises InputError if unreadable."""
 
     @abstractmethod
     def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
-        """Yield an array's rows, about `BLOCK` at a time. Raises InputError if unreadable."""
+        """Yield about `BLOCK` rows at a time. Raises InputError if unreadable."""
 
     def columns(self, names: Sequence[str]) -> Rows:
         """Arrays side by side as columns (T, K). Raises InputError if missing, not numbers or of several lengths."""
@@ -169,17 +169,17 @@ class ArrayFile(ABC):
     def read(
         self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
     ) -> tuple[Stamps, dict[str, Rows]]:
-        """Return `stamps`, and `columns` of each group."""
+        """Read `stamps`, and each group's `columns`."""
         columns = {key: self.columns(names) for key, names in groups.items()}
         return self.stamps(time, unit_ns, epoch_ns), columns
 
     def rows(self, name: str) -> Rows:
-        """Return an array (T, ...) with its row shape; T may be 0. Raises InputError if not numbers."""
+        """An array (T, ...); T may be 0. Raises InputError if not numbers."""
         shape, _ = self._checked(name, least=0)
         return Rows(RowFile(shape[1:], (block.astype(np.float64) for block in self._blocks(name))))
 
     def stamps(self, name: str, unit_ns: int, epoch_ns: int, *, least: int = 1) -> Stamps:
-        """Return stamps (T,) [ns] of times in units of `unit_ns`, or of a dtype with its own unit."""
+        """Stamps (T,) [ns] of times in `unit_ns`, or of a dtype with its own unit."""
         _, dtype = self._checked(name, least=least, kinds="iufM")
         times = np.concatenate([np.zeros(0, dtype), *(block.reshape(-1) for block in self._blocks(name))])
         if times.dtype.kind == "M":
@@ -222,7 +222,7 @@ _DAMAGE = (OSError, *DAMAGE)
 
 class NpzFile(ArrayFile):
     def __init__(self, path: Path) -> None:
-        """Raises InputError for a file of another kind."""
+        """Raises InputError for another kind of file."""
         super().__init__(path)
         try:
             with zipfile.ZipFile(path) as archive:
@@ -238,7 +238,7 @@ class NpzFile(ArrayFile):
             return shape, dtype
 
     def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
-        """Yield the rows; an array stored by columns is read at once."""
+        """Arrays stored by columns are read at once."""
         with ExitStack() as stack:
             shape, dtype, is_by_columns, stream = self._opened(stack, name)
             try:
@@ -279,7 +279,7 @@ _EXTRA = "tables"
 
 class Hdf5File(ArrayFile):
     def __init__(self, path: Path) -> None:
-        """Raises InputError for a file of another kind."""
+        """Raises InputError for another kind of file."""
         super().__init__(path)
         self._h5py = of_extra("h5py", _EXTRA, "HDF5 files")
         self.names = found = list[str]()
@@ -315,7 +315,7 @@ class ParquetFile(ArrayFile):
     """A Parquet file, or its rows whose column `only` has a value."""
 
     def __init__(self, path: Path, only: tuple[str, int] | None = None) -> None:
-        """Raises InputError for a file of another kind."""
+        """Raises InputError for another kind of file."""
         super().__init__(path)
         self._arrow, self._parquet = (
             of_extra(name, _EXTRA, "Parquet files") for name in ("pyarrow", "pyarrow.parquet")
@@ -353,7 +353,7 @@ class ParquetFile(ArrayFile):
                     yield values
 
     def _values(self, column: Any, name: str) -> NDArray[Any]:
-        """A column (T, ...); missing floats are NaN."""
+        """Missing floats are NaN."""
         if not hasattr(column.type, "value_type") or self._arrow.types.is_dictionary(column.type):
             return np.asarray(column.to_numpy(zero_copy_only=False))
         if column.null_count or len(set(column.value_lengths().to_numpy(zero_copy_only=False).tolist())) > 1:

@@ -31,7 +31,7 @@ _PNG_CHUNKS = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}  # that must be understood
 
 @dataclass(frozen=True, kw_only=True)
 class ImageHead:
-    """Size [px], channels (1 or 3) and bits per channel of an undecoded file."""
+    """Size [px], channels (1 or 3) and bits per channel."""
 
     width: int
     height: int
@@ -143,7 +143,7 @@ def _says_more_than_it_holds(png: bytes) -> bool:
 
 
 def write_pfm(path: Path, image: Float32) -> None:
-    """Write an image (H, W) as little-endian grey PFM."""
+    """Write (H, W) as little-endian grey PFM."""
     header = f"Pf\n{image.shape[1]} {image.shape[0]}\n-1.0\n".encode()
     path.write_bytes(header + np.ascontiguousarray(image[::-1], dtype="<f4").tobytes())
 

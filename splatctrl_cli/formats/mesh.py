@@ -29,7 +29,7 @@ class TriangleMesh:
 
     @property
     def corners(self) -> Float64:
-        """Corners (F, 3, 3) of each face."""
+        """(F, 3, 3) by face."""
         return self.vertices[self.faces]
 
 
@@ -67,7 +67,7 @@ def load_mesh(path: Path) -> TriangleMesh:
 
 
 def _opened(path: Path) -> tuple[BytesIO | Path, str]:
-    """A binary STL without bytes after its faces, and a note; or a text as UTF-8."""
+    """A binary STL without trailing bytes, and a note; or text as UTF-8."""
     content = path.read_bytes()
     num = int.from_bytes(content[STL_HEADER - 4 : STL_HEADER], "little")
     end = STL_HEADER + STL_FACE * num  # of a text: gigabytes

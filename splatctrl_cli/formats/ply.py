@@ -1,4 +1,4 @@
-"""PLY elements as tables, with every promised byte and no more; and points in PLY or CSV."""
+"""PLY elements as tables of exactly the promised bytes; points in PLY or CSV."""
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,7 +26,7 @@ BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "
 
 @dataclass(frozen=True, kw_only=True)
 class PlyFile:
-    """An element's rows, a structured array, and the header's comment lines."""
+    """An element's rows, a structured array, and the header's comments."""
 
     path: Path
     rows: NDArray[Any]
@@ -44,12 +44,12 @@ class PlyFile:
         return self.rows.dtype.names or ()
 
     def pairs(self) -> dict[str, str]:
-        """The ``key: value`` comments; without a colon, the value is empty."""
+        """``key: value`` comments; a value may be empty."""
         parts = (line.partition(":") for line in self.comments)
         return {key.strip(): value.strip() for key, _, value in parts if key.strip()}
 
     def column(self, name: str) -> Float64:
-        """Return a property as (N,) float64. Raises InputError naming the first index that is not finite."""
+        """A property as (N,) float64. Raises InputError naming the first non-finite index."""
         values = self.rows[name].astype(np.float64)
         bad = np.flatnonzero(~np.isfinite(values))
         if len(bad):
@@ -62,7 +62,7 @@ class PlyFile:
 
 @dataclass(frozen=True, kw_only=True)
 class _Element:
-    """properties: names and scalar types; a list's has length and value types, separated by a space."""
+    """properties: names and scalar types; a list's are length and value, with a space."""
 
     name: str
     count: int
@@ -73,7 +73,7 @@ class _Element:
         return any(" " in kind for _, kind in self.properties)
 
     def dtype(self, path: Path, byte_order: str) -> "np.dtype[Any]":
-        """Return the row's type; float text becomes float64 to keep its digits."""
+        """Float text becomes float64 to keep its digits."""
         if self.has_lists:
             raise InputError(f"{path}: element {self.name} has list properties: expected a table of numbers")
         types = [(name, SCALARS[kind]) for name, kind in self.properties]
@@ -82,7 +82,7 @@ class _Element:
         )
 
     def end(self, content: bytes, offset: int, byte_order: str) -> int:
-        """Return the end of the element at `offset`; beyond `content` if truncated."""
+        """End of the element at `offset`; beyond `content` if truncated."""
         kinds = [[np.dtype(byte_order + SCALARS[word]) for word in kind.split()] for _, kind in self.properties]
         if not self.has_lists:
             return offset + self.count * sum(kind.itemsize for (kind,) in kinds)
@@ -117,7 +117,7 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
 
 
 def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) -> None:
-    """Raise InputError naming the `required` properties missing from `names`."""
+    """Raise InputError naming missing `required` properties."""
     missing = [name for name in required if name not in names]
     if missing:
         raise InputError(
@@ -250,7 +250,7 @@ def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
 
 
 def is_mesh(path: Path) -> bool:
-    """True for a PLY with faces, and for any other file."""
+    """True for a PLY with faces, or any other file."""
     if path.suffix.lower() != ".ply":
         return True
     header = read_bytes(path, 65536).partition(b"end_header")[0]
@@ -293,7 +293,7 @@ def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
 
 
 def _axes(name: str, cells: Sequence[str]) -> list[int] | None:
-    """Columns of x, y and z; None if the line is a point."""
+    """Columns of x, y, z; None if the line is a point."""
     if len(cells) == 3 and all(_number(cell) is not None for cell in cells):
         return None
     titles = [cell.strip().lstrip("\ufeff").lower() for cell in cells]

@@ -1,4 +1,4 @@
-"""File reads, and decompression to no more bytes than announced, within a fixed bound."""
+"""File reads, and decompression to no more than announced, within a bound."""
 
 import bz2
 from pathlib import Path
@@ -18,7 +18,7 @@ _FAILURES = (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, M
 
 
 def read_bytes(path: Path, most: int = -1) -> bytes:
-    """Read a file, or its first `most` bytes. Raises InputError if unreadable."""
+    """Read all or the first `most` bytes. Raises InputError if unreadable."""
     try:
         with path.open("rb") as stream:
             return stream.read(most)
@@ -31,13 +31,13 @@ class BadBlockError(ValueError):
 
 
 class Budget:
-    """A bound on what a file's blocks unpack to, so that its size bounds the time."""
+    """A bound on what a file unpacks to, so its size bounds the time."""
 
     def __init__(self, file_size: int) -> None:
         self._left = FREE_BYTES + MOST_RATIO * file_size
 
     def unpacked(self, data: bytes, compression: str, size: int) -> bytes:
-        """Unpack within the file's budget. Raises BadBlockError."""
+        """Unpack within the budget. Raises BadBlockError."""
         if size <= MAX_BLOCK:
             self._left -= size
             if self._left < 0:
@@ -61,7 +61,7 @@ def unpacked(data: bytes, compression: str, size: int, largest: int = MAX_BLOCK)
 
 
 def unpacked_start(data: bytes, compression: str, size: int) -> bytes:
-    """Unpack the start of a cut block: at most `size` bytes and MAX_BLOCK, perhaps none."""
+    """Unpack a cut block: at most `size` bytes and MAX_BLOCK, perhaps none."""
     try:
         return _unpacked_up_to(data, compression, min(size, MAX_BLOCK))
     except BadBlockError:

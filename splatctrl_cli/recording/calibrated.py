@@ -1,4 +1,4 @@
-"""Recordings corrected by a calibration (poses, depths, clock), or perturbed, as they are read."""
+"""Recordings corrected by a calibration, or perturbed, as they are read."""
 
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +25,7 @@ from splatctrl_cli.records import SECOND_NS, Float32, Float64, LossReport, RgbdF
 
 @dataclass(frozen=True, kw_only=True)
 class Correction:
-    """A calibration applied to the recording `where`."""
+    """A calibration applied to recording `where`."""
 
     file: Path
     calibration: Calibration
@@ -33,11 +33,11 @@ class Correction:
 
     @property
     def clock_ns(self) -> int:
-        """[ns] to add to joint state stamps for the frames' clock."""
+        """[ns] to add to joint states' stamps."""
         return round((self.calibration.clock or 0.0) * SECOND_NS)
 
     def camera(self, name: str) -> CalibratedCamera:
-        """A camera of the recording. Raises InputError if not calibrated."""
+        """Raises InputError for a camera not calibrated."""
         cameras = self.calibration.cameras
         if name == HOLDOUT and len(cameras) == 1:  # views of the one camera, held out
             return next(iter(cameras.values()))
@@ -49,7 +49,7 @@ class Correction:
         return cameras[name]
 
     def pose(self, name: str, T_recorded: Float64) -> Float64:
-        """Correct a recorded T_world_camera (4, 4). Raises InputError for another recording's calibration."""
+        """Correct a recorded T_world_camera (4, 4). Raises InputError for another recording's."""
         camera = self.camera(name)
         if camera.recorded is None:
             return T_recorded @ camera.T
@@ -67,22 +67,22 @@ class Correction:
         )
 
     def late_ns(self, name: str) -> int:
-        """Delay [ns] of frame stamps against recorded poses; 0 for a fixed camera."""
+        """Delay [ns] of frame stamps against poses; 0 for a fixed camera."""
         return self.clock_ns if self.clock_ns and self.camera(name).moves else 0
 
     def depth(self, name: str, depth: Float32) -> Float32:
-        """Correct a depth image [m]."""
+        """Correct depth [m]."""
         camera = self.camera(name)
         if (camera.scale, camera.bias) == (1.0, 0.0):
             return depth
         return np.maximum(np.where(depth > 0, camera.scale * depth + camera.bias, 0.0), 0.0).astype(np.float32)
 
     def states(self, states: StateColumns) -> StateColumns:
-        """Move joint states to the frames' clock."""
+        """Move states to the frames' clock."""
         return replace(states, stamp_ns=states.stamp_ns + self.clock_ns) if self.clock_ns else states
 
     def frame(self, frame: RgbdFrame) -> RgbdFrame:
-        """Correct a frame whose pose is already on the robot's clock."""
+        """Correct a frame posed on the robot's clock."""
         return replace(
             frame,
             T_world_camera=self.pose(frame.camera, frame.T_world_camera),
@@ -90,7 +90,7 @@ class Correction:
         )
 
     def notes(self, digests: Sequence[str]) -> list[str]:
-        """Return a report's notes; digests: sha256 of the recording's files."""
+        """A report's notes; digests: sha256 of the recording's files."""
         text = f"poses, depths and clock are those of {self.file.name}"
         if set(digests) == set(self.calibration.digests.values()):
             return [text]
@@ -98,7 +98,7 @@ class Correction:
 
 
 def correction_of(options: SourceOptions, where: str) -> Correction | None:
-    """Return the options' correction, None without one. Raises InputError for an invalid file."""
+    """The options' correction, or None. Raises InputError for an invalid file."""
     if options.calibration is None:
         return None
     return Correction(file=options.calibration, calibration=read_calibration(options.calibration), where=where)
@@ -146,27 +146,26 @@ class CalibratedSource(Recording):
 
     @property
     def joint_topics(self) -> JointTopics | None:
-        """Joint state topics; None if the clock is corrected."""
+        """None if the clock is corrected."""
         if self._correction.clock_ns or not isinstance(self.inner, RosLogSource | CaptureSource):
             return None
         return self.inner.joint_topics
 
     @property
     def loss(self) -> LossReport:
-        """The source's loss, a note, and frames without a pose by the clock."""
+        """The source's, a note, and frames the clock leaves unposed."""
         loss = self.inner.loss
         notes = self._correction.notes(list(self.inner.digests().values()))
         return replace(loss, without_pose=loss.without_pose + self._num_without_pose, notes=[*loss.notes, *notes])
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Yield stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp."""
         for stamp, camera, T_recorded in self.inner.poses():
             T = self._pose(stamp, camera, T_recorded)
             if T is not None:
                 yield stamp, camera, T
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the source's files and the calibration."""
+        """Includes the calibration's sha256."""
         return {**self.inner.digests(), f"{CALIBRATION}{self._correction.file.name}": sha256(self._correction.file)}
 
     def _frames(self) -> Iterator[StoredFrame]:
@@ -222,7 +221,7 @@ class CalibratedSource(Recording):
 
 
 def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_ns: int) -> Float64 | None:
-    """Interpolate the pose (4, 4) on a path; its end within the tolerance, else None."""
+    """Interpolate (4, 4) on a path; its end within the tolerance, else None."""
     after = int(np.searchsorted(stamps, stamp_ns))
     if after in (0, len(stamps)):
         end = min(after, len(stamps) - 1)
@@ -254,7 +253,7 @@ class Perturbation:
 
     @classmethod
     def of(cls, given: Mapping[str, float]) -> "Perturbation | None":
-        """Build from values by name; None without effect. Raises UsageError for an unknown name or value."""
+        """Build by name; None without effect. Raises UsageError for an unknown name or value."""
         for name, value in given.items():
             if name not in LIMITS:
                 raise UsageError(f"--perturb {name}: expected one of {', '.join(LIMITS)}", remedy="leave it out")
@@ -264,7 +263,7 @@ class Perturbation:
         return made if made.depth_noise or made.pose_error or made.pose_turn else None
 
     def depth(self, camera: str, stamp_ns: int, depth: Float32) -> Float32:
-        """Add noise to depth (H, W) [m]; 0 without a depth before or after."""
+        """Add noise to depth (H, W) [m]; 0 where none is or remains."""
         noise = self._generator(camera, stamp_ns).standard_normal(depth.shape, np.float32)
         noisy = depth + np.float32(self.depth_noise) * depth**2 * noise
         return np.where((depth > 0) & (noisy > 0), noisy, np.float32(0.0)).astype(np.float32)
@@ -277,7 +276,7 @@ class Perturbation:
         return np.asarray(T_world_camera @ transform_from(self.pose_error * way / np.linalg.norm(way), quat_xyzw))
 
     def words(self) -> str:
-        """The values as on the command line."""
+        """Values as on the command line."""
         values = {"depth-noise": self.depth_noise, "pose-error": self.pose_error, "pose-turn": self.pose_turn}
         return ",".join(f"{name}={value!r}" for name, value in {**values, "seed": self.seed}.items() if value)
 
@@ -295,23 +294,22 @@ class PerturbedSource(Recording):
 
     @property
     def joint_topics(self) -> JointTopics | None:
-        """Joint state topics, None if unknown."""
+        """None if unknown."""
         found = getattr(self.inner, "joint_topics", None)
         return found if isinstance(found, JointTopics) else None
 
     @property
     def loss(self) -> LossReport:
-        """The source's loss, with a note."""
+        """The source's, with a note."""
         loss = self.inner.loss
         return replace(loss, notes=[*loss.notes, f"perturbed: {self._perturbation.words()}"])
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Yield stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp."""
         for stamp_ns, camera, T in self.inner.poses():
             yield stamp_ns, camera, self._perturbation.pose(camera, T)
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the source's files, and the perturbation."""
+        """Includes the perturbation."""
         words = self._perturbation.words()
         return {**self.inner.digests(), f"{PERTURB}{words}": words}
 

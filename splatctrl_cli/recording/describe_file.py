@@ -1,4 +1,4 @@
-"""Summaries of single files: splats, grids, robots, JSON, arrays, images; by header if possible."""
+"""Summaries of splats, grids, robots, JSON, arrays, images; by header if possible."""
 
 import json
 import zipfile
@@ -26,7 +26,7 @@ _LIST_LIMIT = 12  # longer lists are counted, not shown
 
 
 def describe_file(path: Path) -> Summary:
-    """Describe a file by its content. Raises InputError for an unknown kind."""
+    """Describe a file by content. Raises InputError if unknown."""
     if path.stat().st_size == 0:
         raise InputError(f"{path}: the file is empty (0 bytes)", remedy="write or copy it again")
     with path.open("rb") as stream:
@@ -95,7 +95,7 @@ def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], n
 
 
 def _parsed(path: Path, parse: Callable[[], Any], what: str) -> Any:
-    """Run `parse`. Raises InputError if it fails."""
+    """Raises InputError if the file is not `what`."""
     try:
         return parse()
     except (ValueError, EOFError, ParseError, yaml.YAMLError) as error:  # ValueError: what defusedxml forbids, too

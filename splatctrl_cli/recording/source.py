@@ -1,4 +1,4 @@
-"""Any recorded input opened as records in time order, and descriptions of files and folders."""
+"""Any recorded input as records in time order; descriptions of files and folders."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -73,7 +73,7 @@ def _opened(path: Path, options: SourceOptions, *, needs_depth: bool) -> FrameSo
 
 
 def lacks_depth(source: FrameSource) -> InputError | None:
-    """The error for a recording without depth, as only image folders can be."""
+    """The error for missing depth, possible only in image folders."""
     return source.no_depth() if isinstance(source, ImageFolderSource) and not source.has_depth else None
 
 
@@ -88,7 +88,7 @@ def open_session(paths: Sequence[Path], options: SourceOptions | None = None) ->
 
 
 def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescription]]:
-    """URDFs of a session's logs and captures, each text once with its path; skips other inputs."""
+    """URDFs of logs and captures, each once with its path; skips other inputs."""
     found: dict[str, tuple[Path, RobotDescription]] = {}
     for path in paths:
         said = []
@@ -119,7 +119,7 @@ def open_logs(paths: Sequence[Path]) -> RawLog | None:
 
 
 def describe(path: Path, options: SourceOptions | None = None) -> Summary:
-    """Describe `path`. Raises InputError if missing or unknown."""
+    """Raises InputError if missing or unknown."""
     options = options or SourceOptions()
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="check the path")
@@ -143,7 +143,7 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
 
 
 def describe_log(log: RawLog, options: SourceOptions) -> Summary:
-    """Summarise topics, times, frames, cameras, and what a reconstruction misses."""
+    """Topics, times, frames, cameras, and what a reconstruction misses."""
     found, sampling = survey_to_describe(log)
     with_messages = [t for t in found.topics.values() if t.count]
     facts: dict[str, object] = {

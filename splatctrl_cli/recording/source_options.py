@@ -28,7 +28,7 @@ class CameraTopics:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseTopic:
-    """A topic of poses; frame: its posed frame, "" for the messages' own, else the camera's."""
+    """A topic of poses; frame: posed, "" for the messages' or the camera's."""
 
     topic: str
     frame: str = ""
@@ -64,7 +64,7 @@ class SourceOptions:
     perturb: Mapping[str, float] = field(default_factory=dict)
 
     def refuse(self, names: tuple[str, ...], kind: str, path: Path) -> None:
-        """Raise InputError for a set option that does not apply to this kind of input."""
+        """Raise InputError for a set option that does not apply to this input."""
         flags = {"camera_topics": "camera", "human_topics": "human-topic"}
         flags |= dict.fromkeys(["camera_poses", "camera_pose_topics"], "camera-pose")
         default = SourceOptions()
@@ -78,12 +78,12 @@ class SourceOptions:
 
 
 def still_note(camera: str) -> str:
-    """Report note for a camera posed by the user."""
+    """A note on a camera posed by the user."""
     return f"camera {camera}: stands still where --camera-pose puts it, not where the recording may say"
 
 
 def refuse_unknown_cameras(where: Path, asked: Iterable[str], known: Collection[str]) -> None:
-    """Raise InputError if a requested camera is not in a recording."""
+    """Raise InputError for a requested camera not in the recording."""
     for name in asked:
         if name not in known:
             raise InputError(f"{where}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")

@@ -36,7 +36,7 @@ FIELD_FACTS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Channel:
-    """A channel's dtype, values per cell, unit, and if unknown space may blank it."""
+    """A channel's storage; may_be_unknown: unknown space may blank it."""
 
     dtype: str
     components: int = 1
@@ -74,7 +74,7 @@ class GridHead:
 
 
 def file_header(grid: DistanceGrid) -> dict[str, object]:
-    """The header with the written format and version."""
+    """The header with format and version."""
     return {**grid.header, "format": FORMAT, "version": VERSION}
 
 
@@ -83,7 +83,7 @@ def header_text(grid: DistanceGrid) -> str:
 
 
 def parse_header(name: str, text: str) -> dict[str, object]:
-    """Parse a header. Raises InputError naming `name` for other text or another version."""
+    """Parse a header. Raises InputError naming `name` if invalid or of another version."""
     try:
         parsed = json.loads(text)
     except json.JSONDecodeError as error:
@@ -122,12 +122,12 @@ def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -
 
 
 def check_grid(grid: DistanceGrid) -> Shape:
-    """Return a grid's cells. Raises as `check_layout`."""
+    """Raises as `check_layout`."""
     return check_layout("grid to write", {name: (v.dtype.str, v.shape) for name, v in grid.channels.items()})
 
 
 def check_finite(name: str, grid: DistanceGrid) -> None:
-    """Raise InputError for a value that is not finite; the policy `nan` allows NaN in unknown cells."""
+    """Raise InputError for a non-finite value; the policy `nan` allows NaN in unknown cells."""
     for channel, values in grid.channels.items():
         if not np.issubdtype(values.dtype, np.floating):
             continue
@@ -141,14 +141,14 @@ def check_finite(name: str, grid: DistanceGrid) -> None:
 
 
 def slabs(values: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
-    """Yield runs of x layers of at most `CHUNK` bytes, or one layer."""
+    """Yield x layers in runs of `CHUNK` bytes, or one layer."""
     step = max(1, CHUNK // max(1, values.nbytes // len(values)))
     for start in range(0, len(values), step):
         yield np.ascontiguousarray(values[start : start + step])
 
 
 def x_fastest(values: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
-    """Yield runs of z planes, (z, y, x[, 3]), of at most `CHUNK` bytes or one plane."""
+    """Yield z planes, (z, y, x[, 3]), in runs of `CHUNK` bytes or one plane."""
     x, y, z = values.shape[:3]
     step = max(1, CHUNK // max(1, values.nbytes // z))
     for start in range(0, z, step):
@@ -160,7 +160,7 @@ def x_fastest(values: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
 
 
 def from_x_fastest(planes: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Return the channel (X, Y, Z[, 3]) of planes from `x_fastest`."""
+    """Undo `x_fastest`: (X, Y, Z[, 3])."""
     return np.ascontiguousarray(planes.transpose(2, 1, 0, *range(3, planes.ndim)))
 
 
@@ -199,7 +199,7 @@ class GridFormat:
 
 
 def covers(first_cell: Any, voxel: float, shape: Any) -> dict[str, object]:
-    """Return cells, extent and the centres of the first and last cell [m]."""
+    """Cells, extent and the centres of the first and last cell [m]."""
     first, sides = np.asarray(first_cell, np.float64), voxel * (np.asarray(shape) - 1)
     return {
         "shape": [int(n) for n in shape],
@@ -216,7 +216,6 @@ def header_facts(header: Mapping[str, Any]) -> dict[str, object]:
 
 
 def summary_of(path: Path, kind: str, head: GridHead) -> Summary:
-    """Summarise a grid."""
     rows = [[name, CHANNELS[name].dtype.lstrip("<|"), CHANNELS[name].unit or "-"] for name in head.channels]
     facts = {**covers(head.origin, head.voxel, head.shape), **header_facts(head.header)}
     table = Grid(name="channels", header=("channel", "dtype", "unit"), rows=rows)
@@ -224,7 +223,7 @@ def summary_of(path: Path, kind: str, head: GridHead) -> Summary:
 
 
 def json_value(text: object) -> object:
-    """Parse a JSON text; return another value as it is."""
+    """Parse JSON text; return another value as it is."""
     try:
         return json.loads(text) if isinstance(text, str) else text
     except ValueError:
@@ -236,7 +235,7 @@ PROGRESS = "progress.json"
 
 @dataclass(frozen=True, kw_only=True)
 class SlabPlan:
-    """A bake's plan: origin and voxel [m], cells, channels, and settings that decide values (JSON)."""
+    """A bake's plan: origin and voxel [m], cells, channels, and settings (JSON)."""
 
     origin: tuple[float, float, float]
     voxel: float
@@ -250,7 +249,7 @@ class SlabPlan:
 
 
 class GridSlabs:
-    """The channels of a `SlabPlan` in `folder`; `num_layers` of x are on disk, with the baker's `counts` so far."""
+    """A `SlabPlan` in `folder`: `num_layers` of x are on disk, with the baker's `counts`."""
 
     def __init__(
         self, folder: Path, plan: SlabPlan, num_layers: int, counts: Mapping[str, int] | None = None
@@ -280,11 +279,11 @@ class GridSlabs:
         _write_progress(self.folder, self.plan, self.num_layers, self.counts)
 
     def is_whole(self) -> bool:
-        """True if every layer is on disk."""
+        """True if all layers are on disk."""
         return self.num_layers == self.plan.shape[0]
 
     def grid(self, header: Mapping[str, object]) -> DistanceGrid:
-        """The grid as read-only memory maps. Raises InputError before it is whole."""
+        """Open as read-only memory maps. Raises InputError before it is whole."""
         if not self.is_whole():
             raise InputError(
                 f"{self.folder}: expected {self.plan.shape[0]} layers, got {self.num_layers}",
@@ -310,7 +309,7 @@ class GridSlabs:
 
 
 def start_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
-    """Create an empty store, every file at full size. A full disk is an OSError here."""
+    """Create an empty store at full size. A full disk is an OSError here."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / PROGRESS).unlink(missing_ok=True)
     for name in plan.channels:

@@ -1,4 +1,4 @@
-"""The formats of a baked distance grid, by ``sdf-bake --formats`` name."""
+"""The distance grid formats by ``sdf-bake --formats`` name."""
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path

@@ -23,7 +23,7 @@ FURTHEST = np.float32(1e9)  # [m] in the place of what is not known, where no cu
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """Triangles: vertices (V, 3) float64 [m], world; faces (F, 3) int64, anticlockwise from larger distances."""
+    """vertices (V, 3) float64 [m], world; faces (F, 3) int64, anticlockwise from larger distances."""
 
     vertices: Float64
     faces: NDArray[np.int64]
@@ -64,7 +64,7 @@ def iso_surface(grid: DistanceGrid) -> Surface:
 
 
 def write_surface(path: Path, surface: Surface) -> None:
-    """Write by suffix: ``.ply`` and ``.obj`` with vertex normals, ``.stl`` with face normals."""
+    """Write ``.ply`` and ``.obj`` with vertex normals, ``.stl`` with face normals."""
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     options: dict[str, dict[str, object]] = {
         ".ply": {"vertex_normal": True},
@@ -76,7 +76,7 @@ def write_surface(path: Path, surface: Surface) -> None:
 
 
 def _marching_cubes(slab: Float32, is_known: NDArray[np.bool_]) -> tuple[Float64, NDArray[np.int32]] | None:
-    """Vertices [cells] and faces; None if no cube of eight known corners crosses 0."""
+    """Vertices [cells] and faces; None if no cube of known corners crosses 0."""
     whole = np.ones([n - 1 for n in slab.shape], bool)
     for corner in np.ndindex(2, 2, 2):
         whole &= is_known[tuple(slice(i, n - 1 + i) for i, n in zip(corner, slab.shape, strict=True))]
@@ -108,7 +108,7 @@ def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> 
 
 
 def describe_mesh(path: Path, _head: bytes) -> Summary | None:
-    """Summarise a ``.obj`` or ``.stl`` that trimesh reads; reads all of it."""
+    """Summarise a ``.obj`` or ``.stl``, read whole."""
     if path.suffix.lower() not in {".obj", ".stl"}:
         return None
     try:

@@ -38,7 +38,7 @@ _Members = dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]]
 
 
 def write_npz(path: Path, grid: DistanceGrid) -> None:
-    """Write the grid. Raises InputError for invalid channels."""
+    """Raises InputError for invalid channels."""
     check_grid(grid)
     members: dict[str, NDArray[np.generic]] = {
         "origin": np.asarray(grid.origin, dtype="<f8"),
@@ -63,7 +63,7 @@ def read_npz(path: Path) -> DistanceGrid:
 
 
 def read_npz_head(path: Path) -> GridHead:
-    """Read without the channels' values, and without checking them. Raises as `read_npz`."""
+    """Read without values, unchecked. Raises as `read_npz`."""
     with _opened(path) as archive:
         return _head(path, archive, _members(archive))
 
@@ -90,7 +90,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _members(archive: zipfile.ZipFile) -> _Members:
-    """Type and shape by name. Raises ValueError if sizes disagree."""
+    """Raises ValueError if announced and stored sizes disagree."""
     members: _Members = {}
     for entry in archive.infolist():
         name = entry.filename.removesuffix(".npy")

@@ -27,7 +27,7 @@ _TYPES = {"<f4": "float", "|u1": "uint8"}
 
 
 def write_nrrd(path: Path, grid: DistanceGrid, channel: str) -> None:
-    """Write one channel; NaN is kept. Raises InputError for invalid channels."""
+    """Write a channel; NaN is kept. Raises InputError for invalid channels."""
     shape, kind, step = check_grid(grid), CHANNELS[channel], repr(float(grid.voxel))
     directions = [f"({step},0,0)", f"(0,{step},0)", f"(0,0,{step})"]
     sizes, kinds = [str(n) for n in shape], ["domain"] * 3
@@ -82,7 +82,7 @@ def read_nrrd_head(path: Path) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def describe_nrrd(path: Path, head: bytes) -> Summary | None:
-    """Summarise an NRRD file, with the bake's header if ours."""
+    """Summarise an NRRD file and our bake's header."""
     if not head.startswith(b"NRRD000"):
         return None
     fields, pairs = read_nrrd_head(path)

@@ -127,7 +127,7 @@ def write_moveit(path: Path, grid: DistanceGrid) -> None:
 
 
 def is_occupied(grid: DistanceGrid, layers: slice) -> Bool:
-    """Occupied cells (L, Y, Z) of these x layers."""
+    """True (L, Y, Z) for cells written as occupied."""
     name, most = ("bound", 0.0) if "bound" in grid.channels else ("hard", REACH * grid.voxel + ROUNDING)
     reached = np.asarray(grid.channels[name][layers]) <= np.float32(most)
     is_clear: NDArray[np.bool_] = np.asarray(grid.channels["sdf"][layers]) > np.float32(0.0)  # False for NaN
@@ -135,7 +135,7 @@ def is_occupied(grid: DistanceGrid, layers: slice) -> Bool:
 
 
 def read_moveit_head(path: Path) -> tuple[dict[str, float], int]:
-    """Read a stream's numbers and the offset of its bits. Raises InputError if damaged."""
+    """Read the numbers, and the bits' offset. Raises InputError if damaged."""
     with path.open("rb") as stream:
         lines = [stream.readline(128) for _ in FIELDS]
         start = stream.tell()
@@ -152,7 +152,6 @@ def read_moveit_head(path: Path) -> tuple[dict[str, float], int]:
 
 
 def describe_moveit(path: Path, head: bytes) -> Summary | None:
-    """Summarise a MoveIt distance field; None for another file."""
     if re.match(rb"resolution: \S+\nsize_x: ", head) is None:
         return None
     numbers, start = read_moveit_head(path)

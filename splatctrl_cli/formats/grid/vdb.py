@@ -70,7 +70,7 @@ def write_vdb(path: Path, grid: DistanceGrid) -> None:
 
 
 def openvdb() -> Any:
-    """Import OpenVDB under either name. Raises UsageError without it."""
+    """Import OpenVDB by either name. Raises UsageError without it."""
     try:
         import openvdb as module
     except ImportError:
@@ -82,13 +82,13 @@ def openvdb() -> Any:
 
 
 def _above(values: Any) -> float:
-    """The float above the largest value, so that no cell is background."""
+    """The float above the largest value: no cell is background."""
     largest = max((float(np.nanmax(layers)) for layers in slabs(values) if not np.isnan(layers).all()), default=0.0)
     return float(np.nextafter(np.float32(largest), np.float32(np.inf)))
 
 
 def _plain(value: object) -> object:
-    """OpenVDB metadata: text or a number; JSON of all else."""
+    """Text or a number for OpenVDB; JSON of all else."""
     is_number = isinstance(value, float) or (isinstance(value, int) and abs(value) < 2**31)
     return value if isinstance(value, str | bool) or is_number else json.dumps(value, allow_nan=False)
 
@@ -146,7 +146,7 @@ def _metadata(stream: BinaryIO) -> dict[str, object]:
 
 
 def describe_vdb(path: Path, head: bytes) -> Summary | None:
-    """Summarise an OpenVDB file, with the bake's header if ours."""
+    """Summarise an OpenVDB file and our bake's header."""
     if not head.startswith(MAGIC):
         return None
     grids = read_vdb_head(path)

@@ -82,7 +82,7 @@ def write_vti(path: Path, grid: DistanceGrid) -> None:
 
 
 def read_vti(path: Path) -> DistanceGrid:
-    """Read the grid of `write_vti`. Raises InputError if missing, damaged or not ours."""
+    """Undo `write_vti`. Raises InputError if missing, damaged or not ours."""
     with _opened(path) as stream:
         head, starts = _head(path, stream)
         channels = {name: _values(path, stream, head, name, start) for name, start in starts.items()}
@@ -92,7 +92,7 @@ def read_vti(path: Path) -> DistanceGrid:
 
 
 def read_vti_head(path: Path) -> GridHead:
-    """Read without the channels' values. Raises as `read_vti`."""
+    """Read without values. Raises as `read_vti`."""
     with _opened(path) as stream:
         return _head(path, stream)[0]
 
@@ -107,7 +107,7 @@ def _opened(path: Path) -> BinaryIO:
 
 
 def _head(path: Path, stream: BinaryIO) -> tuple[GridHead, dict[str, int]]:
-    """The head, and each channel's offset [bytes], where its length is."""
+    """The head, and offsets [bytes] of each channel's length."""
     text = stream.read(1 << 22)  # bytes in which the XML must end
     mark = text.find(_APPENDED)
     begin = text.find(b"_", mark) + 1
@@ -177,7 +177,7 @@ def _triple(values: object) -> str:
 
 
 def describe_vti(path: Path, head: bytes) -> Summary | None:
-    """Summarise a ``.vti``: as a distance grid if ours, else by its XML."""
+    """Summarise a ``.vti``: a distance grid if ours, else its XML."""
     if path.suffix != ".vti" and b'type="ImageData"' not in head[:512]:
         return None
     text = head.decode("latin-1")

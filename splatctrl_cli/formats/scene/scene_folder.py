@@ -42,7 +42,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, kw_only=True)
 class Snapshot:
-    """The splat set after the frames of `stamp_ns`."""
+    """Splats after the frames of `stamp_ns`."""
 
     stamp_ns: int
     path: Path
@@ -55,11 +55,11 @@ class Snapshot:
         return self.path.with_suffix(".npz")
 
     def occupancy(self) -> OccupancyGrid | None:
-        """The grid, as coarse as `write_states` keeps it; None in an older scene."""
+        """The grid, as coarse as `write_states`; None in an older scene."""
         return self._read_voxels(read_states)
 
     def seen(self) -> SeenVoxels | None:
-        """When each voxel was last seen; None in an older scene."""
+        """When voxels were last seen; None in an older scene."""
         return self._read_voxels(read_seen)
 
     def unrepresented(self) -> Balls | None:
@@ -155,7 +155,7 @@ class SceneFolder:
 
     @cached_property
     def run(self) -> dict[str, Any]:
-        """``run.json``. Raises InputError if it cannot be read."""
+        """Raises InputError if ``run.json`` cannot be read."""
         file = self.path / "run.json"
         try:
             run = json.loads(file.read_text(encoding="utf-8"))
@@ -195,7 +195,7 @@ class SceneFolder:
 
     @property
     def training_stamps_ns(self) -> frozenset[int]:
-        """Made-up stamps of the training views without a clock."""
+        """Made-up stamps of training views without a clock."""
         return self._metric("training_stamps_ns", frozenset[int], ())
 
     @property
@@ -210,25 +210,25 @@ class SceneFolder:
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """Colour in [0, 1] where no splat is; black in an older scene."""
+        """Colour in [0, 1] behind the splats; black in an older scene."""
         return self._metric("background", _color, (0.0, 0.0, 0.0))
 
     @property
     def corrections(self) -> dict[tuple[str, int], ViewCorrection]:
-        """Corrections of training views by camera and stamp; may be empty."""
+        """Corrections by camera and stamp; may be empty."""
         rows, bends = self._metric("corrected_views", _corrections, ()), self._metric("depth_bends", _bends, {})
         return {key: replace(row, bend=bends.get(key[0])) for key, row in rows.items()}
 
     @property
     def is_anisotropic(self) -> bool:
-        """True for 3D Gaussian splatting: `gaussians` instead of splats and occupancy."""
+        """True for 3D Gaussian splatting: `gaussians`, no splats and occupancy."""
         return self._metric("method", "3dgs".__eq__, "")
 
     def _metric(self, name: str, kind: Callable[[Any], T], default: object = None) -> T:
         return run_value(self.run, ("metrics", name), kind, default, where=str(self.path / "run.json"))
 
     def gaussians(self) -> GaussianSet:
-        """The anisotropic Gaussians. Raises InputError if empty."""
+        """Raises InputError if there are none."""
         gaussians = read_gaussian_ply(self.parts.checked(self.path / "splats.ply"))[0]
         if not len(gaussians):
             raise InputError(
@@ -241,7 +241,7 @@ class SceneFolder:
         return read_world_splats(self._isotropic("splats.ply"))
 
     def _isotropic(self, name: str) -> Path:
-        """A checked file. Raises InputError if the splats are not isotropic."""
+        """The checked file. Raises InputError if splats are not isotropic."""
         if self.is_anisotropic:
             raise InputError(
                 f"{self.path}: made by 3D Gaussian splatting; distances are defined on isotropic splats",
@@ -254,11 +254,11 @@ class SceneFolder:
         return read_occupancy(self._isotropic("occupancy.npz"))
 
     def known(self) -> KnownVoxels | None:
-        """Final known voxels, and when last seen; None in an older scene."""
+        """Final voxels, and when last seen; None in an older scene."""
         return read_known_occupancy(self._isotropic("occupancy.npz"))
 
     def seen(self) -> SeenVoxels | None:
-        """When each voxel was last seen; None in an older scene."""
+        """When voxels were last seen; None in an older scene."""
         return read_seen(self._isotropic("occupancy.npz"))
 
     @cached_property
@@ -287,7 +287,7 @@ class SceneFolder:
         return taken
 
     def snapshot_at(self, stamp_ns: int) -> Snapshot:
-        """The newest snapshot not later than `stamp_ns`. Raises NotEvaluableError before the first."""
+        """The newest one up to `stamp_ns`. Raises NotEvaluableError before the first."""
         known = [s for s in self.snapshots if s.stamp_ns <= stamp_ns]
         if not known:
             raise NotEvaluableError(
@@ -297,24 +297,23 @@ class SceneFolder:
         return known[-1]
 
     def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
-        """Occupied voxels without a splat at `snapshot_at` or, for None, the end; None in an older scene."""
+        """Occupied voxels without a splat then or, for None, finally; None in an older scene."""
         if stamp_ns is not None:
             return self.snapshot_at(stamp_ns).unrepresented()
         path = self.path / "occupancy.npz"
         return read_unrepresented(self.parts.checked(path)) if self.parts.has(path) else None
 
     def shell_at(self, stamp_ns: int | None) -> SplatSet | None:
-        """The shell beyond the robot's reach, for pictures only, as in `unrepresented_at`; None if absent."""
+        """The shell beyond the robot's reach, for pictures, then or finally; None if absent."""
         path = self.path / SHELL_FILE if stamp_ns is None else self.snapshot_at(stamp_ns).shell_path
         return read_shell(self.parts.checked(path)) if self.parts.has(path) else None
 
     def splats_at(self, stamp_ns: int) -> SplatSet:
-        """The splats of `snapshot_at`."""
         return self.snapshot_at(stamp_ns).splats()
 
 
 def open_scene(path: Path) -> SceneFolder:
-    """Open a scene folder. Raises InputError for another folder."""
+    """Raises InputError for another folder."""
     if not path.exists():
         raise InputError(f"{path}: no such scene folder", remedy="give what 'splatctrl reconstruct' wrote")
     if path.name.endswith(PARTIAL):
@@ -335,7 +334,7 @@ class SplatFile(SceneFolder):
 
     @cached_property
     def run(self) -> dict[str, Any]:
-        """An empty record: their origin is unknown."""
+        """An empty record: the origin is unknown."""
         return {"metrics": {"cameras": [], "has_clock": False, "stamp_ns": 0}, "inputs": {}, "config": {}}
 
     @cached_property
@@ -345,12 +344,12 @@ class SplatFile(SceneFolder):
 
     @property
     def is_anisotropic(self) -> bool:
-        """True for stretched splats or view-dependent colour."""
+        """True if stretched or with view-dependent colour."""
         return isinstance(self._found, GaussianSet)
 
     @cached_property
     def _found(self) -> SplatSet | GaussianSet:
-        """Raises InputError if damaged, empty, of unknown kind, or in another frame or unit."""
+        """Raises InputError if damaged, empty, or of another kind, frame or unit."""
         found, comments = read_splats(self.path)
         check_world(self.path, comments)
         if not len(found):
@@ -374,5 +373,5 @@ class SplatFile(SceneFolder):
 
 
 def open_splats(path: Path) -> SceneFolder:
-    """Open a scene folder or a splat file. Raises InputError for neither."""
+    """Open a scene folder or splat file. Raises InputError for neither."""
     return SplatFile(path) if path.is_file() else open_scene(path)

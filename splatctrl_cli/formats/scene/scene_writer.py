@@ -1,4 +1,4 @@
-"""A writer of the ``scene/`` folder, and of checkpoints to resume from."""
+"""A writer of the ``scene/`` folder and its checkpoints."""
 
 import csv
 import json
@@ -43,7 +43,7 @@ class Checkpoint:
 
 
 def read_checkpoint(folder: Path) -> Checkpoint:
-    """Read a partial scene's checkpoint. Raises InputError if unreadable."""
+    """Raises InputError if unreadable."""
     path = folder / CHECKPOINT
     try:
         state = read_arrays(path, most=1 << 32)  # the largest grid takes 2.8e9 bytes, its splats the rest
@@ -108,13 +108,13 @@ class SceneWriter:
         return self.folder / "snapshots" / f"{index:06d}.ply"
 
     def audit(self, row: object) -> None:
-        """Append one row to ``audit.jsonl``."""
+        """Append to ``audit.jsonl``."""
         assert is_dataclass(row) and not isinstance(row, type)
         with self._audit.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(asdict(row)) + "\n")
 
     def audited(self) -> list[dict[str, Any]]:
-        """The rows written so far."""
+        """Rows written so far."""
         return [json.loads(line) for line in self._audit.read_text(encoding="utf-8").splitlines()]
 
     def snapshot(
@@ -136,7 +136,7 @@ class SceneWriter:
         self.snapshots.append(snapshot)
 
     def settle(self, *, but: int = 0) -> None:
-        """Wait until all snapshots but the last `but` are written. Raises their errors."""
+        """Wait for all snapshots but the last `but`. Raises their errors."""
         while len(self._unwritten) > but:
             self._unwritten.popleft().result()
 
@@ -150,7 +150,7 @@ class SceneWriter:
             write_ply(path, shell, self.comments | SHELL | {"stamp_ns": str(stamp_ns)})
 
     def checkpoint(self, progress: Mapping[str, Any], state: State, *, is_last: bool = False) -> None:
-        """Replace the checkpoint atomically after flushing its files; the last is compressed."""
+        """Replace the checkpoint atomically after its files; the last is compressed."""
         self.settle()
         flush(self._audit)
         for snapshot in self.snapshots[self._num_flushed :]:
@@ -168,7 +168,7 @@ class SceneWriter:
         write_durably(self.folder / CHECKPOINT, lambda path: savez(path, arrays, level=1 if is_last else 0))
 
     def finish(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, shell: SplatSet | None = None) -> None:
-        """Write the final splats and shell, the occupancy grid and the index of snapshots."""
+        """Write final splats, shell, occupancy and the index of snapshots."""
         self.settle()
         write_ply(self.folder / "splats.ply", splats, self.comments | {"stamp_ns": str(stamp_ns)})
         self._write_shell(self.folder / SHELL_FILE, stamp_ns, shell)

@@ -1,4 +1,4 @@
-"""Voxel files of a scene with their evidence: ``occupancy.npz`` and the states of each snapshot."""
+"""Voxel files of a scene: ``occupancy.npz`` and snapshots' states, with evidence."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -44,7 +44,7 @@ def write_occupancy(path: Path, known: KnownVoxels) -> None:
 
 
 def write_states(path: Path, known: KnownVoxels, states: UInt8) -> None:
-    """Write voxel `states` (X, Y, Z) instead of log-odds: a tenth of the size."""
+    """Write `states` (X, Y, Z) instead of log-odds: a tenth of the size."""
     values = {state.name.lower(): int(state) for state in VoxelState}
     header = _header(known, {"format": "splatctrl-voxel-states 2", "values": values})
     savez(path, {"header": header, "states": states, **_evidence(known)}, level=3)
@@ -68,7 +68,7 @@ def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.gen
 
 
 def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
-    """Arrays common to both files; last_seen in one byte is twice as fast."""
+    """Arrays of both files; last_seen in one byte is twice as fast."""
     balls = known.unrepresented
     return {
         "last_seen": known.last_seen.astype(np.uint8 if len(known.step_stamps_ns) < FIRST_REASON else np.uint16),
@@ -90,7 +90,7 @@ def _refused(path: Path, what: str) -> Iterator[None]:
 
 
 def read_states(path: Path) -> OccupancyGrid:
-    """Read a grid from `write_states`. Raises InputError otherwise; never unpickles."""
+    """Undo `write_states`. Raises InputError otherwise; never unpickles."""
     with _refused(path, _STATES):
         arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
         header = json.loads(str(arrays["header"]))
@@ -124,14 +124,14 @@ def _read_header(path: Path) -> dict[str, Any]:
 
 
 def read_occupancy(path: Path) -> OccupancyGrid:
-    """Read the grid of ``occupancy.npz``. Raises InputError otherwise; never unpickles."""
+    """Read the ``occupancy.npz`` grid. Raises InputError otherwise; never unpickles."""
     with _refused(path, _OCCUPANCY):
         arrays = read_arrays(path, ("header", *_GRID), most=_HEADER + 7 * MOST_VOXELS)
         return _grid_of(arrays, json.loads(str(arrays["header"])))
 
 
 def read_known_occupancy(path: Path) -> KnownVoxels | None:
-    """Read all of ``occupancy.npz``; None for an older file. Raises as `read_occupancy`."""
+    """Read all of ``occupancy.npz``; None if older. Raises as `read_occupancy`."""
     with _refused(path, _OCCUPANCY):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
@@ -153,10 +153,7 @@ def read_known_occupancy(path: Path) -> KnownVoxels | None:
 
 
 def read_unrepresented(path: Path) -> Balls | None:
-    """Read only the unrepresented voxels of either file; None for an older one.
-
-    Raises InputError for another file.
-    """
+    """Read only unrepresented voxels; None if older. Raises InputError for another file."""
     with _refused(path, _OURS):
         header = _read_header(path)
         if "step_stamps_ns" not in header:

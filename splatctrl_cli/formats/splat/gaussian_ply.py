@@ -59,7 +59,7 @@ def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str
 
 
 def rows_of(gaussians: GaussianSet, dtype: "np.dtype[Any]") -> NDArray[Any]:
-    """The Gaussians (N,) as rows of `dtype`, 0 in other properties."""
+    """Rows (N,) of `dtype`, 0 in other properties."""
     g = gaussians
     rest = np.zeros((len(g), 3, 15), dtype=np.float32)
     rest[:, :, : g.harmonics.shape[1] - 1] = g.harmonics[:, 1:].transpose(0, 2, 1)
@@ -83,7 +83,7 @@ def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def gaussians_of(ply: PlyFile) -> GaussianSet:
-    """The Gaussians of a PLY table. Raises as `read_gaussian_ply`."""
+    """Raises as `read_gaussian_ply`."""
     path = ply.path
     check_properties(path, ply.names, REQUIRED)
     logs = log_sigmas(ply)
@@ -105,7 +105,7 @@ class RoundedError(InputError):
 
 
 def exact_centers(ply: PlyFile) -> Float64:
-    """Centres (N, 3) float64 [m] as in the file."""
+    """(N, 3) float64 [m], as in the file."""
     return np.column_stack([ply.column(name) for name in "xyz"])
 
 
@@ -167,7 +167,7 @@ def log_sigmas(ply: PlyFile) -> Float64:
 
 
 def labels_of(ply: PlyFile) -> UInt8:
-    """Labels (N,), 0 (object) without a column. Raises InputError for other values."""
+    """Labels (N,), 0 (object) by default. Raises InputError for other values."""
     if "label" not in ply:
         return np.zeros(len(ply), dtype=np.uint8)
     values = ply.column("label")
@@ -177,7 +177,7 @@ def labels_of(ply: PlyFile) -> UInt8:
 
 
 def without_zero_degrees(harmonics: Float32) -> Float32:
-    """`harmonics` (N, K, 3) up to the last nonzero degree: the same colours."""
+    """(N, K, 3) up to the last nonzero degree: the same colours."""
     degree = 3
     while degree and not harmonics[:, degree * degree :].any():
         degree -= 1
@@ -185,7 +185,7 @@ def without_zero_degrees(harmonics: Float32) -> Float32:
 
 
 def check_gaussians(where: str, gaussians: GaussianSet) -> None:
-    """Raise InputError naming the index of the first invalid Gaussian."""
+    """Raise InputError naming the first invalid Gaussian's index."""
     g = gaussians
     groups: dict[str, NDArray[np.generic]] = {"center": g.centers, "sigma": g.scales, "rotation": g.quats_wxyz}
     groups |= {"opacity": g.opacities, "harmonics": g.harmonics}
@@ -199,7 +199,7 @@ def check_gaussians(where: str, gaussians: GaussianSet) -> None:
 
 
 def _harmonics(ply: PlyFile) -> Float32:
-    """Coefficients (N, K, 3); f_rest has each channel's in a row."""
+    """(N, K, 3); f_rest has each channel's in a row."""
     num_rest = sum(name.startswith("f_rest_") for name in ply.names)
     names = [f"f_rest_{index}" for index in range(num_rest)]
     if num_rest not in REST_PER_DEGREE or not all(name in ply for name in names):

@@ -64,7 +64,7 @@ def _write(path: Path, document: Mapping[str, Any], tables: Sequence[NDArray[Any
 
 
 def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
-    """Read a ``.glb`` file's document and buffer. Raises InputError if truncated, or not version 2."""
+    """A ``.glb``'s document and buffer. Raises InputError if truncated, or not version 2."""
     content = read_bytes(path)
     if len(content) < 20 or struct.unpack_from("<I", content)[0] != MAGIC:
         raise InputError(f"{path}: no .glb file: expected it to start with 'glTF', got {content[:4]!r}")
@@ -89,7 +89,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, width: int) -> Float32:
-    """An accessor as (N, width) float32. Raises InputError for another width or missing data."""
+    """(N, width) float32. Raises InputError for another width or missing data."""
     accessor, where = document["accessors"][index], f"{path}: accessor {index}"
     dtype = np.dtype(COMPONENTS[accessor["componentType"]])
     if accessor["type"] != TYPES[width] or "sparse" in accessor or "bufferView" not in accessor:
@@ -154,13 +154,13 @@ def read_gltf(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def coefficient_name(index: int) -> str:
-    """Attribute of the harmonics' coefficient `index`, counted through all degrees."""
+    """Attribute of coefficient `index`, counted through all degrees."""
     degree = int(np.sqrt(index))
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index - degree * degree}"
 
 
 def _point_colors(gaussians: GaussianSet) -> NDArray[np.uint8]:
-    """(N, 4) red, green, blue, opacity, 0 to 255, for plain point clouds."""
+    """(N, 4) red, green, blue, opacity, 0 to 255, for point clouds."""
     colors = np.clip(0.5 + SH_C0 * gaussians.harmonics[:, 0].astype(np.float64), 0.0, 1.0)
     return np.rint(255.0 * np.column_stack([colors, gaussians.opacities])).astype(np.uint8)
 

@@ -59,7 +59,7 @@ def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str])
 
 
 def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
-    """Read a ``.splat`` file, which has no comments. Raises InputError if truncated or invalid."""
+    """Read a ``.splat``, without comments. Raises InputError if truncated or invalid."""
     content = read_bytes(path)
     if len(content) % ROW.itemsize:
         raise InputError(f"{path}: expected a multiple of 32 bytes, one row per splat, got {len(content)}")
@@ -80,7 +80,7 @@ def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def held_by_splat(gaussians: GaussianSet) -> GaussianSet:
-    """Return `gaussians` limited to degree-0 colours in 0 to 1, without labels."""
+    """Limit to degree-0 colours in 0 to 1, without labels."""
     limit = 0.5 / SH_C0
     return replace(without_labels(gaussians), harmonics=np.clip(gaussians.harmonics[:, :1], -limit, limit))
 
@@ -157,7 +157,7 @@ def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
-    """Return `gaussians` clipped to the format's ranges, without labels."""
+    """Clip to the format's ranges, without labels."""
     harmonics = np.clip(gaussians.harmonics, *HARMONICS)
     harmonics[:, 0] = np.clip(gaussians.harmonics[:, 0], -127.5 / COLOR_SCALE, 127.5 / COLOR_SCALE)
     scales = np.clip(gaussians.scales, *np.exp(LOG_SIGMAS)).astype(np.float32)
@@ -181,7 +181,7 @@ def spz_bound(gaussians: GaussianSet) -> Differences:
 
 
 def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
-    """Fraction bits and bytes by attribute, a row per Gaussian. Raises InputError for another length."""
+    """Fraction bits and bytes (N, width) by attribute. Raises InputError for another length."""
     start = content[:4]
     if start == PLAIN:
         num, bits, widths = _parsed(path, content, (4,), len(content))
@@ -196,7 +196,7 @@ def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
 
 
 def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
-    """Number of Gaussians, fraction bits, bytes per attribute; size: of the file."""
+    """Number of Gaussians, fraction bits, bytes per attribute; size: the file's."""
     if len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC:
         raise InputError(f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}")
     _, version, num, degree, bits, flags, _ = HEADER.unpack_from(head)
@@ -216,7 +216,7 @@ def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tu
 
 
 def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], bytes]:
-    """`_parsed` and all attributes, unpacking no more than the header says."""
+    """`_parsed` and the attributes, unpacking no more than announced."""
     try:
         with gzip.GzipFile(fileobj=BytesIO(content)) as stream:
             num, bits, widths = _parsed(path, stream.read(HEADER.size), (2, 3), len(content))
@@ -253,7 +253,7 @@ def _streams(path: Path, content: bytes, sizes: list[int]) -> list[bytes]:
 
 
 def _fraction_bits(centers: Float32) -> int:
-    """The most fraction bits, up to 12, that fit every coordinate in 24 bits."""
+    """The most fraction bits, up to 12, that fit coordinates in 24 bits."""
     largest = float(np.abs(centers).max(initial=0.0))
     bits = FRACTION_BITS
     while largest * 2.0**bits > 2**23 - 1:

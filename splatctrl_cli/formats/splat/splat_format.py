@@ -1,4 +1,4 @@
-"""The declaration of a splat file format: writing, reading, representable values and precision."""
+"""A splat format's declaration: writing, reading, representable values, precision."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -32,7 +32,7 @@ def sigmoid(logits: Float64) -> Float32:
 
 
 def sigma_of_log(where: str, name: str, logs: Float64) -> Float32:
-    """exp(x) as float32 [m]. Raises InputError naming the splat if infinite or zero."""
+    """exp(x) as float32 [m]. Raises InputError naming an infinite or zero one."""
     values = np.exp(np.clip(logs, -700.0, 700.0))
     limits = np.finfo(np.float32)
     refuse(where, name, values, (values > limits.max) | (values < limits.tiny), "a radius that float32 holds [m]")
@@ -40,7 +40,7 @@ def sigma_of_log(where: str, name: str, logs: Float64) -> Float32:
 
 
 def unit_quaternions(where: str, quats: NDArray[np.floating]) -> Float32:
-    """Normalise quaternions (N, 4), bit-exact if already unit. Raises InputError for zero length."""
+    """Normalise (N, 4), bit-exact if already unit. Raises InputError for zero length."""
     wide = quats.astype(np.float64)
     lengths = np.linalg.norm(wide, axis=1, keepdims=True)
     refuse(where, "rotation", quats, np.asarray(~(lengths[:, 0] > 1e-12)), "a quaternion that is not zero")
@@ -48,7 +48,7 @@ def unit_quaternions(where: str, quats: NDArray[np.floating]) -> Float32:
 
 
 def refuse(where: str, name: str, values: NDArray[Any], is_bad: Bool, expected: str) -> None:
-    """Raise InputError naming the first splat where `is_bad` (N,)."""
+    """Raise InputError naming the first bad splat (N,)."""
     bad = np.flatnonzero(is_bad)
     if len(bad):
         value = values[bad[0]]
@@ -57,7 +57,7 @@ def refuse(where: str, name: str, values: NDArray[Any], is_bad: Bool, expected: 
 
 
 def check_finite(where: str, num: int, groups: Mapping[str, NDArray[Any]]) -> None:
-    """Raise InputError at the first value that is not finite, or for not `num` rows."""
+    """Raise InputError at the first non-finite value, or for not `num` rows."""
     for name, values in groups.items():
         if len(values) != num:
             raise InputError(f"{where}: {name}: expected {num} values, got {len(values)}")
@@ -79,7 +79,7 @@ class Differences:
     harmonics: float
 
     def beyond(self, bound: "Differences") -> list[str]:
-        """Names of what exceeds `bound`, with value and bound."""
+        """Names beyond `bound`, with both values."""
         limits = asdict(bound)
         pairs = ((name, value, limits[name]) for name, value in asdict(self).items())
         return [f"{name} {value:.3g} (at most {limit:.3g})" for name, value, limit in pairs if not value <= limit]
@@ -95,7 +95,7 @@ def float32_bound(gaussians: GaussianSet) -> Differences:
 
 
 def differences(a: GaussianSet, b: GaussianSet, centers: Float64 | None = None) -> Differences:
-    """The largest differences of two sets in the same order; centers: exact ones of `a` (N, 3) [m]."""
+    """Largest differences in equal order; centers: exact ones of `a` (N, 3) [m]."""
     return Differences(
         center=_largest((a.centers.astype(np.float64) if centers is None else centers) - b.centers),
         sigma=_largest(b.scales / a.scales.astype(np.float64) - 1.0),
@@ -117,7 +117,7 @@ def _padded(harmonics: Float32) -> Float64:
 
 
 def _angles(a: Float32, b: Float32) -> Float64:
-    """Angle [deg] between unit quaternions by the chord, precise where a cosine is not."""
+    """Angle [deg] by the chord, precise where a cosine is not."""
     one, two = a.astype(np.float64), b.astype(np.float64)
     chord = np.minimum(np.linalg.norm(one - two, axis=1), np.linalg.norm(one + two, axis=1))
     return np.asarray(np.degrees(4.0 * np.arcsin(np.minimum(chord / 2.0, 1.0))))

@@ -56,7 +56,7 @@ HEADER_COMMENTS = {
 
 
 def as_gaussians(splats: SplatSet) -> GaussianSet:
-    """Convert `splats` to Gaussians, without density."""
+    """Convert to Gaussians, without density."""
     coefficients = (splats.colors.astype(np.float64) - 0.5) / SH_C0
     return GaussianSet(
         centers=splats.centers,
@@ -69,7 +69,7 @@ def as_gaussians(splats: SplatSet) -> GaussianSet:
 
 
 def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
-    """Convert round Gaussians to splats. Raises InputError counting stretched and view-dependent ones."""
+    """Convert round Gaussians. Raises InputError counting stretched and view-dependent ones."""
     num_stretched = int(np.count_nonzero(_is_stretched(gaussians)))
     num_coloured = int(np.count_nonzero(gaussians.harmonics[:, 1:].any(axis=(1, 2))))
     if num_stretched or num_coloured:
@@ -130,7 +130,7 @@ def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
 
 
 def read_world_splats(path: Path) -> SplatSet:
-    """Read a PLY in metres and world; comments that name neither are trusted.
+    """Read a PLY in metres and world; comments may omit both.
 
     Raises as `read_ply` and `check_world`.
     """
@@ -140,7 +140,7 @@ def read_world_splats(path: Path) -> SplatSet:
 
 
 def check_world(path: Path, comments: Mapping[str, str]) -> None:
-    """Raise InputError for comments that name another unit or frame, or a shell."""
+    """Raise InputError for comments of another unit or frame, or a shell."""
     check_no_shell(path, comments)
     for key, known in (("units", METRES), ("frame", ("world",))):
         said = comments.get(key)
@@ -152,7 +152,7 @@ def check_world(path: Path, comments: Mapping[str, str]) -> None:
 
 
 def check_no_shell(path: Path, comments: Mapping[str, str]) -> None:
-    """Raise InputError for a shell, which is rendered only."""
+    """Raise InputError for a shell, which is only rendered."""
     if SHELL.keys() & comments.keys():
         raise InputError(
             f"{path}: the shell beyond the robot's reach, which is rendered only and has no distances",
@@ -161,7 +161,7 @@ def check_no_shell(path: Path, comments: Mapping[str, str]) -> None:
 
 
 def read_shell(path: Path) -> SplatSet:
-    """Read a shell. Raises as `read_ply`, and InputError for other splats."""
+    """Raises as `read_ply`, and InputError for other splats."""
     splats, comments = read_ply(path)
     if not SHELL.keys() <= comments.keys():
         raise InputError(f"{path}: expected a shell, got other splats", remedy="reconstruct the scene again")
@@ -169,7 +169,7 @@ def read_shell(path: Path) -> SplatSet:
 
 
 def splats_of(ply: PlyFile) -> SplatSet:
-    """Return a PLY table's splats. Raises as `read_ply`."""
+    """Raises as `read_ply`."""
     path = ply.path
     if num := num_stretched(ply):
         raise InputError(
@@ -191,14 +191,14 @@ def splats_of(ply: PlyFile) -> SplatSet:
 
 
 def num_stretched(ply: PlyFile) -> int:
-    """Count the rows with unequal scales."""
+    """Count rows with unequal scales."""
     scales = log_sigmas(ply)
     spread = scales.max(axis=1, initial=-np.inf) - scales.min(axis=1, initial=np.inf)
     return int(np.count_nonzero(spread > MAX_SCALE_SPREAD))
 
 
 def check_splats(where: str, splats: SplatSet) -> None:
-    """Raise InputError at the first invalid splat: not finite, no radius, opacity outside [0, 1]."""
+    """Raise InputError at the first splat not finite, without radius, or opacity outside [0, 1]."""
     groups = {
         "center": splats.centers,
         "radius": splats.radii,
@@ -215,7 +215,7 @@ FORMATS: Mapping[str, SplatFormat] = {kind.suffix: kind for kind in entries_of(_
 
 
 def format_of(path: Path) -> SplatFormat:
-    """Return the suffix's format, PLY without one. Raises UsageError if unknown."""
+    """The suffix's format, PLY without one. Raises UsageError if unknown."""
     found = FORMATS.get(path.suffix.lower() or ".ply")
     if found is None:
         raise UsageError(f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}")
@@ -287,7 +287,7 @@ def read_spheres(path: Path) -> SplatSet:
 
 
 def describe_splats(path: Path, _head: bytes) -> Summary:
-    """Summarise a splat file. Raises InputError for another kind."""
+    """Raises InputError for another kind."""
     found, comments = read_splats(path)
     gaussians = as_gaussians(found) if isinstance(found, SplatSet) else found
     facts: dict[str, object] = {

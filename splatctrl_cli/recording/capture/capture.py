@@ -1,4 +1,4 @@
-"""``X.capture/``: a recording as a plain folder of images, poses and joints (docs/capture.md)."""
+"""``X.capture/``: a plain folder of images, poses and joints (docs/capture.md)."""
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -78,13 +78,12 @@ class CaptureSource(Recording):
 
     @property
     def loss(self) -> LossReport:
-        """The loss of `ingest`, and damage since."""
+        """The loss of `ingest`, and later damage."""
         loss = self._loss
         damaged = max(self._damaged, self._damaged_before, key=len)
         return replace(loss, damaged=loss.damaged + len(damaged), notes=[*loss.notes, *damaged])
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Yield stamp, camera and pose of every frames.csv row."""
         return ((int(row["stamp_ns"]), row["camera"], _pose(row)) for row in self._rows)
 
     def digests(self) -> dict[str, str]:
@@ -96,7 +95,7 @@ class CaptureSource(Recording):
         yield from filter(None, map(self._stored_frame, self._rows))
 
     def _stored_frame(self, row: Mapping[str, str]) -> StoredFrame | None:
-        """A row's frame; None, and counted, if an image was changed."""
+        """None, and counted, if an image was changed."""
         color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
         human_bytes = self._read(row["human"]) if row.get("human") else None
         camera = self._cameras[row["camera"]]
@@ -153,7 +152,7 @@ class CaptureSource(Recording):
         return data
 
     def _checked(self, name: str) -> Path:
-        """The path. Raises InputError for a changed file."""
+        """Raises InputError for a changed file."""
         file = self._path / name
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise InputError(f"{file}: lies outside the capture", remedy=AGAIN)
@@ -163,7 +162,7 @@ class CaptureSource(Recording):
 
 
 def robot_description_of(path: Path) -> list[RobotDescription]:
-    """A capture's URDF, or none. Raises InputError for a changed file."""
+    """A capture's URDF, if any. Raises InputError if changed."""
     file = path / ROBOT
     if not file.is_file():
         return []

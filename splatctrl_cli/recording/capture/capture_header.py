@@ -1,4 +1,4 @@
-"""A capture's index: capture.json, and frames.csv and SHA256SUMS by row, at fifty bytes a file."""
+"""A capture's index: capture.json; frames.csv and SHA256SUMS at fifty bytes a file."""
 
 import csv
 import hashlib
@@ -84,7 +84,7 @@ def is_capture(path: Path) -> bool:
 
 
 def read_capture_header(path: Path) -> dict[str, Any]:
-    """Read capture.json. Raises InputError if not ours, or of another version."""
+    """Raises InputError if not ours, or of another version."""
     file = path / "capture.json"
     try:
         header = json.loads(file.read_text(encoding="utf-8"))
@@ -121,10 +121,10 @@ _UNREADABLE = (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError)
 
 
 class FrameRows:
-    """Rows of frames.csv of some cameras, in file order, read again at each iteration."""
+    """Some cameras' rows of frames.csv, in order, read again at each iteration."""
 
     def __init__(self, file: Path, cameras: Collection[str]) -> None:
-        """Raises InputError for an invalid row, or one that names a file outside the capture."""
+        """Raises InputError for an invalid row, or a file outside the capture."""
         self._file, self._cameras = file, cameras
         try:
             self._num = sum(1 for _ in self._read())
@@ -157,7 +157,7 @@ class FrameRows:
 
 
 def _checked(row: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the row. Raises ValueError if invalid."""
+    """Raises ValueError if invalid."""
     int(row["stamp_ns"])
     for key in COLUMNS[4:11]:
         float(row[key])
@@ -191,7 +191,7 @@ class FileSums:
         self._sums = np.frombuffer(sums, dtype=np.uint8).reshape(-1, 32)[order]
 
     def get(self, name: str) -> str | None:
-        """The hexadecimal sha256 of a name's last line, or None."""
+        """Hexadecimal sha256 of a name's last line, or None."""
         at = int(np.searchsorted(self._keys, np.uint64(_key(name.encode())), side="right")) - 1
         if at < 0 or int(self._keys[at]) != _key(name.encode()):
             return None

@@ -41,7 +41,7 @@ JOURNAL = "ingest.jsonl"  # in the folder while it is partial
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """A written frame: its frames.csv row, (sha256, name) of its files, its provenance.csv row."""
+    """A written frame: frames.csv row, (sha256, name) of files, provenance.csv row."""
 
     row: Mapping[str, str]
     sums: Sequence[tuple[str, str]]
@@ -49,10 +49,10 @@ class Entry:
 
 
 class Journal:
-    """A partial folder's journal; an earlier run's entries come first, then new ones are added."""
+    """A partial folder's journal: an earlier run's entries, then new ones."""
 
     def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
-        """identity: the facts that decide the bytes, stored for a resumed run."""
+        """identity: the facts that decide the bytes, for a resumed run."""
         self._path = folder / JOURNAL
         self.num_entries = 0
         folder.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,7 @@ class Journal:
         self._stream.close()
 
     def kept(self) -> Entry | None:
-        """The earlier run's next frame; None after the last."""
+        """The earlier run's next frame, or None."""
         found = next(self._kept, None)
         if found is None:
             return None
@@ -78,19 +78,19 @@ class Journal:
         return Entry(**found)
 
     def add(self, entry: Entry) -> None:
-        """Add a frame whose files are written."""
+        """Add a written frame."""
         self.num_entries += 1
         self._stream.write(json.dumps(vars(entry)) + "\n")
         self._stream.flush()
 
     def entries(self) -> Iterator[Entry]:
-        """Yield all entries in order."""
+        """All entries in order."""
         lines = _lines(self._path)
         next(lines, None)
         yield from (Entry(**line) for line in lines)
 
     def remove(self) -> None:
-        """Delete the journal of a finished capture."""
+        """Delete it after the capture."""
         self._stream.close()
         self._path.unlink()
 
@@ -103,7 +103,7 @@ class Journal:
 
 
 def read_identity(folder: Path) -> Mapping[str, Any] | None:
-    """Identity of an interrupted run; None without one."""
+    """An interrupted run's identity, or None."""
     path = folder / JOURNAL
     first = next(_lines(path), None) if path.is_file() else None
     return None if first is None else first.get("identity")
@@ -118,7 +118,7 @@ def check_not_partial(folder: Path) -> None:
 
 
 def check_same_frame(folder: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Raise UsageError if a written frame differs from the source's now."""
+    """Raise UsageError if a written frame differs from the source's."""
     differing = [name for name in now if before.get(name) != now[name]]
     if differing:
         name = differing[0]
@@ -233,12 +233,12 @@ def _write_index(
 
 
 def _is_of_lens(name: str) -> bool:
-    """True if a lens's frames share the file, out of their order."""
+    """True if a lens's frames share it, out of order."""
     return name.startswith("valid/")
 
 
 def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None:
-    """Write sorted lines; the journal is read once per image folder to bound memory."""
+    """The journal is read once per image folder to bound memory."""
     written = (name for entry in journal.entries() for _, name in entry.sums if not _is_of_lens(name))
     folders = {f"{name.rpartition('/')[0]}/" for name in written}
     with path.open("w", encoding="utf-8", newline="") as stream:
@@ -256,7 +256,7 @@ def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str,
 
 
 def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
-    """The frames.csv row without file names; counts its camera."""
+    """Without file names; counts the camera."""
     if stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera):
         raise InputError(
             f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="rename the camera"
@@ -307,7 +307,7 @@ def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera:
 
 
 def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
-    """Places of the recorded images; an unknown byte is empty."""
+    """An unknown byte is empty."""
     if not stored.places:
         return {}
     found = {"color": color, "depth": depth}
@@ -318,7 +318,7 @@ def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
 
 
 def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
-    """Suffix and bytes: the recorded PNG if in the camera's unit."""
+    """Suffix and bytes, of the recorded PNG if in the unit."""
     if stored.depth_file is not None and stored.depth_unit == unit:
         return "png", stored.depth_file
     counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)
@@ -326,7 +326,7 @@ def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
 
 
 def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:
-    """Depth as uint16 counts of `unit`; None if they would not restore it."""
+    """uint16 counts of `unit`; None if they would not restore depth."""
     if depth.max(initial=0.0) / unit > 65534.5:
         return None
     counts = np.round(depth / np.float32(unit)).astype(np.uint16)

@@ -36,7 +36,7 @@ Fields = dict[str, bytes]
 
 
 class BagRecord(NamedTuple):
-    """A record; the body of a cut one is what remains of it."""
+    """A record; a cut one has the rest of its body."""
 
     offset: int
     kind: int
@@ -53,7 +53,7 @@ class BagFile:
         self.size = path.stat().st_size
 
     def records(self, damage: Damage) -> Iterator[BagRecord]:
-        """Yield chunks, connections, messages and the bag's header in order; losses go to `damage`."""
+        """Yield all but index data in order; losses go to `damage`."""
         with self.path.open("rb") as stream:
             if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
                 damage.add(f"{self.path.name}: is not a bag of format 2.0")
@@ -74,7 +74,7 @@ class BagFile:
                 stream.seek(place)
 
     def connections(self) -> list[BagRecord]:
-        """The index's connections; empty without an index."""
+        """The index's connections, if any."""
         with self.path.open("rb") as stream:
             stream.readline(64)
             first = self._record(stream, stream.tell())
@@ -88,7 +88,7 @@ class BagFile:
             return found
 
     def _record(self, stream: BinaryIO, offset: int) -> BagRecord | None:
-        """Read a record, or None; the stream is left after it."""
+        """None if invalid; the stream is left after it."""
         head = self._head(stream)
         if head is None:
             return None
@@ -140,7 +140,7 @@ class BagFile:
 
 
 def fields_of(header: bytes) -> Fields | None:
-    """Parse a record header's named fields; None if its lengths do not fit."""
+    """A header's named fields; None if its lengths do not fit."""
     found: Fields = {}
     at = 0
     while at < len(header):
@@ -156,7 +156,7 @@ def fields_of(header: bytes) -> Fields | None:
 
 
 def number(fields: Fields, name: str) -> int:
-    """A field of four or eight bytes as a number; -1 if missing."""
+    """A field of 4 or 8 bytes as a number; -1 if missing."""
     value = fields.get(name, b"")
     return int.from_bytes(value, "little") if len(value) in {4, 8} else -1
 
@@ -202,11 +202,10 @@ class Bag1Log:
             self._connect(record.fields, record.body, Damage())
 
     def topics(self) -> tuple[Topic, ...]:
-        """Connections of the index, and those read."""
         return tuple(self._topics.values())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield messages in file order; skips a chunk that does not unpack, reads a cut one to its cut."""
+        """Yield in file order; skips bad chunks, reads a cut one to its cut."""
         budget, num_indexed, num_chunks = Budget(self._file.size), 0, None
         for record in self._file.records(damage):
             if record.kind == BAG_HEADER:
@@ -316,11 +315,10 @@ class Db3Log:
             self._database = self.path  # what is whole of it is read without its journal
 
     def topics(self) -> tuple[Topic, ...]:
-        """The topics table."""
         return tuple(self._topics.values())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield messages in written order; rows on damaged pages are skipped and counted."""
+        """Yield in written order; rows on damaged pages are skipped and counted."""
         if self._num_pages > 0:
             damage.remark(
                 f"{self.path.name}: was not closed; {self._num_pages} pages of {self._journal.name} were read"

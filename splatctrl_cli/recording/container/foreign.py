@@ -1,4 +1,4 @@
-"""Recordings of other tools that are not read: their marks, and how to export them."""
+"""Recordings of unsupported tools: their marks, and how to export them."""
 
 import zipfile
 from dataclasses import dataclass

@@ -27,7 +27,7 @@ from splatctrl_cli.recording.container.raw_log import Topic
 
 
 class MessageTypes:
-    """The message types of a FileDescriptorSet. Raises ValueError for other bytes."""
+    """A FileDescriptorSet's types. Raises ValueError for other bytes."""
 
     def __init__(self, descriptor_set: bytes) -> None:
         files = DescriptorDatabase()  # asked by the pool, so that a file may come before those that it imports
@@ -39,7 +39,7 @@ class MessageTypes:
         self._pool = DescriptorPool(files)
 
     def read(self, type_name: str, data: bytes) -> Any:
-        """Decode a message; unwritten fields have defaults. Raises ValueError."""
+        """Decode; unwritten fields have defaults. Raises ValueError."""
         try:
             return GetMessageClass(self._pool.FindMessageTypeByName(type_name)).FromString(data)
         except KeyError:
@@ -88,7 +88,7 @@ def stands_for(schema: str) -> str:
 
 
 def standing_in(topic: Topic) -> Topic:
-    """A topic with the type it stands for, if of foxglove_msgs or the SDK's texts."""
+    """The topic with its ROS type, if of foxglove_msgs or SDK texts."""
     texts = _TEXTS if topic.type_name == TEXT else {}
     said = next((kind for pattern, kind in texts.items() if re.fullmatch(pattern, topic.name)), "")
     ros_type = said or stands_for(topic.type_name)
@@ -106,7 +106,7 @@ def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> A
 
 
 def as_ros(schema: str, message: Any) -> Any:
-    """Convert a decoded Foxglove message to its ROS message."""
+    """Convert to its ROS message."""
     return _READERS[schema.replace("/", ".").rpartition(".")[2]](message)
 
 
@@ -116,14 +116,13 @@ def _types(definition: str) -> MessageTypes:
 
 
 def _object(value: Any) -> Any:
-    """JSON objects as objects with fields."""
     if isinstance(value, dict):
         return SimpleNamespace(**{key: _object(item) for key, item in value.items()})
     return [_object(item) for item in value] if isinstance(value, list) else value
 
 
 def _header(message: Any, frame_id: str | None = None) -> Any:
-    """A header; frame_id: for messages without that field."""
+    """frame_id: for messages without that field."""
     frame_id = str(getattr(message, "frame_id", "")) if frame_id is None else frame_id
     time = getattr(message, "timestamp", None)
     seconds = _either(time, "sec", "seconds")
@@ -132,7 +131,7 @@ def _header(message: Any, frame_id: str | None = None) -> Any:
 
 
 def _either(message: Any, *names: str) -> Any:
-    """The first present field; 0 if none, as JSON writers omit zeros."""
+    """The first present field; 0 if none, as JSON omits zeros."""
     return next((getattr(message, name) for name in names if hasattr(message, name)), 0)
 
 
@@ -189,7 +188,7 @@ def _transform(message: Any) -> Any:
 
 
 def _joint_states(message: Any) -> Any:
-    """Joint states without velocities: an unset one looks like zero."""
+    """No velocities: an unset one looks like zero."""
     return SimpleNamespace(
         header=_header(message),
         name=[str(joint.name) for joint in message.joints],

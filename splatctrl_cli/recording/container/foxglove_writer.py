@@ -27,10 +27,7 @@ REMEDY = "pip install 'splatctrl-cli[mcap]'"
 
 @contextmanager
 def foxglove_log(path: Path) -> Iterator["FoxgloveLog"]:
-    """Open a log for writing; it is complete and closed after the block.
-
-    Raises UsageError without its libraries.
-    """
+    """Open a log, complete and closed after the block. Raises UsageError without libraries."""
     try:
         register = import_module("mcap_protobuf.schema").register_schema
         import_module(f"{SCHEMAS}.PointCloud_pb2")
@@ -44,7 +41,7 @@ def foxglove_log(path: Path) -> Iterator["FoxgloveLog"]:
 
 
 class FoxgloveLog:
-    """Messages for an open MCAP, in time order, in the frame `WORLD`."""
+    """Messages for an open MCAP, in time order, in `WORLD`."""
 
     def __init__(self, writer: Writer, register: Any) -> None:
         self._writer = writer
@@ -54,11 +51,11 @@ class FoxgloveLog:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Number of messages by topic."""
+        """Messages by topic."""
         return self._counts
 
     def add_cloud(self, topic: str, stamp_ns: int, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Add a PointCloud: float32 or uint8 columns (N,), among them x, y, z [m]."""
+        """Add a PointCloud: float32 or uint8 (N,), among them x, y, z [m]."""
         kind = np.dtype([(name, column.dtype) for name, column in columns.items()])
         packed = np.zeros(len(columns["x"]), kind)
         for name, column in columns.items():
@@ -71,7 +68,7 @@ class FoxgloveLog:
     def add_voxels(
         self, topic: str, stamp_ns: int, name: str, values: NDArray[Any], origin: Float64, voxel: float
     ) -> None:
-        """Add a VoxelGrid (X, Y, Z), uint8 or float32; voxel (0, 0, 0) is centred at `origin` (3,) [m]."""
+        """Add (X, Y, Z), uint8 or float32; voxel (0, 0, 0) is centred at `origin` (3,) [m]."""
         columns, rows, _ = values.shape
         size = values.dtype.itemsize
         message = _new(
@@ -92,7 +89,7 @@ class FoxgloveLog:
         self._add(topic, stamp_ns, message)
 
     def add_transforms(self, topic: str, stamp_ns: int, poses: Mapping[str, Float64]) -> None:
-        """Add FrameTransforms: T_world_frame (4, 4) by frame."""
+        """Add T_world_frame (4, 4) by frame."""
         message = _new("FrameTransforms")
         for frame, T in poses.items():
             each = message.transforms.add(parent_frame_id=WORLD, child_frame_id=frame)
@@ -106,7 +103,7 @@ class FoxgloveLog:
     def add_mesh(
         self, topic: str, stamp_ns: int, frame: str, vertices: NDArray[np.floating], faces: NDArray[np.integer]
     ) -> None:
-        """Add a SceneUpdate: vertices (V, 3) [m] and faces (F, 3) that move with a frame."""
+        """Add a SceneUpdate: (V, 3) [m] and (F, 3) that move with a frame."""
         message = _new("SceneUpdate")
         entity = message.entities.add(id=frame, frame_id=frame, frame_locked=True)
         entity.timestamp.FromNanoseconds(stamp_ns)
@@ -123,7 +120,7 @@ class FoxgloveLog:
         self._add(topic, stamp_ns, _new("Log", level=LEVELS.index(level), message=text, name="splatctrl"))
 
     def add_numbers(self, topic: str, stamp_ns: int, values: Mapping[str, float | None]) -> None:
-        """Add numbers as a JSON object."""
+        """Add a JSON object."""
         if topic not in self._channels:
             schema = {"type": "object", "properties": {name: {"type": ["number", "null"]} for name in values}}
             made = self._writer.register_schema(f"splatctrl{topic}", "jsonschema", json.dumps(schema).encode())

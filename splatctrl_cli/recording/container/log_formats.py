@@ -37,7 +37,7 @@ _MOST_RATIO = 100  # of an unpacked file, on disk, to the compressed one
 
 
 def unpack(path: Path, target: Path) -> str:
-    """Unpack a .zstd file as far as possible; return the fault, or ""."""
+    """Unpack a .zstd as far as possible; return the fault, or ""."""
     left = FREE_BYTES + _MOST_RATIO * path.stat().st_size
     decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
     with path.open("rb") as source, target.open("wb") as written:
@@ -56,13 +56,13 @@ def unpack(path: Path, target: Path) -> str:
 
 
 class UnpackedMessagesLog(JoinedLog):
-    """A log whose messages are zstd frames."""
+    """A log of zstd messages."""
 
     def __init__(self, log: RawLog) -> None:
         super().__init__(log.path, (log,), log.container)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the unpacked messages; failures are counted."""
+        """Failures are counted."""
         budget = Budget(sum(file.stat().st_size for file in self.files))
         for message in super().messages(damage, names):
             try:
@@ -86,7 +86,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 
 @dataclass(frozen=True, kw_only=True)
 class Container:
-    """A log file format: suffix, first bytes, and opener."""
+    """A log format: suffix, first bytes, opener."""
 
     suffix: str
     magic: bytes
@@ -102,7 +102,7 @@ SUFFIXES = tuple(kind.suffix for kind in CONTAINERS)
 
 
 class SessionLog(JoinedLog):
-    """Logs recorded at once, such as cameras and joints, merged by log time."""
+    """Logs recorded at once, such as cameras and joints, by log time."""
 
     def __init__(self, parts: tuple[RawLog, ...]) -> None:
         path = parts[0].path.with_name("+".join(part.path.name for part in parts))
@@ -183,7 +183,7 @@ def _open_folder(path: Path) -> RawLog:
 
 
 def told_formats(path: Path) -> set[str]:
-    """Serialization formats in a bag folder's metadata.yaml; empty for others."""
+    """Serialization formats in a bag folder's metadata.yaml."""
     if not path.is_dir():
         return set()
     try:
@@ -217,7 +217,7 @@ def _open_compressed(path: Path) -> RawLog:
 
 
 def _ordered_files(path: Path, told: dict[str, Any]) -> list[Path]:
-    """Files in recording order: metadata.yaml's, else by numbers in names."""
+    """In recording order: metadata.yaml's, else by numbers in names."""
     names = told.get("relative_file_paths")
     if names:
         return [path / Path(name).name for name in dict.fromkeys(names)]

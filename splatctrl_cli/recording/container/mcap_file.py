@@ -34,7 +34,7 @@ _FOOTER_SIZE = HEAD.size + 20
 
 
 class Part(NamedTuple):
-    """A record; without content for attachments and unknown records."""
+    """A record; attachments and unknown ones have no content."""
 
     offset: int
     opcode: int
@@ -61,7 +61,7 @@ class McapFile:
             yield from walk.parts()
 
     def summary(self) -> list[Part]:
-        """Records of the summary section; empty without a readable one."""
+        """The summary section's records, if readable."""
         with self.path.open("rb") as stream:
             footer = _footer(stream, self.size)
             if footer is None or not len(MAGIC) <= footer.summary_start < self.size:
@@ -78,7 +78,7 @@ class McapFile:
         return found
 
     def chunk_indexes(self) -> list[ChunkIndex]:
-        """Chunks in the summary, in file order."""
+        """The summary's chunks in file order."""
         found = []
         for part in self.summary():
             try:
@@ -90,7 +90,7 @@ class McapFile:
         return sorted(found, key=lambda index: index.chunk_start_offset)
 
     def chunk_at(self, index: ChunkIndex) -> bytes:
-        """A chunk record's content, or what remains of it."""
+        """A chunk record's content, or the rest of it."""
         with self.path.open("rb") as stream:
             stream.seek(min(index.chunk_start_offset, self.size))
             opcode, length = HEAD.unpack((stream.read(HEAD.size) + bytes(HEAD.size))[: HEAD.size])
@@ -106,7 +106,7 @@ class _Walk:
         self._crc: int | None = 0 if has_crc else None  # of the data section so far; None once a part was skipped
 
     def parts(self) -> Iterator[Part]:
-        """Yield the records up to the footer, or the rest of the last one."""
+        """Yield records up to the footer, or the last one's rest."""
         if self._take(len(MAGIC)) != MAGIC:
             self._add("does not begin like an MCAP")
             return
@@ -139,7 +139,7 @@ class _Walk:
                 return
 
     def _part(self, offset: int, opcode: int, length: int, head: bytes) -> Part:
-        """Read a record, without content if too large or unknown."""
+        """Content is left out if too large or unknown."""
         self._count(head)
         if opcode == ATTACHMENT:
             self._check_attachment(offset, length)
@@ -183,7 +183,7 @@ class _Walk:
         return None
 
     def _chunks_in(self, block: bytes, base: int) -> Iterator[int]:
-        """Places in `block` (at `base` in the file) of chunks with consistent lengths."""
+        """Chunks in `block` (at `base`) with consistent lengths."""
         for name in _COMPRESSIONS:
             at = block.find(name)
             while at >= 0:
@@ -249,7 +249,7 @@ class _Walk:
             self._add("checksum of the summary differs")
 
     def _pass_over(self, length: int, crc: int = 0) -> int:
-        """Skip bytes; return their checksum, continued from `crc`."""
+        """Skip bytes; return their checksum, from `crc` on."""
         while length > 0 and (piece := self._take(min(length, PIECE))):
             crc = zlib.crc32(piece, crc)
             length -= len(piece)

@@ -40,7 +40,7 @@ MOST_HEADS = 100_000  # records that are visited: a second or so
 
 @dataclass(frozen=True, kw_only=True)
 class LogIndex:
-    """Messages by channel, log times [ns], chunks in file order; notes: gaps of the index."""
+    """Messages by channel, log times [ns], chunks in file order; notes: gaps."""
 
     counts: dict[int, int]
     first_ns: int
@@ -50,7 +50,7 @@ class LogIndex:
 
 
 def index_by_heads(file: McapFile) -> LogIndex:
-    """Index a file without a summary, up to the first damage or MOST_HEADS records."""
+    """Index without a summary, up to damage or MOST_HEADS records."""
     counts: dict[int, int] = {}
     chunks: list[ChunkIndex] = []
     stamps: list[int] = []
@@ -126,11 +126,10 @@ class McapLog:
                 self._declare(part.opcode, part.content, Damage())
 
     def topics(self) -> tuple[Topic, ...]:
-        """Channels of the summary, and those read."""
         return tuple(self._channels.values())
 
     def index(self) -> LogIndex:
-        """The file's index by its summary, else by the heads of its records."""
+        """The index by summary, else by the heads of records."""
         found = self._statistics
         if found is not None:
             chunks = tuple(self._file.chunk_indexes())
@@ -145,7 +144,7 @@ class McapLog:
         return index_by_heads(self._file)
 
     def topic_of(self, channel: int) -> Topic | None:
-        """The topic of a channel declared so far, or None."""
+        """A declared channel's topic, or None."""
         return self._channels.get(channel)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
@@ -169,14 +168,14 @@ class McapLog:
     def messages_of(
         self, chunks: Collection[ChunkIndex], damage: Damage, names: Collection[str] | None = None
     ) -> Iterator[RawMessage]:
-        """Yield the messages of these chunks only, anywhere in the file."""
+        """Yield these chunks' messages, anywhere in the file."""
         self._forget_changed()
         for index in chunks:
             content = self._file.chunk_at(index)
             yield from self._chunk_messages(content, index.chunk_start_offset, damage, names, is_cut=False)
 
     def _forget_changed(self) -> tuple[int, int]:
-        """The file's state; forgets its checksums if it changed."""
+        """The file's state; forgets checksums if it changed."""
         stat = self.path.stat()
         state = stat.st_size, stat.st_mtime_ns
         self._whole = self._whole if state == self._whole else None

@@ -27,7 +27,7 @@ class _Fields(ReadDataStream):  # type: ignore[misc]
     """A reader of fields within a record's bytes."""
 
     def read(self, length: int) -> bytes:
-        """Read `length` bytes. Raises EndOfFile at a record's end (the package returns fewer)."""
+        """Raises EndOfFile at a record's end, where the package returns fewer."""
         found: bytes = super().read(length)
         if len(found) < length:
             raise EndOfFile
@@ -42,7 +42,7 @@ class _Fields(ReadDataStream):  # type: ignore[misc]
 
 
 class Chunk(NamedTuple):
-    """A stored batch of records; shorter than `compressed_size` if the file is cut."""
+    """Stored records; shorter than `compressed_size` if cut."""
 
     message_start_time: int
     message_end_time: int
@@ -54,7 +54,6 @@ class Chunk(NamedTuple):
 
     @classmethod
     def read(cls, fields: _Fields) -> "Chunk":
-        """Parse a chunk, which may be cut."""
         numbers = (fields.read8(), fields.read8(), fields.read8(), fields.read4())
         compression, size = fields.read_prefixed_string(), fields.read8()
         return cls(*numbers, compression, size, fields.rest()[:size])
@@ -72,7 +71,7 @@ _KINDS: dict[int, Any] = {  # by opcode
 
 
 def parse_record(opcode: int, content: bytes) -> object:
-    """Parse a record, None for an opcode not in `_KINDS`. Raises BadRecordError."""
+    """A record, None if not in `_KINDS`. Raises BadRecordError."""
     if opcode not in _KINDS:
         return None
     try:

@@ -30,7 +30,7 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 
 @contextmanager
 def mcap_log(path: Path) -> Iterator["McapLog"]:
-    """Open a log for writing; it is complete and closed after the block."""
+    """Open a log, complete and closed after the block."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=4 << 20, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="splatctrl")
@@ -49,7 +49,7 @@ class McapLog:
         self._sequence: dict[str, int] = {}
 
     def add_joint_state(self, state: JointState, joint_names: Sequence[str]) -> None:
-        """Add a /joint_states message, without effort."""
+        """Effort is empty."""
         message = self._new(
             "sensor_msgs/msg/JointState",
             header=self._header(state.stamp_ns, ""),
@@ -61,7 +61,7 @@ class McapLog:
         self._add("/joint_states", message, state.stamp_ns)
 
     def add_transforms(self, stamp_ns: int, transforms: Sequence[Transform], *, is_static: bool) -> None:
-        """Add a /tf or /tf_static message."""
+        """Add /tf or /tf_static."""
         stamped = [
             self._new(
                 "geometry_msgs/msg/TransformStamped",
@@ -75,7 +75,7 @@ class McapLog:
         self._add("/tf_static" if is_static else "/tf", message, stamp_ns)
 
     def add_frame(self, frame: RgbdFrame) -> None:
-        """Add colour as JPEG, CameraInfo, depth and any mask, of one stamp and optical frame."""
+        """Add JPEG colour, CameraInfo, depth and any mask, in one optical frame."""
         header = self._header(frame.stamp_ns, f"{frame.camera}_optical_frame")
         jpeg = cv2.imencode(".jpg", frame.color[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
         color = self._new("sensor_msgs/msg/CompressedImage", header=header, format="jpeg", data=jpeg.reshape(-1))

@@ -1,4 +1,4 @@
-"""Recorded messages as bytes, in file order, for any container; damage is counted, not raised."""
+"""Recorded messages as bytes, in file order; damage is counted, not raised."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
@@ -53,7 +53,7 @@ class Damage:
     _num_unsaid: int = 0
 
     def add(self, note: str, num: int = 1) -> None:
-        """Count and note damaged parts; after MAX_NOTES a last note counts the rest."""
+        """Count and note damage; after MAX_NOTES a last note counts the rest."""
         self.count += num
         if len(self.notes) < MAX_NOTES:
             self.notes.append(note)
@@ -62,18 +62,18 @@ class Damage:
             self.notes[MAX_NOTES:] = [f"and {self._num_unsaid} more"]
 
     def remark(self, text: str) -> None:
-        """Count what is no damage; after MAX_NOTES remarks, new ones share one."""
+        """Count what is no damage; after MAX_NOTES, new remarks share one."""
         is_room = text in self.remarks or len(self.remarks) < MAX_NOTES
         self.remarks[text if is_room else "more of this kind"] += 1
 
     @property
     def all_notes(self) -> list[str]:
-        """Damage, then each remark with its count."""
+        """Damage, then remarks with counts."""
         return [*self.notes, *(text if num == 1 else f"{text} ({num} times)" for text, num in self.remarks.items())]
 
 
 class RawLog(Protocol):
-    """A log that can be read any number of times."""
+    """A log that can be read repeatedly."""
 
     @property
     def path(self) -> Path: ...
@@ -85,20 +85,20 @@ class RawLog(Protocol):
 
     @property
     def container(self) -> str:
-        """The file kind (``MCAP``, ``ROS 1 bag``, ``ROS 2 bag (sqlite3)``)."""
+        """``MCAP``, ``ROS 1 bag``, ``ROS 2 bag (sqlite3)``."""
         ...
 
     def topics(self) -> tuple[Topic, ...]:
-        """Topics in the index, even without messages; empty without an index."""
+        """Topics in the index, even without messages; none without an index."""
         ...
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of topics `names` (all, if None) in file order; losses go to `damage`."""
+        """Yield messages of `names` (None: all) in file order; losses go to `damage`."""
         ...
 
 
 class JoinedLog:
-    """Logs read one after the other; `note` tells a fault of the whole, counted as damage."""
+    """Logs read in turn; `note` is a fault of the whole, counted as damage."""
 
     def __init__(
         self, path: Path, parts: Sequence[RawLog], container: str, *, files: tuple[Path, ...] = (), note: str = ""
@@ -109,11 +109,9 @@ class JoinedLog:
         self._parts, self._note = parts, note
 
     def topics(self) -> tuple[Topic, ...]:
-        """The topics of all parts, each once."""
         return tuple(dict.fromkeys(topic for part in self._parts for topic in part.topics()))
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield each part's messages in turn."""
         if self._note:
             damage.add(self._note)
         for part in self._parts:

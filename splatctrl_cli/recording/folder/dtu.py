@@ -46,7 +46,7 @@ Shrink = Callable[[DtuView], DtuView]
 
 @dataclass(frozen=True, kw_only=True)
 class DtuScan:
-    """The views of a scan, their numbers, the files read, and names of views without_depth."""
+    """A scan's views, their numbers, files read, and names without_depth."""
 
     name: str
     views: tuple[DtuView, ...]
@@ -90,7 +90,7 @@ def read_dtu(
 
 
 def chosen_scan(root: Path, folders: Mapping[str, Path], scan: str | None) -> tuple[str, Path]:
-    """Return the scan of that name, or the only one, and its folder. Raises InputError with the choices."""
+    """The scan of that name, or the only one. Raises InputError with the choices."""
     if scan is None and len(folders) == 1:
         scan = next(iter(folders))
     if scan is None or scan not in folders:
@@ -175,7 +175,7 @@ def check_lengths(where: str, views: Sequence[DtuView]) -> None:
 
 
 def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
-    """Write views as one scan of a new DTU folder."""
+    """Write a new DTU folder of one scan."""
     cameras = root / "Cameras"
     rectified = root / "Rectified" / f"{scan}_train"
     depths = root / "Depths_raw" / scan
@@ -195,7 +195,7 @@ def write_png(path: Path, image: UInt8) -> None:
 
 
 def scan_folders(root: Path) -> dict[str, Path]:
-    """Return the image folders by scan. Raises InputError without Rectified."""
+    """Image folders by scan. Raises InputError without Rectified."""
     rectified = root / "Rectified"
     if not rectified.is_dir():
         raise InputError(
@@ -207,7 +207,7 @@ def scan_folders(root: Path) -> dict[str, Path]:
 
 
 def _images(folder: Path) -> dict[int, Path]:
-    """Images by view number, light 3 if there is a choice."""
+    """Images by view number, preferably light 3."""
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         match = re.fullmatch(r"rect_(\d+)_(\d+|max)(_r5000)?\.(png|jpg)", path.name)
@@ -221,7 +221,7 @@ def _images(folder: Path) -> dict[int, Path]:
 
 
 def read_image(path: Path) -> UInt8:
-    """Read RGB (H, W, 3), ignoring the orientation tag. Raises InputError if unreadable."""
+    """RGB (H, W, 3), ignoring the orientation tag. Raises InputError if unreadable."""
     image = decode_file(path.read_bytes(), color=True) if path.is_file() else None
     if image is None:
         raise InputError(f"{path}: not an image that can be read", remedy="copy the file anew")
@@ -229,7 +229,7 @@ def read_image(path: Path) -> UInt8:
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Bool:
-    """Return (H, W) True where bright in every channel; another size takes the nearest pixel."""
+    """(H, W) True where bright in every channel, by nearest pixels."""
     image = read_image(path)
     if image.shape[1::-1] != size:
         width, height = size
@@ -242,7 +242,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool:
 
 
 def _mask_file(folder: Path, number: int) -> Path:
-    """``007.png`` or the like in the folder (RegNeRF) or its ``mask`` (IDR)."""
+    """``007.png`` or the like in the folder (RegNeRF) or ``mask`` (IDR)."""
     for place in (folder, folder / "mask"):
         for path in sorted(place.glob("*.png")):
             if path.stem.isdecimal() and int(path.stem) == number:
@@ -325,7 +325,7 @@ def _depth_file(root: Path, scan: str, number: int) -> Path | None:
 
 
 def read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:
-    """Read depth (H, W) [m] for an image of `size` (width, height), 0 = none."""
+    """Depth (H, W) [m] for an image of `size` (width, height), 0 = none."""
     depth = read_pfm(path)
     depth = np.where(np.isfinite(depth) & (depth > 0), depth / np.float32(MILLIMETRES), np.float32(0))
     if visual.is_file():

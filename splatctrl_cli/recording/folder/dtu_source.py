@@ -1,4 +1,4 @@
-"""A DTU scan (MVSNet or IDR) as a record source of training and held-out views."""
+"""A DTU scan (MVSNet or IDR) as training and held-out records."""
 
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ HOLDOUT_CAMERA = "holdout"
 
 
 def view_numbers(words: Sequence[str]) -> list[int]:
-    """Parse view numbers, ``2`` and ``5``. Raises UsageError for others."""
+    """Parse ``2`` and ``5``. Raises UsageError for others."""
     bad = [word for word in words if not word.isdigit()]
     if bad:
         raise UsageError(f"--holdout: expected view numbers such as 2,5, got {bad[0]!r}")
@@ -87,7 +87,7 @@ class DtuSource:
         return any(bool((view.depth > 0).any()) for view in self._views.values())
 
     def mask(self, number: int) -> Bool | None:
-        """(H, W) True on the object; None if unknown."""
+        """(H, W) True on the object, or None."""
         return self._views[number].mask
 
     def records(self) -> Iterator[Record]:
@@ -144,7 +144,7 @@ def shrunk(view: DtuView, factor: int) -> DtuView:
 
 
 def _factor(view: DtuView, protocol: ScoreProtocol | None) -> int:
-    """The shrink factor to the protocol's published size; 1 if not whole."""
+    """Shrink factor to the protocol's published size; 1 if not whole."""
     if protocol is None or protocol.size is None:
         return 1
     width, height = protocol.size

@@ -1,4 +1,4 @@
-"""The TOML file that describes a folder of colour and depth images (docs/input.md)."""
+"""The TOML description of an image folder (docs/input.md)."""
 
 import tomllib
 from collections.abc import Callable, Collection, Mapping
@@ -18,7 +18,7 @@ DEPTH_ENCODINGS = ("uint16", "uint16-rotated3", "float32")
 
 @dataclass(frozen=True, kw_only=True)
 class CameraTable:
-    """``[camera]`` or ``[depth_camera]``; pixel_center: coordinate of the first pixel's centre (0 or 0.5)."""
+    """``[camera]`` or ``[depth_camera]``; pixel_center: the first pixel's coordinate (0 or 0.5)."""
 
     width: int
     height: int
@@ -34,7 +34,7 @@ class CameraTable:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Intrinsics with pixel (0, 0) centred at u = v = 0."""
+        """Pixel (0, 0) is centred at u = v = 0."""
         return Intrinsics(
             fx=self.fx,
             fy=self.fy,
@@ -59,7 +59,7 @@ class FramesTable:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthTable:
-    """``[depth]``: encoding, metres per count, and an invalid count next to 0 (-1: none)."""
+    """``[depth]``: encoding, metres per count, an invalid count next to 0 (-1: none)."""
 
     encoding: str = "uint16"
     scale: float = 1e-3
@@ -79,7 +79,7 @@ class PosesTable:
 
 @dataclass(frozen=True, kw_only=True)
 class StampsTable:
-    """``[stamps]``: rate [1/s] of frame numbers, or `names`: file names are seconds."""
+    """``[stamps]``: rate [1/s] of frame numbers; names: file names are seconds."""
 
     rate: float | None = None
     names: bool = False
@@ -192,7 +192,7 @@ def _refused(what: str) -> InputError:
 
 
 def read_description(path: Path, root: Path | None = None) -> Description:
-    """Parse a description. Raises InputError naming an unknown, missing or wrong key."""
+    """Raises InputError naming an unknown, missing or wrong key."""
     return _read(_content(path), path, root)
 
 
@@ -218,7 +218,7 @@ def read_table(
 
 
 def has_table(path: Path, name: str) -> bool:
-    """True if a TOML file has table [name]. Raises InputError if not TOML."""
+    """Raises InputError if not TOML."""
     return name in _content(path)
 
 

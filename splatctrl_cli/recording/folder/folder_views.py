@@ -1,4 +1,4 @@
-"""The views of an image folder's description: files, poses, stamps and lenses, matched by name."""
+"""The views of an image folder's description, matched by name."""
 
 import os
 import re
@@ -52,7 +52,7 @@ class View:
     valid: Path | None = None
 
     def in_unit(self, metres: float) -> "View":
-        """Scale pose and depth to metres per length."""
+        """Scale pose and depth to metres."""
         T = self.T_world_camera.copy()
         T[:3, 3] *= metres
         return replace(self, T_world_camera=T, depth_scale=self.depth_scale * metres)
@@ -72,7 +72,7 @@ def length_unit(median: float, apart: float) -> float:
 
 
 def views_of(description: Description, options: SourceOptions, loss: LossReport) -> list[View]:
-    """Return views by stamp; unpaired and unposed ones are counted in `loss`. Raises InputError without any."""
+    """Views by stamp; losses are counted in `loss`. Raises InputError without any."""
     listed = _present(description, loss) if description.listed else _listed(description, options, loss)
     names = [view.name for view in listed]
     held = _holdout(description, names, options)
@@ -145,7 +145,7 @@ def _present(description: Description, loss: LossReport) -> list[ListedView]:
 
 
 def find_files(root: Path, pattern: str) -> list[tuple[str, Path]]:
-    """Files sorted by the text of the pattern's `*`; without `*` one file, with empty text."""
+    """Files sorted by the text of `*`; without it one file, with empty text."""
     if "*" not in pattern:
         return [("", root / pattern)] if (root / pattern).is_file() else []
     expression = re.compile(".*".join(re.escape(part) for part in pattern.split("*")).replace(".*", "(.*)", 1))
@@ -204,7 +204,7 @@ def _listed(description: Description, options: SourceOptions, loss: LossReport) 
 
 
 def _masks(description: Description, names: list[str], loss: LossReport) -> dict[str, Path]:
-    """Masks by view name; missing ones are noted in `loss`."""
+    """Missing ones are noted in `loss`."""
     assert description.frames is not None
     pattern = description.frames.human_mask
     if not pattern:
@@ -250,7 +250,7 @@ def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float
 
 
 def _holdout(description: Description, names: list[str], options: SourceOptions) -> set[str]:
-    """Held-out names; an entry is a name, else a position."""
+    """An entry is a name, else a position."""
     entries = description.split.holdout if options.holdout is None else options.holdout
     held = set()
     for entry in entries:
@@ -267,7 +267,7 @@ def _holdout(description: Description, names: list[str], options: SourceOptions)
 
 
 def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
-    """The stamp by layout, file name or frame rate; else one second a frame."""
+    """The layout's, else by file name, frame rate, or one second a frame."""
     stamps = description.stamps
     if view.stamp_ns is not None:
         return view.stamp_ns

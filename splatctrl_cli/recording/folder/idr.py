@@ -35,7 +35,7 @@ PLAUSIBLE_RADIUS = (0.02, 20.0)  # [m] of the sphere around the object
 
 
 def idr_scans(root: Path) -> dict[str, Path]:
-    """Scan folders by name: `root` itself, or its children."""
+    """Scan folders by name: `root`, or its children."""
     folders = [root] if is_idr(root) else sorted(p for p in root.glob("*") if is_idr(p))
     return {path.name.removeprefix("dtu_"): path for path in folders}
 
@@ -104,7 +104,7 @@ def write_idr(root: Path, scan: str, views: Sequence[DtuView]) -> Path:
 
 
 def projection(view: DtuView) -> Float64:
-    """Projection (4, 4) of world points [mm] to pixels."""
+    """World points [mm] to pixels, (4, 4)."""
     k = view.intrinsics
     T_camera_world = invert_transform(view.T_world_camera)
     T_camera_world[:3, 3] *= MILLIMETRES
@@ -137,7 +137,7 @@ def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
 
 
 def _numbered(folder: Path, num: int) -> dict[int, Path]:
-    """Images by camera number: in order if there are `num`, else by name. Raises InputError for another name."""
+    """In order if there are `num` images, else by name. Raises InputError for another name."""
     paths = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
     if len(paths) == num:
         return dict(enumerate(paths))
@@ -155,7 +155,7 @@ def _numbered(folder: Path, num: int) -> dict[int, Path]:
 
 
 def _projections(path: Path) -> list[Float64]:
-    """World points [mm] to pixels, (3, 4) per camera."""
+    """World points [mm] to pixels, (3, 4) each."""
     try:
         arrays = read_arrays(path, most=1 << 24)  # bytes of cameras: 500 each
         num = sum(1 for name in arrays if re.fullmatch(r"world_mat_\d+", name))

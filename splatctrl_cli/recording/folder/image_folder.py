@@ -69,7 +69,7 @@ class ImageFolderSource(Recording):
 
     @property
     def has_depth(self) -> bool:
-        """True with depth; else every frame's is 0."""
+        """False if every depth is 0."""
         return any(view.depth is not None for view in self._views)
 
     def no_depth(self) -> InputError:
@@ -81,13 +81,13 @@ class ImageFolderSource(Recording):
 
     @property
     def has_clock(self) -> bool:
-        """True if the description times the images."""
+        """True if the description has stamps."""
         stamps = self._description.stamps
         return stamps.rate is not None or stamps.names
 
     @property
     def loss(self) -> LossReport:
-        """Unpaired and unposed images, and those `records` could not decode."""
+        """Unpaired, unposed and undecodable images."""
         loss = self._loss
         return replace(
             loss,
@@ -97,7 +97,7 @@ class ImageFolderSource(Recording):
         )
 
     def _in_metres(self) -> str:
-        """Convert lengths in millimetres or centimetres; return a note."""
+        """Convert millimetres or centimetres; return a note."""
         places = [view.T_world_camera[:3, 3] for view in self._views]
         apart = float(np.linalg.norm(np.ptp(places, axis=0)))  # the diagonal of their box, in the unit of the poses
         for view in self._views if apart > UNIT_BASELINE / max(UNITS) else ():
@@ -133,15 +133,14 @@ class ImageFolderSource(Recording):
             yield stored
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Yield stamp, camera and pose of every view."""
         return ((view.stamp_ns, view.camera, view.T_world_camera) for view in self._views)
 
     def count_views(self) -> dict[str, int]:
-        """Number of views by camera."""
+        """Views by camera."""
         return {name: sum(view.camera == name for view in self._views) for name in self.cameras}
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the description, the pose files and the images, by path below the root."""
+        """sha256 of description, pose files and images, by path below the root."""
         return dict(self._digests)
 
     @cached_property
@@ -193,7 +192,7 @@ class ImageFolderSource(Recording):
         )
 
     def _depth_file(self, view: View) -> bytes | None:
-        """The depth PNG, if its counts are the depth."""
+        """The PNG, if its counts are the depth."""
         table = self._description.depth
         if (
             view.depth is None
@@ -226,7 +225,7 @@ class ImageFolderSource(Recording):
         return self._lenses[table.name]
 
     def _valid(self, view: View, lens: Lens) -> Bool | None:
-        """Pixels the lens saw and the mask keeps; none if it is unreadable."""
+        """Pixels seen and kept by the mask; none if it is unreadable."""
         seen = None if lens.undistortion is None else lens.undistortion.valid
         if view.valid is None:
             return seen
@@ -243,7 +242,7 @@ class ImageFolderSource(Recording):
         return lens.labels(human_mask(pixels, lens.intrinsics, str(path)))
 
     def _depth(self, view: View, lens: Lens) -> Float32 | None:
-        """Depth (H, W) [m] at colour's pixels, 0 = no return; None if unreadable."""
+        """(H, W) [m] at colour's pixels, 0 = no return; None if unreadable."""
         if view.depth is None:
             return np.zeros((view.lens.height, view.lens.width), np.float32)
         depth = self._recorded_depth(view.depth, view.depth_scale)
@@ -311,7 +310,6 @@ def _check_size(path: ImageFile, pixels: NDArray[Any], camera: CameraTable) -> N
 
 
 def open_image_folder(path: Path, options: SourceOptions) -> ImageFolderSource:
-    """Open the records of a TOML description."""
     rig = {part.camera.name: part for part in read_rig(path, options.root) if part.camera is not None}
     if not rig:
         options.refuse(("intrinsics",), "a folder whose description has [camera]", path)

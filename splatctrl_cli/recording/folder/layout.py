@@ -1,4 +1,4 @@
-"""Shared parts of dataset layouts: lenses by name, image sizes, numbers in names, descriptions."""
+"""Shared parts of dataset layouts: lenses, image sizes, numbers, descriptions."""
 
 import json
 import re
@@ -50,7 +50,7 @@ class Layout:
 
 
 def marked(*alternatives: str) -> Callable[[Path], bool]:
-    """Return a folder test: it has every name of one alternative; a trailing / means a folder."""
+    """A folder test: every name of one alternative; a trailing / means a folder."""
 
     def has(folder: Path, mark: str) -> bool:
         return any(path.is_dir() if mark.endswith("/") else path.is_file() for path in folder.glob(mark))
@@ -59,7 +59,7 @@ def marked(*alternatives: str) -> Callable[[Path], bool]:
 
 
 def by_description(name: str, *examples: str) -> Callable[[Path, SourceOptions], Description]:
-    """Return a reader that asks for a description, like one of the examples."""
+    """A reader that asks for a description, like one of the examples."""
 
     def refuse(folder: Path, _: SourceOptions) -> Description:
         raise InputError(
@@ -81,7 +81,7 @@ class Lenses:
         return len(self._tables)
 
     def named(self, table: CameraTable, where: str) -> CameraTable:
-        """Return the camera of a lens, new or known. Raises as `check_camera`."""
+        """A lens's camera, new or known. Raises as `check_camera`."""
         for known in self._tables:
             if asdict(replace(known, name=table.name)) == asdict(table):
                 return known
@@ -119,7 +119,7 @@ def paired_by_name(
     pose: Callable[[Key], Float64 | None],
     name: Callable[[Key], str] = str,
 ) -> Pairs:
-    """Pair files with equal keys, named and posed by key."""
+    """Pair equal keys, named and posed by key."""
     views = [
         ListedView(name=name(key), color=color, depth=depths[key], matrix=pose(key))
         for key, color in colors.items()
@@ -135,7 +135,7 @@ def paired_by_stamp(
     pose_at: Callable[[int], Float64 | None],
     options: SourceOptions,
 ) -> Pairs:
-    """Pair files by stamp [ns] within the tolerance, posed at the colour's."""
+    """Pair stamps [ns] within the tolerance, posed at the colour's."""
     tolerance_ns = round(options.pairing_tolerance_s * 1e9)
     pairs = paired([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns).tolist()
     views = [
@@ -193,20 +193,20 @@ def described(
 
 
 def given_lens(options: SourceOptions, image: ImageFile) -> CameraTable | None:
-    """The lens of --intrinsics for ``camera``, in the size of `image`; None without one."""
+    """--intrinsics for ``camera``, in the size of `image`, or None."""
     values = options.intrinsics.get(CAMERA)
     return None if values is None else pinhole(values[:4], image, values[4:])
 
 
 def pinhole(values: Sequence[float], image: ImageFile, distortion: Sequence[float] = ()) -> CameraTable:
-    """A lens of fx, fy, cx, cy [px] and an image's size."""
+    """fx, fy, cx, cy [px] and an image's size."""
     width, height = image_size(image)
     fx, fy, cx, cy = values
     return CameraTable(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=list(distortion))
 
 
 def read_K(path: Path) -> tuple[float, float, float, float]:
-    """Read fx, fy, cx, cy from a text file with a 3x3 matrix."""
+    """fx, fy, cx, cy of a text file's 3x3 matrix."""
     values = read_numbers(path)
     if len(values) != 9:
         raise InputError(
@@ -217,14 +217,14 @@ def read_K(path: Path) -> tuple[float, float, float, float]:
 
 
 def own_depth_camera(color: CameraTable, depth: CameraTable, T_color_depth: Float64) -> CameraTable | None:
-    """The depth camera posed in the colour camera; None if they are one."""
+    """The depth camera posed in the colour camera; None if one."""
     if depth == color and np.abs(T_color_depth - np.eye(4)).max() <= 1e-6:
         return None
     return replace(depth, depth_to_color=T_color_depth.tolist())
 
 
 def image_size(path: ImageFile) -> tuple[int, int]:
-    """Columns and rows of an image file. Raises InputError if it is none."""
+    """Columns and rows. Raises InputError if it is no image."""
     if isinstance(path, ImagePart):
         return path.size
     try:
@@ -240,28 +240,28 @@ def image_size(path: ImageFile) -> tuple[int, int]:
 
 
 def images_of(folder: Path) -> dict[str, Path]:
-    """Image files by stem, sorted by numbers."""
+    """Images by stem, sorted by numbers."""
     files = [p for p in folder.iterdir() if p.suffix.lower() in _IMAGES]
     return {path.stem: path for path in sorted(files, key=lambda p: by_numbers(p.stem))}
 
 
 def by_numbers(name: str) -> tuple[list[int], str]:
-    """A key that sorts names by their numbers (2 before 10)."""
+    """A key that sorts 2 before 10."""
     return [int(number) for number in re.findall(r"\d+", name)], name
 
 
 def pose_or_none(matrix: Float64) -> Float64 | None:
-    """The matrix, or None if not finite: how trackers write a loss."""
+    """None if not finite: how trackers write a loss."""
     return matrix if np.isfinite(matrix).all() else None
 
 
 def read_pose(path: Path) -> Float64 | None:
-    """Read a pose file (4, 4); None without a file or when tracking was lost."""
+    """A pose (4, 4); None without a file or tracking."""
     return pose_or_none(read_matrix_file(path)) if path.is_file() else None
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file. Raises InputError if unreadable."""
+    """Raises InputError if unreadable."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:

@@ -56,7 +56,7 @@ TRAJECTORY = "lowres_wide.traj"
 
 
 def read_arkit(folder: Path, options: SourceOptions) -> Description:
-    """Describe the folder; lenses that differ become separate cameras."""
+    """Lenses that differ become separate cameras."""
     options.refuse(("intrinsics",), "a video of ARKitScenes", folder)
     root = _frames(folder)
     assert root is not None
@@ -139,7 +139,7 @@ COLOR_FOLDERS = ("rgb", "gray")
 
 
 def read_bop(folder: Path, options: SourceOptions) -> Description:
-    """Describe the scene; without cam_R_w2c it has no poses."""
+    """No poses without cam_R_w2c."""
     options.refuse(("intrinsics",), "a BOP scene", folder)
     views: list[ListedView] = []
     num_colors = num_depths = 0
@@ -165,7 +165,7 @@ def read_bop(folder: Path, options: SourceOptions) -> Description:
 
 
 def _sensors(folder: Path) -> list[str]:
-    """Suffixes of the sensors' files, such as ``_cam1``; one sensor's is empty."""
+    """File suffixes, such as ``_cam1``; one sensor's is empty."""
     stem = Path(FILE).stem
     found = sorted(path.stem.removeprefix(stem) for path in folder.glob(f"{stem}*.json"))
     return [sensor for sensor in found if (folder / f"depth{sensor}").is_dir()]
@@ -222,7 +222,7 @@ _ESTIMATED = ("est", "mvsnet")  # in the names of folders with a network's depth
 
 
 def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
-    """Describe the folder, a lens per K; --depth-scale is metres per length of cameras and depth."""
+    """A lens per K; --depth-scale is metres per length of cameras and depth."""
     options.refuse(("intrinsics",), "an MVSNet scene", folder)
     files = {path.name.removesuffix("_cam.txt"): path for path in sorted(folder.glob(_CAMERAS))}
     cameras = {stem: read_camera_file(path) for stem, path in files.items()}
@@ -261,7 +261,7 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
 
 
 def _images(folder: Path, stems: set[str]) -> dict[str, Path]:
-    """Images from the folder with most of them."""
+    """Images of the folder with most of them."""
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and "depth" not in path.name.lower()]
     found = [{stem: path for stem, path in images_of(place).items() if stem in stems} for place in (*inner, folder)]
     most = max(found, key=len)

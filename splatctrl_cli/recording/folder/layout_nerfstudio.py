@@ -34,7 +34,7 @@ _SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
 
 
 def read(folder: Path, options: SourceOptions) -> Description:
-    """Describe the folder; depth is in millimetres by default."""
+    """Depth is in millimetres by default."""
     options.refuse(("intrinsics",), "a folder with transforms.json", folder)
     file = next(name for name in FILES if (folder / name).is_file())
     poses = PosesTable(format="nerfstudio", file=file, axes="opengl")
@@ -42,7 +42,7 @@ def read(folder: Path, options: SourceOptions) -> Description:
 
 
 def with_transforms(description: Description) -> Description:
-    """Fill a description's missing camera and views from its transforms.json."""
+    """Fill missing camera and views from transforms.json."""
     table = description.poses
     is_whole = bool(description.listed or (description.camera and description.frames))
     if is_whole or table is None or table.format != "nerfstudio":
@@ -82,7 +82,7 @@ def _view(
     description: Description,
     matrices: dict[str, Float64],
 ) -> ListedView:
-    """A frame's view; its values override the file's."""
+    """A frame's values override the file's."""
     name, said = str(entry["file_path"]), {**content, **entry}
     color = _image(path.parent / _with_slashes(name))
     depth, scale = _only(entry, _DEPTHS, path), _only(said, _SCALES, path)
@@ -106,7 +106,7 @@ def _view(
 
 
 def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
-    """The value of any key, or None. Raises InputError if two differ."""
+    """None without any. Raises InputError if two differ."""
     found = {key: said[key] for key in keys if said.get(key) not in (None, "")}
     if len(set(found.values())) > 1:
         both = " and ".join(f"{key} = {value}" for key, value in found.items())
@@ -119,7 +119,7 @@ def _with_slashes(name: str) -> str:
 
 
 def _image(path: Path) -> Path:
-    """An image whose name may omit `.png` or `.jpg`, as in Blender's scenes."""
+    """The name may omit `.png` or `.jpg`, as in Blender's scenes."""
     if path.suffix:
         return path
     return next((file for end in (".png", ".jpg") if (file := path.with_name(path.name + end)).is_file()), path)

@@ -53,12 +53,12 @@ class Cloud:
     T_world_camera: Float64
 
     def in_camera(self, *, is_world: bool) -> Float64:
-        """Points (H, W, 3) in the camera's frame; is_world: the file's are in the world."""
+        """Points (H, W, 3) in the camera; is_world: the file's are in world."""
         return transform_points(invert_transform(self.T_world_camera), self.points) if is_world else self.points
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Read an organised coloured cloud. Raises InputError for another file."""
+    """Raises InputError if not organised or without colour."""
     said = _head(path)
     size = (said.height, said.width)
     try:
@@ -92,7 +92,7 @@ def pinhole_of(points: Float64) -> Intrinsics | None:
 
 
 def residual(points: Float64, camera: Intrinsics | None) -> float:
-    """The 95th percentile [px] of points (H, W, 3) from their pixels; inf without a camera."""
+    """95th percentile [px] of points (H, W, 3) from their pixels; inf without a camera."""
     valid = _is_seen(points)
     if camera is None or not valid.any():
         return float("inf")
@@ -101,7 +101,7 @@ def residual(points: Float64, camera: Intrinsics | None) -> float:
 
 
 def read(path: Path, options: SourceOptions) -> Description:
-    """Describe a cloud or a folder of them; --depth-scale is metres per length of points and VIEWPOINT."""
+    """Describe clouds; --depth-scale is metres per length of points and VIEWPOINT."""
     files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"), key=lambda p: by_numbers(p.stem))
     heads, unit = [_head(file) for file in files], options.depth_scale or 1.0
     k, is_world, notes = _fitted(files[0], options)
@@ -144,7 +144,7 @@ def read(path: Path, options: SourceOptions) -> Description:
 
 
 def _fitted(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[str]]:
-    """The camera, is_world of the points, and notes."""
+    """Camera, is_world of the points, and notes."""
     cloud, given = read_cloud(path), options.intrinsics.get(CAMERA)
     fits = []
     for is_world in (False, True):
@@ -176,7 +176,7 @@ def _library() -> Any:
 
 
 def _head(path: Path) -> Any:
-    """Raises InputError for a cloud not organised or without colour."""
+    """Raises InputError if not organised or without colour."""
     lines: list[str] = []
     try:
         with path.open("rb") as stream:
@@ -211,7 +211,7 @@ def _unreadable(path: Path, error: Exception) -> InputError:
 
 
 def _viewpoint(said: Any) -> Float64:
-    """T_world_camera (4, 4) of x, y, z, qw, qx, qy, qz."""
+    """(4, 4) of x, y, z, qw, qx, qy, qz."""
     x, y, z, qw, qx, qy, qz = said.viewpoint
     return transform_from((x, y, z), (qx, qy, qz, qw))
 

@@ -101,7 +101,7 @@ def read_frames(folder: Path, options: SourceOptions) -> Description:
 
 
 def _files(folder: Path, pattern: str, kind: str) -> dict[str, Path]:
-    """Files by path up to `kind`, sorted by numbers."""
+    """Paths up to `kind`, sorted by numbers."""
     paths = sorted(folder.glob(pattern), key=lambda p: by_numbers(p.relative_to(folder).as_posix()))
     return {path.relative_to(folder).as_posix().partition(kind)[0]: path for path in paths}
 
@@ -159,7 +159,7 @@ def read_redwood(folder: Path, options: SourceOptions) -> Description:
 
 
 def _pairs(colors: list[str], depths: list[str]) -> list[tuple[str, str]]:
-    """Pair equal names; else equal numbers of files in order; else equal first numbers."""
+    """Pair equal names; else all in order; else equal first numbers."""
     same = [(name, name) for name in colors if name in depths]
     if same:
         return same

@@ -101,7 +101,7 @@ _BONN_NOTE = (
 
 
 def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
-    """Describe the folder: pairs within the pairing tolerance, poses interpolated."""
+    """Pairs within the tolerance, poses interpolated."""
     colors, depths = listed(folder / "rgb.txt"), listed(folder / "depth.txt")
     series = _series(folder)
     file = folder / "groundtruth.txt"
@@ -122,7 +122,7 @@ def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
 
 
 def listed(path: Path) -> list[tuple[int, Path]]:
-    """Read stamp [ns] and file of each line ``stamp path``."""
+    """Stamp [ns] and file of lines ``stamp path``."""
     found = []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         words = line.split()
@@ -182,7 +182,7 @@ ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
 
 
 def read_sun3d(folder: Path, options: SourceOptions) -> Description:
-    """Describe the folder: images within the pairing tolerance of a depth image."""
+    """Images within the tolerance of a depth image."""
     colors, depths = _by_stamp(folder / "image"), _by_stamp(folder / "depth")
     extrinsics = sorted((folder / "extrinsics").glob("*.txt"))
     poses = _poses(extrinsics[-1]) if extrinsics else []

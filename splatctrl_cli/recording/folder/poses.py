@@ -1,4 +1,4 @@
-"""Camera poses from text and JSON files, as T_world_camera of optical cameras (z forward)."""
+"""Camera poses from text and JSON, as T_world_camera of optical cameras (z forward)."""
 
 import json
 import re
@@ -28,7 +28,7 @@ _CORRECT = "correct the file, or [poses] where a .toml names it"
 
 
 def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Float64:
-    """T_world_camera (4, 4), optical, of a matrix as written. Raises InputError if not rigid."""
+    """T_world_camera (4, 4), optical, of a file's matrix. Raises InputError if not rigid."""
     T = rigid(matrix, where)
     if convention == "world_to_camera":
         T = invert_transform(T)
@@ -55,7 +55,7 @@ def rigid(matrix: Float64, where: str) -> Float64:
 
 
 def read_matrix_blocks(path: Path, heading: str) -> dict[str, Float64]:
-    """Read 4x4 blocks under ``# heading ... NUMBER`` lines, by number; skips other headings."""
+    """4x4 blocks under ``# heading ... NUMBER`` lines, by number."""
     poses: dict[str, Float64] = {}
     lines = _lines(path)
     for index, line in enumerate(lines):
@@ -66,7 +66,7 @@ def read_matrix_blocks(path: Path, heading: str) -> dict[str, Float64]:
 
 
 def read_trajectory_log(path: Path) -> dict[str, Float64]:
-    """Read Open3D's .log: three numbers, first the frame's, then a 4x4 matrix."""
+    """Open3D's .log: three numbers, first the frame's, then a 4x4 matrix."""
     poses: dict[str, Float64] = {}
     lines = [line for line in _lines(path) if line]
     for index in range(0, len(lines), 5):
@@ -95,7 +95,7 @@ def tum_rows(path: Path) -> dict[str, Float64 | None]:
 
 
 def read_matrix_lines(path: Path) -> dict[str, Float64]:
-    """Read a 4x4 or 3x4 (KITTI) matrix per line, by line number from 0."""
+    """A 4x4 or 3x4 (KITTI) matrix per line, by number from 0."""
     poses: dict[str, Float64] = {}
     for where, _, values in read_rows(path):
         if len(values) not in {12, 16}:
@@ -107,7 +107,7 @@ def read_matrix_lines(path: Path) -> dict[str, Float64]:
 
 
 def read_rows(path: Path) -> Iterator[tuple[str, list[str], list[float]]]:
-    """Yield place, words and numbers of each line but empty ones and comments."""
+    """Yield place, words and numbers of lines but empty ones and comments."""
     for index, line in enumerate(_lines(path)):
         if line and not line.startswith("#"):
             words, where = line.split(), f"{path}:{index + 1}"
@@ -115,7 +115,7 @@ def read_rows(path: Path) -> Iterator[tuple[str, list[str], list[float]]]:
 
 
 def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
-    """Read a transforms.json whole, and its matrices by file_path."""
+    """A transforms.json, and its matrices by file_path."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         matrices = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=np.float64) for f in content["frames"]}
@@ -128,17 +128,17 @@ def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
 
 
 def read_matrix_file(path: Path) -> Float64:
-    """Read a 4x4 matrix alone in a text file."""
+    """A text file's only 4x4 matrix."""
     return _matrix([line for line in _lines(path) if line and not line.startswith("#")][:4], str(path))
 
 
 def read_numbers(path: Path) -> list[float]:
-    """All numbers of a text file, in order."""
+    """All numbers in order."""
     return [value for line in _lines(path) if not line.startswith("#") for value in _numbers(line.split(), str(path))]
 
 
 class Trajectory:
-    """A camera's poses by stamp [s, as text], interpolated like tf, never across a None."""
+    """A camera's poses by stamp [s, as text], interpolated like tf, never across None."""
 
     def __init__(self, poses: Mapping[str, Float64 | None]) -> None:
         self._tree = TfTree()
@@ -165,7 +165,7 @@ class Trajectory:
 
 
 def stamp_of_text(text: str, unit_ns: int = 1_000_000_000) -> int | None:
-    """Nanoseconds of a time in units of `unit_ns`, without float rounding; None if not a time."""
+    """Nanoseconds of a text in `unit_ns`, without float rounding; None if no time."""
     try:
         stamp_ns = Decimal(text) * unit_ns
         return round(stamp_ns) if abs(stamp_ns) < _MOST_NS else None  # rounding 1e999 writes out its digits

@@ -116,7 +116,7 @@ def _camera(
 
 
 def _family(name: str) -> tuple[str, ...]:
-    """Topic parts shared by raw, rectified and compressed images of a sensor."""
+    """Topic parts shared by a sensor's raw, rectified and compressed images."""
     parts = _parts(name)
     return (*parts[:-1], re.sub("_?(rect|raw)", "", parts[-1]))
 
@@ -143,7 +143,7 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
 
 
 def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info: str) -> bool:
-    """True if depth pixels lie on colour pixels: equal size, frame (or a name says so), K and distortion."""
+    """True if depth is on colour pixels: equal size, frame (or by name), K and distortion."""
     color_image, depth_image = survey.topics[color].image, survey.topics[depth].image
     if (color_image.width, color_image.height) != (depth_image.width, depth_image.height):
         return False
@@ -161,7 +161,7 @@ def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info:
 
 
 def _same_distortion(one: Calibration, two: Calibration) -> bool:
-    """Compare two lenses; missing coefficients are 0."""
+    """Missing coefficients are 0."""
     bent = [is_distorted(c.distortion_model, c.distortion) for c in (one, two)]
     if not all(bent):
         return not any(bent)
@@ -170,7 +170,7 @@ def _same_distortion(one: Calibration, two: Calibration) -> bool:
 
 
 def frame_of(survey: Survey, color: str, depth: str) -> str:
-    """Return the frame of colour images; a video file has its aligned depth's."""
+    """Colour's frame; a video file has its aligned depth's."""
     return survey.topics[depth if _is_of_file(survey.topics[color]) else color].image.frame_id
 
 
@@ -179,7 +179,7 @@ def _is_of_file(topic: TopicSurvey) -> bool:
 
 
 def common_prefix(name: str, other: str) -> tuple[str, ...]:
-    """Return the leading path parts that two topics share, without their last parts."""
+    """Leading path parts two topics share, without their last."""
     pairs = zip(_parts(name)[:-1], _parts(other)[:-1], strict=False)
     return tuple(a for a, _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
@@ -224,7 +224,7 @@ def _folder_name(name: str) -> str:
 
 
 def no_camera(log: RawLog, survey: Survey) -> InputError:
-    """Return the error for a log without matching colour and depth."""
+    """The error for a log without matching colour and depth."""
     colors = [t.topic.name for t in image_topics(survey, "color")]
     depths = [t.topic.name for t in image_topics(survey, "depth")]
     broken = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
@@ -304,7 +304,7 @@ def _unread_video(what: str, *, has_depth: bool) -> InputError:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return up to eight names, then how many more."""
+    """Up to eight names, then how many more."""
     shown = ", ".join(names[:8]) or "none"
     return f"{shown} and {len(names) - 8} more" if len(names) > 8 else shown
 

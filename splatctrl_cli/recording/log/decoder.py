@@ -54,28 +54,28 @@ class UndecodableMessageError(ValueError):
 
 
 class UnreadFormError(UndecodableMessageError):
-    """A message of an unsupported or refused form; its bytes may be whole."""
+    """A message of an unread or refused form, perhaps whole."""
 
 
 def is_ros(topic: Topic) -> bool:
-    """True for ROS encodings, and messages that stand for ROS ones."""
+    """True for ROS encodings, or messages that stand for ROS."""
     return topic.encoding in {"cdr", "ros1", VIDEO} or is_foxglove(topic)
 
 
 def is_foxglove(topic: Topic) -> bool:
-    """True for protobuf or JSON messages that stand for ROS ones."""
+    """True for protobuf or JSON that stands for ROS."""
     return topic.schema != "" and topic.encoding in {"protobuf", "json"}
 
 
 class MessageDecoder:
-    """A decoder with a type store per definition, so that a bad one spoils no other topic."""
+    """A decoder with a store per definition: a bad one spoils no other topic."""
 
     def __init__(self) -> None:
         self._stores: dict[Topic, Any] = {}
         self._refused: dict[Topic, str] = {}
 
     def decode(self, message: RawMessage) -> Any:
-        """Decode a message to an object with its fields. Raises UndecodableMessageError."""
+        """Decode to an object with fields. Raises UndecodableMessageError."""
         topic = message.topic
         if topic.encoding == VIDEO:
             return _unpack_image(message.data)
@@ -125,7 +125,7 @@ def header_stamp_ns(message: RawMessage) -> int:
 
 
 def pack_image(header: Any, pixels: NDArray[np.uint8]) -> bytes:
-    """Pack a video image (H, W, 3) RGB as a message, its stamp at CDR's place."""
+    """Pack a video image (H, W, 3) RGB, its stamp at CDR's place."""
     frame, (height, width) = header.frame_id.strip("/").encode(), pixels.shape[:2]
     head = _IMAGE_HEAD.pack(b"\0\1\0\0", header.stamp.sec, header.stamp.nanosec, height, width, len(frame))
     return bytes(head + frame + pixels.tobytes())
@@ -188,7 +188,7 @@ def _names(description: Any) -> list[str]:
 
 
 def _check_fields(store: Any) -> None:
-    """Raise ValueError for a missing standard field; case, lengths and extra fields are free."""
+    """Raise ValueError for a missing standard field; case, lengths and extras are free."""
     standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
     for name in sorted(_KNOWN & store.fielddefs.keys()):
         there = {key.lower(): _kind(description) for key, description in store.fielddefs[name][1]}
@@ -222,14 +222,14 @@ _DEPTH_UNITS = re.compile(r"(/device_\d+/sensor_\d+)/option/Depth[ _]Units/value
 
 @dataclass(kw_only=True)
 class RealSense:
-    """Extrinsics by stream and group, depth units by sensor, and image units in bag order."""
+    """Extrinsics by stream and group, depth units by sensor, image units in order."""
 
     extrinsics: dict[str, dict[str, Float64]] = field(default_factory=dict)
     depth_units: dict[str, float] = field(default_factory=dict)
     image_units: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, topic: str, message: Any) -> None:
-        """Take a Transform or an option; ignore other topics. Raises ValueError for invalid values."""
+        """Take a Transform or option; ignore others. Raises ValueError if invalid."""
         extrinsics, units = _EXTRINSICS.fullmatch(topic), _DEPTH_UNITS.fullmatch(topic)
         if extrinsics:
             t, r = message.translation, message.rotation
@@ -244,7 +244,7 @@ class RealSense:
             self._say(topic, message.data)
 
     def add_image(self, message: RawMessage) -> None:
-        """Take an image's depth unit, if any. Raises ValueError for an invalid one."""
+        """Take an image's depth unit, if any. Raises ValueError if invalid."""
         if has_unit(message) and (value := struct.unpack("<f", message.data[-4:])[0]):
             self._say(message.topic.name, value)
 
@@ -254,13 +254,13 @@ class RealSense:
             units.append(unit)
 
     def T_between(self, to_topic: str, from_topic: str) -> Float64 | None:
-        """T_to_from (4, 4) between two image topics' streams; None without a common group."""
+        """(4, 4) between image topics' streams; None without a common group."""
         to_all, from_all = (self.extrinsics.get(_stream(topic), {}) for topic in (to_topic, from_topic))
         group = next((group for group in to_all if group in from_all), None)
         return None if group is None else to_all[group] @ invert_transform(from_all[group])
 
     def depth_unit(self, topic: str) -> float | None:
-        """Metres per count of a depth topic, None if unknown. Raises InputError if it changes."""
+        """Metres per count, None if unknown. Raises InputError if it changes."""
         said = self.image_units.get(_stream(topic), [])
         if len(said) > 1:
             raise InputError(
@@ -271,14 +271,14 @@ class RealSense:
 
 
 def has_unit(message: RawMessage) -> bool:
-    """True if a depth unit follows the SDK's image message."""
+    """True if a depth unit follows an SDK image."""
     topic = message.topic
     is_image = topic.encoding == "ros1" and topic.type_name == "sensor_msgs/msg/Image"
     return is_image and message.data[_AT : _AT + len(_FRAME_1)] == _FRAME_1 and device_of(topic.name) != ""
 
 
 def device_of(topic: str) -> str:
-    """The device of an SDK topic, "" for others."""
+    """An SDK topic's device, or ""."""
     match = _STREAM.match(topic)
     return match[1] if match else ""
 

@@ -20,7 +20,7 @@ NO_MASK = -1
 
 @dataclass(frozen=True, kw_only=True)
 class Planned:
-    """A planned frame: message numbers in the colour, depth and mask topics (None: no mask), and the pose."""
+    """A planned frame: message numbers by topic (human_index None: no mask), and the pose."""
 
     stamp_ns: int
     camera: Camera
@@ -38,7 +38,7 @@ class Planned:
 
 
 class FramePlan:
-    """A log's frames by stamp, then camera, then colour image number."""
+    """Frames by stamp, then camera, then colour number."""
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         self._cameras = tuple(sorted(cameras, key=lambda camera: camera.name))
@@ -71,7 +71,7 @@ class FramePlan:
         masks: Mapping[int, int],
         poses: Iterable[Float64 | None],
     ) -> int:
-        """Add a camera's frames (K,) with known poses (4, 4), masks by colour number; return their number."""
+        """Add frames (K,) with known poses (4, 4), masks by colour number; return their number."""
         first = len(self._poses)
         is_known = np.fromiter(map(self._keep, poses), np.bool_, len(stamp_ns))
         number = self._cameras.index(camera)
@@ -89,7 +89,7 @@ class FramePlan:
         return T is not None
 
     def uses(self) -> dict[str, Index]:
-        """The number of frames that need each image, by topic and number."""
+        """Number of frames that need each image."""
         found: dict[str, list[Index]] = {}
         for number, camera in enumerate(self._cameras):
             of_camera = self._columns[:, self._columns[1] == number]
@@ -105,7 +105,7 @@ Key = tuple[str, int]  # topic, number of the message within it
 
 
 class HeldMessages:
-    """Waiting messages; half of a log that stores topics apart."""
+    """Waiting messages, half of a log that stores topics apart."""
 
     def __init__(self) -> None:
         self._messages: dict[Key, RawMessage] = {}

@@ -46,5 +46,5 @@ def word_of(parts: tuple[str, ...], *, is_device: bool = True) -> str:
 
 
 def is_other(word: str) -> bool:
-    """True if 16-bit images with this word are not depth."""
+    """True if 16-bit images so named are not depth."""
     return word in _OTHERS

@@ -113,7 +113,7 @@ class ImageMessage:
         return self.encoding in {"mono8", "8UC1"}
 
     def unit(self, scale: float | None) -> float:
-        """Metres per unit of depth: `scale`, else 1 mm for counts, 1 m for floats (REP 118)."""
+        """Metres per unit: `scale`, else 1 mm for counts, 1 m for floats (REP 118)."""
         return scale if scale is not None else MILLIMETRE if self.is_counts else 1.0
 
 
@@ -288,12 +288,12 @@ def color_of(image: ImageMessage) -> UInt8:
 
 
 def depth_of(image: ImageMessage, scale: float | None) -> Float32:
-    """Return depth (H, W) float32 [m] in the `unit` of `scale`; 0 = no return."""
+    """Depth (H, W) float32 [m] in the `unit` of `scale`; 0 = no return."""
     return (metres if image.is_counts else measured)(image.pixels, image.unit(scale))
 
 
 def num_invalid(depth: NDArray[Any]) -> int:
-    """Count recorded depths (H, W) that are negative, NaN, infinite or a no-return code."""
+    """Count depths (H, W) negative, NaN, infinite or a no-return code."""
     is_invalid = depth == NO_RETURN
     if depth.dtype.kind != "u":
         is_invalid |= ~(depth >= 0) | (np.abs(depth - NO_RETURN_M) < 1e-4) | (depth >= FARTHEST)

@@ -33,7 +33,7 @@ from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
 
 
 class _Edge:
-    """T_parent_child over time, its rows (4, 4) in `transforms` by number."""
+    """T_parent_child over time; `numbers` index rows (4, 4) of `transforms`."""
 
     def __init__(self, parent: str, transforms: RowFile) -> None:
         self.parent = parent
@@ -136,7 +136,7 @@ class TfTree:
             self.note(f"tf: {parent} -> {child} is both static and moving; the static one holds")
 
     def note(self, note: str) -> None:
-        """Note a remark on the tree, once."""
+        """Note a remark once."""
         if note not in self.notes:
             self.notes.append(note)
 
@@ -151,21 +151,21 @@ class TfTree:
         return tuple(frame for frame in self.frames if frame not in self._edges)
 
     def root_of(self, frame: str) -> str:
-        """Return the topmost ancestor of `frame`, or itself."""
+        """The topmost ancestor, perhaps itself."""
         return self._ancestors(frame)[-1]
 
     def span_ns(self, frame: str) -> tuple[int, int] | None:
-        """Return the stamps between which all moving edges above `frame` are known; None if none moves."""
+        """Stamps between which all moving edges above are known; None without any."""
         edges = [self._edges[f] for f in self._ancestors(frame)[:-1]]
         moving = [edge.stamps for edge in edges if not edge.static]
         return (max(min(s) for s in moving), min(max(s) for s in moving)) if moving else None
 
     def connects(self, target: str, source: str) -> bool:
-        """True if edges join the two frames."""
+        """True if edges join them."""
         return self.root_of(target.strip("/")) == self.root_of(source.strip("/"))
 
     def lookup(self, target: str, source: str, stamp_ns: int, tolerance_ns: int = 0) -> Float64 | None:
-        """Return T_target_source (4, 4) at a time; None if unconnected or unknown then."""
+        """T_target_source (4, 4) at a time; None if unconnected or unknown then."""
         target, source = target.strip("/"), source.strip("/")
         up_target, up_source = self._ancestors(target), self._ancestors(source)
         common = next((frame for frame in up_source if frame in up_target), None)
@@ -205,12 +205,12 @@ _PINHOLES = ("", "none", "pinhole", "perspective", "rectilinear", "inversebrownc
 
 
 def lens_model(name: str) -> str:
-    """Translate a driver's name into one of `DISTORTION_MODELS`, else return it unchanged."""
+    """One of `DISTORTION_MODELS` for a driver's name, else unchanged."""
     return _SAME_MODELS.get(_letters(name), name)
 
 
 def is_distorted(model: str, coefficients: Float64) -> bool:
-    """False for a pinhole; an equidistant lens or an unknown model is always distorted."""
+    """False for a pinhole; equidistant and unknown models always distort."""
     is_radial = lens_model(model) in DISTORTION_MODELS[:2] or _letters(model) in _PINHOLES
     return not is_radial or bool(np.any(np.abs(coefficients) > 1e-9))
 
@@ -221,7 +221,7 @@ def _letters(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthToColor:
-    """A warp of depth images into another camera's view; undistortion: of the depth lens."""
+    """A warp of depth into another camera; undistortion: the depth lens's."""
 
     depth_intrinsics: Intrinsics
     color_intrinsics: Intrinsics
@@ -302,36 +302,36 @@ class Undistortion:
         self._map_u[~is_seen] = -10.0  # folded back into the image, or outside of it
 
     def color(self, image: UInt8) -> UInt8:
-        """Undistort colour (H, W, 3), interpolated."""
+        """(H, W, 3), interpolated."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_LINEAR), dtype=np.uint8)
 
     def labels(self, image: UInt8) -> UInt8:
-        """Undistort labels (H, W), nearest pixel."""
+        """(H, W), nearest pixel."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.uint8)
 
     def depth(self, image: Float32) -> Float32:
-        """Undistort depth (H, W) [m], nearest pixel."""
+        """(H, W) [m], nearest pixel."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
-    """A camera's image corrections; intrinsics: of the result."""
+    """Image corrections; intrinsics: of the result."""
 
     intrinsics: Intrinsics
     undistortion: Undistortion | None = None
     depth_to_color: DepthToColor | None = None
 
     def color(self, image: UInt8) -> UInt8:
-        """Undistort recorded colour (H, W, 3)."""
+        """(H, W, 3), undistorted."""
         return image if self.undistortion is None else self.undistortion.color(image)
 
     def labels(self, image: UInt8) -> UInt8:
-        """Undistort labels (H, W) of recorded colour."""
+        """(H, W), undistorted."""
         return image if self.undistortion is None else self.undistortion.labels(image)
 
     def depth(self, image: Float32) -> Float32:
-        """Map recorded depth [m] to colour's pixels (H, W)."""
+        """Recorded [m] to colour's pixels (H, W)."""
         if self.depth_to_color is not None:
             return self.depth_to_color.warp(image)
         return image if self.undistortion is None else self.undistortion.depth(image)

@@ -1,4 +1,4 @@
-"""The cameras of a log with intrinsics, world frame, lens and depth registration, or their problems."""
+"""A log's cameras with intrinsics, world frame, lens and registration, or their problems."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -60,14 +60,14 @@ class Camera(Lens):
     human_topic: str = ""
 
     def pose_at(self, tf: TfTree, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
-        """T_world_camera at a time; None if tf does not know it."""
+        """None if tf does not know it."""
         if self.fixed_pose is not None:
             return self.fixed_pose
         return tf.lookup(self.world_frame, self.frame_id, stamp_ns, tolerance_ns)
 
 
 def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[Camera, ...]:
-    """Build every requested camera. Raises InputError naming the camera, the topic and the problem."""
+    """Build requested cameras. Raises InputError naming camera, topic and problem."""
     found = camera_topics(log, survey, options)
     if not found:
         raise no_camera(log, survey)
@@ -94,12 +94,12 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
 
 
 def camera_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    """The cameras of the options, else those found; a mask is never colour."""
+    """The options' cameras, else those found; a mask is never colour."""
     return _given_topics(log, survey, options) or find_cameras(survey, without=options.human_topics.values())
 
 
 def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
-    """List what a reconstruction from this log misses; may be empty."""
+    """List what a reconstruction would miss."""
     found = camera_topics(log, survey, options)
     if not found:
         lacks = [str(no_camera(log, survey)).removeprefix(f"{log.path}: ")]
@@ -125,7 +125,7 @@ def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
 
 
 def nearest_gap_ns(color_ns: Sequence[int], depth_ns: Sequence[int]) -> int:
-    """The smallest difference of a colour and a depth stamp [ns]."""
+    """Smallest difference of a colour and a depth stamp."""
     color, depth = np.sort(np.array(color_ns)), np.sort(np.array(depth_ns))
     after = np.clip(np.searchsorted(depth, color), 0, len(depth) - 1)
     before = np.clip(after - 1, 0, None)
@@ -133,7 +133,7 @@ def nearest_gap_ns(color_ns: Sequence[int], depth_ns: Sequence[int]) -> int:
 
 
 def intrinsics_of(calibration: Calibration) -> Intrinsics:
-    """The pinhole part of a CameraInfo (its pixel convention is ours)."""
+    """A CameraInfo's pinhole (its pixel convention is ours)."""
     K = calibration.K
     return Intrinsics(
         fx=float(K[0, 0]),
@@ -146,7 +146,7 @@ def intrinsics_of(calibration: Calibration) -> Intrinsics:
 
 
 def _rectified(calibration: Calibration) -> Calibration:
-    """The rectified image's camera: P if set, no distortion; valid if the lens is known."""
+    """P if set, without distortion; valid if the lens is known."""
     K = calibration.projection if calibration.projection[0, 0] > 0 else calibration.K
     pinhole = replace(calibration, K=K, distortion_model="plumb_bob", distortion=np.zeros(0))
     model = lens_model(calibration.distortion_model)
@@ -190,7 +190,7 @@ class _Builder:
         self._topics = topics
 
     def build(self) -> Camera:
-        """Build the camera. Raises InputError for its first problem."""
+        """Raises InputError for the first problem."""
         topics = self._topics
         self._check_depth()
         self._check_clock()
@@ -214,7 +214,7 @@ class _Builder:
         )
 
     def problems(self) -> list[str]:
-        """List all problems; empty if `build` succeeds."""
+        """Empty if `build` succeeds."""
         found = []
         intrinsics = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
         steps: list[Callable[[], object]] = [
@@ -438,7 +438,7 @@ def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
 
 
 def check_mask_topics(path: Path, survey: Survey, topics: Mapping[str, str], cameras: tuple[str, ...]) -> None:
-    """Raise InputError if a mask topic, by camera name, has no camera or no grey images."""
+    """Raise InputError for a mask topic without camera or grey images."""
     grey = [
         topic.topic.name
         for topic in survey.of_type(IMAGE, COMPRESSED_IMAGE)

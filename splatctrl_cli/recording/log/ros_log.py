@@ -44,7 +44,7 @@ class _Pass:
 
 
 class RosLogSource(Recording):
-    """Records of an MCAP, ROS 1 bag or ROS 2 bag."""
+    """Records of an MCAP or ROS bag."""
 
     has_clock = True
 
@@ -77,7 +77,7 @@ class RosLogSource(Recording):
 
     @property
     def loss(self) -> LossReport:
-        """The loss; undecodable images are those of the pass that found most."""
+        """Undecodable images are those of the fullest pass."""
         loss, most = self._loss, max(self._passes, key=lambda one: (one.damage.count, one.num_invalid))
         return replace(
             loss,
@@ -90,11 +90,10 @@ class RosLogSource(Recording):
         return decoded(by_stamp(self.states, self._frames(lazily=False)))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Yield stamp, camera and pose of every planned frame."""
         return ((planned.stamp_ns, planned.camera.name, planned.T_world_camera) for planned in self._plan)
 
     def pose_at(self, camera: str, stamp_ns: int) -> Float64 | None:
-        """T_world_camera (4, 4) at a time [ns]; None if tf does not know it."""
+        """T_world_camera (4, 4) at [ns]; None if tf does not know it."""
         found = next(c for c in self._rig if c.name == camera)
         return found.pose_at(self._tf, stamp_ns, round(self._options.pose_tolerance_s * SECOND_NS))
 

@@ -1,4 +1,4 @@
-"""Cleaned joint states as columns on disk, and as states."""
+"""Cleaned joint states, as columns on disk and as states."""
 
 from array import array
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -51,7 +51,7 @@ class StateColumns(Sequence[JointState]):
             yield from self.states(first, last)
 
     def postures(self, within_ns: int) -> Posture:
-        """Joint positions at any time, linear between neighbours at most `within_ns` away."""
+        """Positions at any time, linear between states at most `within_ns` away."""
 
         def posture(stamp_ns: int) -> Float64 | None:
             after = int(np.searchsorted(self.stamp_ns, stamp_ns))
@@ -92,11 +92,10 @@ class StateColumns(Sequence[JointState]):
         return self._changed(lambda table, _: selected(table, index), COLUMNS, stamp_ns=self.stamp_ns[index])
 
     def of_joints(self, order: Index) -> Self:
-        """The joints of an order (J,)."""
         return self._changed(lambda table, _: of_columns(table, order), OF_JOINTS)
 
     def of_log(self, order: Index, factor: Float64, offset: Float64) -> Self:
-        """Joints (J,) as ``position[order] * factor + offset``."""
+        """Joints (J,): ``position[order] * factor + offset``."""
         plain = self.of_joints(order)
         if (factor == 1.0).all() and (offset == 0.0).all():
             return plain
@@ -108,7 +107,7 @@ class StateColumns(Sequence[JointState]):
         return plain._changed(moved, OF_JOINTS)
 
     def tables(self) -> dict[str, Table]:
-        """The `COLUMNS` that are present."""
+        """The present `COLUMNS`."""
         return {name: table for name in COLUMNS if (table := getattr(self, name)) is not None}
 
     def _changed(self, change: Callable[[Table, str], Table], names: Collection[str], **others: Any) -> Self:
@@ -122,13 +121,10 @@ NO_STATES = StateColumns(stamp_ns=np.zeros(0, np.int64), position=np.zeros((0, 0
 
 
 class ColumnWriter:
-    """A writer of columns, state by state, in blocks; NaN for a missing value."""
+    """A writer of columns by state, in blocks; NaN if missing."""
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]], blocks: Mapping[str, Iterable[Float64]]) -> None:
-        """shapes: a row's, by column; blocks: whole columns of known states.
-
-        Raises ValueError if these differ in length.
-        """
+        """shapes: a row's; blocks: columns of known states. Raises ValueError if they differ in length."""
         self._shapes = shapes
         self._files = {name: RowFile(shapes[name], of_column) for name, of_column in blocks.items()}
         self._num, *others = {len(file) for file in self._files.values()} or {0}  # states that are in the files
@@ -140,13 +136,13 @@ class ColumnWriter:
         return self._num + len(self._waiting)
 
     def add(self, values: Mapping[str, Float64 | None]) -> None:
-        """Add a state's values by column."""
+        """Add a state by column."""
         self._waiting.append(values)
         if len(self._waiting) == BLOCK:
             self._flush()
 
     def tables(self) -> dict[str, Rows]:
-        """Tables of all states so far, without empty columns."""
+        """Non-empty tables so far."""
         self._flush()
         return {name: Rows(self._files[name]) for name in self._shapes if name in self._files}
 
@@ -163,7 +159,7 @@ class ColumnWriter:
 
 
 class StateCollector:
-    """A collector of states into columns."""
+    """A collector of states."""
 
     def __init__(self, num_joints: int) -> None:
         self._num_joints = num_joints
@@ -172,7 +168,7 @@ class StateCollector:
         self._columns = ColumnWriter({name: joints if name in OF_JOINTS else pose for name in COLUMNS}, {})
 
     def add(self, state: JointState) -> None:
-        """Add a state. Raises InputError for another number of joints."""
+        """Raises InputError for another number of joints."""
         if np.shape(state.position) != (self._num_joints,):
             raise InputError(
                 f"joint state {len(self._stamps)}: expected {self._num_joints} joints, got {np.size(state.position)}"
@@ -181,7 +177,7 @@ class StateCollector:
         self._columns.add({name: getattr(state, name) for name in COLUMNS})
 
     def columns(self) -> StateColumns:
-        """Columns of all states so far."""
+        """Columns so far."""
         nothing = np.zeros((0, self._num_joints))
         found: dict[str, Table] = {"position": nothing, "velocity": nothing, **self._columns.tables()}
         return StateColumns(stamp_ns=np.array(self._stamps, dtype=np.int64), **found)

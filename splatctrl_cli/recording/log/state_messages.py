@@ -1,4 +1,4 @@
-"""Joint states from robots' messages, in columns by joint names."""
+"""Joint states of robots' messages, in columns by joint names."""
 
 from array import array
 from collections import Counter
@@ -46,7 +46,7 @@ class RawJoints:
 
 
 def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoints]:
-    """The joint states of a message of `STATE_TYPES`, log time [ns]. Raises UndecodableMessageError."""
+    """States of a `STATE_TYPES` message, log time [ns]. Raises UndecodableMessageError."""
     if type_name == JOINT_STATE:
         names, position = tuple(str(name) for name in message.name), _array(message.position)
         velocity = _array(message.velocity)
@@ -59,7 +59,7 @@ def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoint
 
 
 def rigid_or_none(T: Float64) -> Float64 | None:
-    """The pose (4, 4) if finite with a rotation, else None: an unfilled field is zeros."""
+    """None unless finite and a rotation: an unfilled field is zeros."""
     R = T[:3, :3]
     is_rigid = np.isfinite(T).all() and np.abs(R.T @ R - np.eye(3)).max() < _MAX_SKEW and np.linalg.det(R) > 0
     return T if is_rigid else None
@@ -71,7 +71,7 @@ def pose_of_columns(values: Float64) -> Float64 | None:
 
 
 def pose_of_quat(position: Float64, quat_xyzw: Float64) -> Float64 | None:
-    """T (4, 4) of a position [m] and a quaternion, None if not unit."""
+    """T (4, 4) of a position [m], None if the quaternion is not unit."""
     if not (np.isfinite(position).all() and abs(float(np.linalg.norm(quat_xyzw)) - 1.0) < _MAX_SKEW):
         return None
     return transform_from(position, quat_xyzw)
@@ -168,10 +168,10 @@ COLUMNS = ("position", "velocity", "commanded_velocity", "T_base_ee")
 
 
 class JointStream:
-    """States with the same joints; `names` and columns have the first one's order."""
+    """States with equal joints, in the first one's order."""
 
     def __init__(self, names: tuple[str, ...], columns: Mapping[str, Iterable[Float64]] | None = None) -> None:
-        """columns: blocks of rows of already known states."""
+        """columns: rows of known states, in blocks."""
         self.names = names
         self._stamps, self._log_times = array("q"), array("q")
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
@@ -182,7 +182,7 @@ class JointStream:
     def of(
         cls, names: tuple[str, ...], stamp_ns: Stamps, log_time_ns: Stamps, columns: Mapping[str, Iterable[Float64]]
     ) -> "JointStream":
-        """Build from columns in blocks of rows. Raises ValueError for other lengths."""
+        """Build from blocks of rows. Raises ValueError for other lengths."""
         stream = cls(names, columns)
         stream._stamps.extend(stamp_ns.tolist())
         stream._log_times.extend(log_time_ns.tolist())
@@ -211,7 +211,7 @@ class JointStream:
         return self._columns.tables()
 
     def add(self, state: RawJoints) -> None:
-        """Add a state. Raises OverflowError for a time beyond 64 bits."""
+        """Raises OverflowError for a time beyond 64 bits."""
         times = array("q", (state.stamp_ns, state.log_time_ns))  # both, before either is kept
         self._stamps.append(times[0])
         self._log_times.append(times[1])
@@ -227,7 +227,7 @@ class JointStream:
 
 
 class JointLog:
-    """A topic's states in file order; first_names: the first one's, or None; notes: counted."""
+    """States in file order; first_names: the first one's, or None; notes: counted."""
 
     def __init__(self) -> None:
         self.first_names: tuple[str, ...] | None = None
@@ -237,7 +237,7 @@ class JointLog:
 
     @classmethod
     def of(cls, num: int, streams: Sequence[JointStream]) -> "JointLog":
-        """Build from the streams of `num` states."""
+        """Build from `num` states' streams."""
         log = cls()
         log._num = num
         log._streams = {frozenset(stream.names): stream for stream in streams}
@@ -249,11 +249,11 @@ class JointLog:
 
     @property
     def streams(self) -> list[JointStream]:
-        """Streams by joint names; skips nameless states."""
+        """Streams by joints, without nameless states."""
         return list(self._streams.values())
 
     def extend(self, states: Iterable[RawJoints]) -> None:
-        """Add states. Raises OverflowError for a time beyond 64 bits."""
+        """Raises OverflowError for a time beyond 64 bits."""
         for state in states:
             self.notes.update(filter(None, [state.note]))
             if state.names:

@@ -1,4 +1,4 @@
-"""The joint states of a log's topics: choosing, merging and renaming them, and checking their clocks."""
+"""Joint states of a log's topics: chosen, merged, renamed, clocks checked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -66,7 +66,7 @@ def joint_records(
 
 
 def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> list[TopicSurvey]:
-    """Return topics with joint states; planned motions only if nothing is measured.
+    """Topics with states; planned motions only if nothing is measured.
 
     Raises InputError for an unknown --joint-topic.
     """
@@ -87,7 +87,7 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
 
 
 def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
-    """Choose /joint_states, else the largest JointState topic, else the largest other; commands come last."""
+    """/joint_states, else the largest JointState topic, else another; commands last."""
     by_name = {topic.topic.name: topic for topic in topics}
     chosen = by_name[
         max(
@@ -108,7 +108,7 @@ def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
 
 
 def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
-    """Return a topic's states with the most joints; others (a gripper that publishes alone) are noted."""
+    """States with the most joints; others (a gripper that publishes alone) are noted."""
     chosen = max(_streams([topic]), key=lambda s: (len(s.names), len(s.states), sorted(s.names)))
     others = len(topic.joints) - len(chosen.states)
     if others:
@@ -202,7 +202,7 @@ def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | 
 
 
 def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
-    """Median distance [rad or m] of shared joints at equal times; 0 without overlap."""
+    """Median distance [rad or m] of shared joints; 0 without overlap."""
     stamps, its = base.states.stamp_ns, other.states.stamp_ns
     at, at_other = np.argsort(stamps, kind="stable"), np.argsort(its, kind="stable")
     its = its[at_other]
@@ -236,7 +236,7 @@ def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
 
 
 def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
-    """Rename the robot's missing joints if only a prefix differs."""
+    """Rename unknown joints to the robot's if only a prefix differs."""
     found = dict.fromkeys(name for stream in streams for name in stream.names)
     unknown, missing = [n for n in found if n not in wanted], [name for name in wanted if name not in found]
     names = with_prefix(unknown, missing)
@@ -248,7 +248,7 @@ def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) ->
 
 
 def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
-    """Map a log's joint names to the robot's by a prefix on either side; empty unless one fits best."""
+    """A log's joint names to the robot's by either side's prefix; empty unless one fits best."""
     by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
     for name in dict.fromkeys(found):
         for meant in wanted:

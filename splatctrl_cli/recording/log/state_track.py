@@ -18,7 +18,7 @@ from splatctrl_cli.records import Bool, Float64, LossReport, Stamps
 
 
 def gaps_of(stamp_ns: Stamps) -> NDArray[np.intp]:
-    """Indices i of the gaps between states i and i + 1; stamps (T,) rise."""
+    """Indices i of gaps between states i and i + 1; stamps (T,) rise."""
     steps = np.diff(stamp_ns)
     if not len(steps):
         return np.zeros(0, dtype=np.intp)
@@ -63,20 +63,20 @@ class _Sums:
 
     @property
     def num(self) -> int:
-        """Number of added states."""
+        """States added."""
         return self._start + self._sums.shape[1] - 1
 
     def add(self, k: Float64, r: Float64) -> None:
-        """Add the next states' values (T,)."""
+        """Add values (T,)."""
         rows = [np.cumsum(np.concatenate([s[-1:], v])) for s, v in zip(self._sums, (k, r, k**2, k * r), strict=True)]
         self._sums = np.hstack([self._sums, np.array(rows)[:, 1:]])
 
     def means(self, first: NDArray[np.intp], last: NDArray[np.intp]) -> Float64:
-        """Means (4, T) of states first to last, excluded."""
+        """Means (4, T) from first to last, excluded."""
         return np.asarray((self._sums[:, last - self._start] - self._sums[:, first - self._start]) / (last - first))
 
     def forget(self, before: int) -> None:
-        """Drop sums that no later state needs."""
+        """Drop sums no later state needs."""
         if before > self._start:
             self._sums, self._start = self._sums[:, before - self._start :].copy(), before
 
@@ -110,7 +110,7 @@ def differentiated(stamp_ns: Stamps, position: Float64) -> Float64:
 
 
 def slopes_by_block(stamp_ns: Stamps, position: Table) -> Iterator[tuple[int, Float64]]:
-    """Yield `differentiated` by block: its first state and velocities (K, J)."""
+    """Yield `differentiated` by block: first state, velocities (K, J)."""
     for start, end in pairwise([0, *(gaps_of(stamp_ns) + 1).tolist(), len(stamp_ns)]):
         if end - start == 1:
             yield start, np.zeros((1, *position.shape[1:]))
@@ -137,13 +137,13 @@ def _slopes(seconds: Float64, position: Float64) -> Float64:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawTrack(StateColumns):
-    """Joint states as recorded, in file order; absent velocity is NaN. where: its name in messages."""
+    """States as recorded, in file order; absent velocity is NaN. where: for messages."""
 
     where: str
     names: tuple[str, ...]
 
     def of_names(self, names: Sequence[str]) -> "RawTrack":
-        """The columns of these joints, in that order."""
+        """Columns of these joints, in order."""
         order = np.array([self.names.index(name) for name in names], dtype=np.int64)
         return replace(self.of_joints(order), names=tuple(names))
 
@@ -169,7 +169,7 @@ def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
 
 
 def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
-    """Remove whole turns between states in time order, as from pi to -pi."""
+    """Remove whole turns between states in time order, such as pi to -pi."""
     position, file = raw.position, RowFile(raw.position.shape[1:])
     turns: Float64 = np.zeros(position.shape[1])
     is_close = np.diff(raw.stamp_ns) * 1e-9 <= fixed.STATES_BRIDGED
@@ -247,7 +247,7 @@ def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
 
 
 def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
-    """Number of states without velocity, joints (J,) that move at velocity 0, and the note."""
+    """Number of states to differentiate, joints (J,) that move at velocity 0, a note."""
     num, num_joints = raw.position.shape[:2]
     low, high = np.full(num_joints, np.inf), np.full(num_joints, -np.inf)
     is_still, is_missing, is_there = (np.full(num_joints, first) for first in (True, False, False))

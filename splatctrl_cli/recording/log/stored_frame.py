@@ -58,7 +58,7 @@ class JointTopics:
 
 
 def with_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
-    """Merge the joint states' report, its notes at index `at`."""
+    """Merge the joints' report, its notes at index `at`."""
     return loss.plus(joints, [*loss.notes[:at], *joints.notes, *loss.notes[at:]])
 
 
@@ -68,7 +68,7 @@ def without_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
 
 
 def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) -> dict[str, Any]:
-    """Write all topics' streams into a capture; `wrote` gets each file. Returns the entry for capture.json."""
+    """Write streams into a capture; `wrote` gets each file. Returns the capture.json entry."""
     described, number = [], 0
     for topic in kept.topics:
         streams = []
@@ -133,7 +133,7 @@ def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSur
 
 
 def write_rows(stream: IO[bytes], rows: Table) -> None:
-    """Write float64 rows as .npy, a block at a time."""
+    """Write float64 as .npy, a block at a time."""
     np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": tuple(rows.shape)})
     for block in blocks_of(rows):
         stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())
@@ -181,17 +181,17 @@ class StoredFrame:
 
     @cached_property
     def color(self) -> UInt8:
-        """The colour. Raises InputError if undecodable."""
+        """Raises InputError if undecodable."""
         return self._read(self.read_color)
 
     @cached_property
     def depth(self) -> Float32:
-        """The depth. Raises InputError if undecodable."""
+        """Raises InputError if undecodable."""
         return self._read(self.read_depth)
 
     @property
     def frame(self) -> RgbdFrame:
-        """The decoded frame. Raises InputError if undecodable."""
+        """Raises InputError if undecodable."""
         return RgbdFrame(
             stamp_ns=self.stamp_ns,
             camera=self.camera,
@@ -211,11 +211,11 @@ class StoredFrame:
 
 
 class FrameSource(RecordSource, Protocol):
-    """A record source that also gives its frames as stored."""
+    """A record source with frames as stored."""
 
     @property
     def world_frame(self) -> str:
-        """The source's name for the frame of poses."""
+        """The source's frame of poses."""
         ...
 
     @property
@@ -224,16 +224,16 @@ class FrameSource(RecordSource, Protocol):
         ...
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Yield `records` with frames as stored."""
+        """Yield `records`, undecoded."""
         ...
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Yield stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp, without images."""
+        """Yield stamp [ns], camera, T_world_camera (4, 4) by stamp, without images."""
         ...
 
 
 class Recording:
-    """Records by stamp: joint states, and a subclass's `_frames`."""
+    """Records by stamp: joint states, and `_frames`."""
 
     states: StateColumns = NO_STATES
 
@@ -250,22 +250,21 @@ class Recording:
 
 
 def is_kept(data: bytes | None) -> bool:
-    """True for JPEG or PNG bytes, which captures can keep."""
+    """True for JPEG or PNG, which captures keep."""
     return data is not None and data.startswith((JPEG, PNG))
 
 
 def is_png(data: bytes | None) -> bool:
-    """True for PNG bytes."""
+    """True for PNG."""
     return data is not None and data.startswith(PNG)
 
 
 def decoded(items: Iterable[StoredFrame | JointState]) -> Iterator[Record]:
-    """Decode the frames of records."""
     return (item.frame if isinstance(item, StoredFrame) else item for item in items)
 
 
 def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:
-    """Return (H, W) uint8, 1 where not 0. Raises InputError unless 8-bit grey of the camera's size."""
+    """(H, W) uint8, 1 where not 0. Raises InputError unless 8-bit grey of that size."""
     if pixels.dtype != np.uint8 or pixels.shape != (camera.height, camera.width):
         size = "x".join(map(str, reversed(pixels.shape[:2])))
         channels = pixels.shape[2] if pixels.ndim == 3 else 1

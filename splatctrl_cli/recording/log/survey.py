@@ -80,7 +80,7 @@ class StampClock:
     _latest_log_ns: int = 0
 
     def see(self, stamp_ns: int, log_time_ns: int) -> None:
-        """Take the next message in file order."""
+        """Take the next message in order."""
         if self._latest_ns is None or stamp_ns > self._latest_ns:
             self._latest_ns, self._latest_log_ns = stamp_ns, log_time_ns
         elif self._latest_ns - stamp_ns > IMAGES_BACK_NS and log_time_ns > self._latest_log_ns:
@@ -90,12 +90,12 @@ class StampClock:
 
     @property
     def went_back(self) -> bool:
-        """True if it did; single stamps may be wrong."""
+        """True if it did; single stamps may err."""
         return self.num_back >= IMAGES_FEWEST_BACK
 
 
 def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
-    """Return the numbers (K,) of images whose stamp is new."""
+    """Numbers (K,) of images with a new stamp."""
     return np.sort(np.unique(stamps_ns, return_index=True)[1]).astype(np.int64)
 
 
@@ -147,7 +147,7 @@ class Calibration:
 
 @dataclass(kw_only=True)
 class TopicSurvey:
-    """A topic in a log; stamps_ns and clock (images only) are of headers in file order."""
+    """A topic; stamps_ns and clock (images only) are headers' in file order."""
 
     topic: Topic
     count: int = 0
@@ -161,14 +161,14 @@ class TopicSurvey:
 
     @property
     def image(self) -> ImageMessage:
-        """The first image, which must exist."""
+        """The first image, required."""
         assert self.first_image is not None
         return self.first_image
 
 
 @dataclass(kw_only=True)
 class Survey:
-    """A log without its images; by_log_time: stamps are log times, not headers'."""
+    """A log without images; by_log_time: stamps are log times."""
 
     by_log_time: bool = False
     topics: dict[str, TopicSurvey] = field(default_factory=dict)
@@ -182,7 +182,7 @@ class Survey:
         return sum(topic.count for topic in self.topics.values())
 
     def of_type(self, *types: str) -> list[TopicSurvey]:
-        """Return non-empty topics of these types, by name."""
+        """Non-empty topics, by name."""
         found = [t for t in self.topics.values() if t.topic.type_name in types and t.count and is_ros(t.topic)]
         return sorted(found, key=lambda t: t.topic.name)
 
@@ -202,7 +202,6 @@ def survey(log: RawLog, *, by_log_time: bool = False) -> Survey:
 
 
 def add_message(result: Survey, decoder: MessageDecoder, message: RawMessage) -> None:
-    """Add one message to a survey."""
     entry = result.topics.setdefault(message.topic.name, TopicSurvey(topic=message.topic))
     if entry.count == 0:
         entry.topic = message.topic
@@ -299,7 +298,7 @@ def _calibration(message: Any) -> Calibration | None:
 
 
 def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints]:
-    """Joint states; log time shifts all of a message."""
+    """Log time shifts all of a message."""
     states = read_states(decoded, message.topic.type_name, message.log_time_ns)
     if not result.by_log_time:
         return states
@@ -308,7 +307,7 @@ def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints
 
 
 def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
-    """Survey a log; a large MCAP by its index, with notes that say so."""
+    """Survey a log; a large MCAP by its index, noted."""
     size = sum(file.stat().st_size for file in log.files)
     inner, video = (log.inner, log) if isinstance(log, VideoLog) else (log, None)
     if size < LARGE or not isinstance(inner, McapLog):
@@ -341,7 +340,7 @@ def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:
 
 
 def _first_chunks(index: LogIndex) -> list[ChunkIndex]:
-    """Each channel's first chunk and the file's first ones, within bounds."""
+    """Each channel's first chunk and the file's first, within bounds."""
     wanted = {chunk.chunk_start_offset: chunk for chunk in index.chunks[:4]}
     for channel in sorted(index.counts):
         first = next((c for c in index.chunks if channel in c.message_index_offsets), None)
@@ -363,14 +362,14 @@ _TEXT = 4  # a parameter's type that is text (rcl_interfaces/ParameterType)
 
 @dataclass(frozen=True, kw_only=True)
 class RobotDescription:
-    """A URDF text and its topic or node."""
+    """A URDF and its topic or node."""
 
     where: str
     text: str
 
 
 def robot_descriptions(log: RawLog) -> list[RobotDescription]:
-    """Return a log's URDFs, each text once, from a topic's first message; reads only their topics."""
+    """A log's URDFs, each once, from first messages; reads only their topics."""
     topics = log.topics()
     own = {t.name for t in topics if t.type_name == STRING and t.name.rpartition("/")[2] == NAME}
     wanted = own or {t.name for t in topics if t.type_name == EVENT}

@@ -59,22 +59,20 @@ class _Stream:
 
 
 class VideoLog:
-    """A log with its video as images."""
+    """A log with video as images."""
 
     def __init__(self, log: RawLog) -> None:
         self.inner = log
         self.path, self.files, self.container = log.path, log.files, log.container
 
     def topics(self) -> tuple[Topic, ...]:
-        """The log's topics, video as decoded."""
         return tuple(map(_decoded_topic, self.inner.topics()))
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the log's messages, with images as the decoder returns them."""
         return self.decoded(self.inner.messages(damage, names), damage)
 
     def decoded(self, messages: Iterable[RawMessage], damage: Damage) -> Iterator[RawMessage]:
-        """Decode a part of the log's messages, in order."""
+        """Decode some of the log's messages, in order."""
         streams: dict[str, _Stream | None] = {}
         decoder = MessageDecoder()
         for message in messages:
@@ -179,9 +177,9 @@ _TIME = re.compile("time|stamp", re.IGNORECASE)
 
 
 def open_log(path: Path) -> RawLog:
-    """Open a log, with video if the library is installed, or a video file with stamps.
+    """Open a log, or a video file with stamps. Raises InputError.
 
-    Raises InputError.
+    Video is decoded if the library is installed.
     """
     refuse_foreign(path)
     if path.suffix.lower() in SUFFIXES:
@@ -216,11 +214,10 @@ class VideoFileLog:
         self._topic = Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)
 
     def topics(self) -> tuple[Topic, ...]:
-        """The only topic."""
         return (self._topic,)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the images. Raises InputError if their number is not the stamps'."""
+        """Raises InputError if images and stamps differ in number."""
         if names is not None and self._topic.name not in names:
             return
         num, found = 0, Damage()

@@ -21,7 +21,7 @@ def is_lerobot(path: Path) -> bool:
 
 
 def preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
-    """The keys of [states] for an episode, by default the only one. Raises InputError."""
+    """An episode's keys of [states], by default the only one. Raises InputError."""
     info = read_json(folder / INFO)
     try:
         feature, num = info["features"][POSITION], int(info["total_episodes"])

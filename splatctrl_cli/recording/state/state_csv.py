@@ -1,4 +1,4 @@
-"""CSV numbers by column, and the logs that libfranka writes."""
+"""CSV numbers by column, and libfranka's logs."""
 
 import csv
 from array import array
@@ -21,13 +21,13 @@ _DESCRIBE = "describe the columns in a .toml (splatctrl help replay, Logs)"
 
 @dataclass(frozen=True, kw_only=True)
 class CsvTable:
-    """A CSV file: column names stripped from its first line, other lines read in blocks."""
+    """A CSV file: stripped column names, lines read in blocks."""
 
     path: Path
     names: list[str]
 
     def index(self, name: str | int) -> int:
-        """Return the first column of that name; a number is unchanged. Raises InputError."""
+        """The first column so named; a number is unchanged. Raises InputError."""
         if isinstance(name, int):
             return name
         if name not in self.names:
@@ -155,7 +155,7 @@ def libfranka_track(table: CsvTable) -> RawTrack:
 
 
 def poses_of(rows: Table, read: Callable[[Float64], Float64 | None]) -> Rows:
-    """Poses (T, 4, 4) of rows (T, K); NaN where `read` gives None."""
+    """(T, 4, 4) of rows (T, K); NaN where `read` gives None."""
     nothing = np.full((4, 4), np.nan)
     blocks = (np.array([nothing if T is None else T for T in map(read, block)]) for block in blocks_of(rows))
     return Rows(RowFile((4, 4), blocks))

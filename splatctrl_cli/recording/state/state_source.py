@@ -1,4 +1,4 @@
-"""A robot's motion from any input: recordings, logs without cameras, libfranka's and other tables."""
+"""A robot's motion from recordings, logs without cameras, and tables."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,7 +34,7 @@ _NOT_FOR_TABLES = (*_FOR_CAMERAS, "joint_topic", "root", "holdout")
 
 
 class StateSource(Recording):
-    """Joint states without frames, of a log or a table."""
+    """Joint states without frames."""
 
     cameras: tuple[str, ...] = ()
     has_clock = True

@@ -1,4 +1,4 @@
-"""Joint states in CSV, NPZ, HDF5 or Parquet, described by a TOML file (docs/replay.md, Logs)."""
+"""Joint states in CSV, NPZ, HDF5 or Parquet, described in TOML (docs/replay.md, Logs)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -54,10 +54,7 @@ class StatesTable:
 
 
 def described_track(path: Path) -> tuple[RawTrack, Path]:
-    """Read the states that a TOML file describes, and their file.
-
-    Raises InputError naming the key or column.
-    """
+    """Read described states, and their file. Raises InputError naming key or column."""
     table = read_table(StatesTable, path, "states", beside=("twists",), fill=lambda given: with_preset(path, given))
     choices: Mapping[str, tuple[str, ...]] = {
         "unit": tuple(UNITS),
@@ -79,7 +76,7 @@ def described_track(path: Path) -> tuple[RawTrack, Path]:
 
 
 def dataset_track(folder: Path) -> tuple[RawTrack, Path]:
-    """Read a LeRobot dataset's only episode, and its file. Raises InputError."""
+    """A LeRobot dataset's only episode, and its file. Raises InputError."""
     found = dict(lerobot.preset(folder, None))
     if "joints" not in found:
         raise InputError(
@@ -95,7 +92,7 @@ def _of_episode(table: StatesTable, episode: int, path: Path) -> tuple[RawTrack,
 
 
 def with_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Fill table [states] of TOML file `path` by its preset."""
+    """Fill [states] of TOML file `path` by its preset."""
     name = given.get("preset", "")
     if not name:
         return given
@@ -106,7 +103,7 @@ def with_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def columns_of(path: Path, table: str, name: str) -> CsvTable | ArrayFile:
-    """Open the columns that a table of TOML file `path` names. Raises InputError."""
+    """Columns that a table of TOML file `path` names. Raises InputError."""
     file = path.parent / name
     if not file.is_file():
         raise InputError(f"{path}: {table}.file: {file}: no such file", remedy="give it relative to the .toml")

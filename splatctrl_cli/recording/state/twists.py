@@ -1,4 +1,4 @@
-"""Commanded twists from a log's topic, or the columns of a TOML file's [twists]."""
+"""Commanded twists of a log's topic, or of a TOML file's [twists]."""
 
 from dataclasses import dataclass
 from pathlib import Path
