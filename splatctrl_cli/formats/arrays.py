@@ -238,7 +238,7 @@ class NpzFile(ArrayFile):
             return shape, dtype
 
     def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
-        """Arrays stored by columns are read at once."""
+        """Yield the rows; an array stored by columns is read at once."""
         with ExitStack() as stack:
             shape, dtype, is_by_columns, stream = self._opened(stack, name)
             try:
@@ -353,7 +353,6 @@ class ParquetFile(ArrayFile):
                     yield values
 
     def _values(self, column: Any, name: str) -> NDArray[Any]:
-        """Missing floats are NaN."""
         if not hasattr(column.type, "value_type") or self._arrow.types.is_dictionary(column.type):
             return np.asarray(column.to_numpy(zero_copy_only=False))
         if column.null_count or len(set(column.value_lengths().to_numpy(zero_copy_only=False).tolist())) > 1:

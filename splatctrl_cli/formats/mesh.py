@@ -89,6 +89,5 @@ def _opened(path: Path) -> tuple[BytesIO | Path, str]:
 
 
 def _collada_unit(path: Path) -> float:
-    """Metres per unit."""
     unit = ElementTree.parse(path).find("{*}asset/{*}unit")
     return 1.0 if unit is None else float(unit.get("meter", "1"))

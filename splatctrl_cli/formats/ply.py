@@ -73,7 +73,7 @@ class _Element:
         return any(" " in kind for _, kind in self.properties)
 
     def dtype(self, path: Path, byte_order: str) -> "np.dtype[Any]":
-        """Float text becomes float64 to keep its digits."""
+        """The row's type; float text becomes float64 to keep its digits."""
         if self.has_lists:
             raise InputError(f"{path}: element {self.name} has list properties: expected a table of numbers")
         types = [(name, SCALARS[kind]) for name, kind in self.properties]
@@ -186,7 +186,6 @@ def _read_ascii(
 
 
 def _parse_header(path: Path, content: bytes) -> tuple[str, list[_Element], list[str], int]:
-    """Format, elements, comments and header length [bytes]."""
     if not content.startswith((b"ply\n", b"ply\r\n")):
         raise InputError(f"{path}: no PLY file: expected it to start with 'ply', got {content[:8]!r}")
     end = content.find(b"\nend_header")

@@ -37,7 +37,7 @@ class Correction:
         return round((self.calibration.clock or 0.0) * SECOND_NS)
 
     def camera(self, name: str) -> CalibratedCamera:
-        """Raises InputError for a camera not calibrated."""
+        """A calibrated camera. Raises InputError for another."""
         cameras = self.calibration.cameras
         if name == HOLDOUT and len(cameras) == 1:  # views of the one camera, held out
             return next(iter(cameras.values()))
@@ -49,7 +49,7 @@ class Correction:
         return cameras[name]
 
     def pose(self, name: str, T_recorded: Float64) -> Float64:
-        """Correct a recorded T_world_camera (4, 4). Raises InputError for another recording's."""
+        """Correct a recorded T_world_camera (4, 4). Raises InputError for another recording's calibration."""
         camera = self.camera(name)
         if camera.recorded is None:
             return T_recorded @ camera.T
@@ -146,7 +146,7 @@ class CalibratedSource(Recording):
 
     @property
     def joint_topics(self) -> JointTopics | None:
-        """None if the clock is corrected."""
+        """Joint state topics, None if the clock is corrected."""
         if self._correction.clock_ns or not isinstance(self.inner, RosLogSource | CaptureSource):
             return None
         return self.inner.joint_topics
@@ -165,7 +165,7 @@ class CalibratedSource(Recording):
                 yield stamp, camera, T
 
     def digests(self) -> dict[str, str]:
-        """Includes the calibration's sha256."""
+        """sha256 of the files and the calibration."""
         return {**self.inner.digests(), f"{CALIBRATION}{self._correction.file.name}": sha256(self._correction.file)}
 
     def _frames(self) -> Iterator[StoredFrame]:
@@ -211,7 +211,6 @@ class CalibratedSource(Recording):
 
     @cached_property
     def _paths(self) -> dict[str, tuple[list[int], list[Float64]]]:
-        """Stamps [ns] and recorded poses by camera."""
         paths: dict[str, tuple[list[int], list[Float64]]] = {}
         for stamp, camera, T in self.inner.poses():
             stamps, poses = paths.setdefault(camera, ([], []))
@@ -294,7 +293,7 @@ class PerturbedSource(Recording):
 
     @property
     def joint_topics(self) -> JointTopics | None:
-        """None if unknown."""
+        """Joint state topics, None if unknown."""
         found = getattr(self.inner, "joint_topics", None)
         return found if isinstance(found, JointTopics) else None
 
@@ -309,7 +308,7 @@ class PerturbedSource(Recording):
             yield stamp_ns, camera, self._perturbation.pose(camera, T)
 
     def digests(self) -> dict[str, str]:
-        """Includes the perturbation."""
+        """sha256 of the files, and the perturbation."""
         words = self._perturbation.words()
         return {**self.inner.digests(), f"{PERTURB}{words}": words}
 

@@ -95,7 +95,6 @@ def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], n
 
 
 def _parsed(path: Path, parse: Callable[[], Any], what: str) -> Any:
-    """Raises InputError if the file is not `what`."""
     try:
         return parse()
     except (ValueError, EOFError, ParseError, yaml.YAMLError) as error:  # ValueError: what defusedxml forbids, too
@@ -186,7 +185,6 @@ def _find(content: Any, key: str) -> Any:
 
 
 def _short(value: object) -> object:
-    """Shorten long lists to their length."""
     if isinstance(value, list) and (len(value) > _LIST_LIMIT or any(isinstance(v, list | dict) for v in value)):
         return f"{len(value)} entries"
     if isinstance(value, dict):

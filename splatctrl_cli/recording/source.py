@@ -119,7 +119,7 @@ def open_logs(paths: Sequence[Path]) -> RawLog | None:
 
 
 def describe(path: Path, options: SourceOptions | None = None) -> Summary:
-    """Raises InputError if missing or unknown."""
+    """Describe any input. Raises InputError if missing or unknown."""
     options = options or SourceOptions()
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="check the path")
@@ -260,7 +260,6 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
 
 
 def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
-    """A scene's final space by its own thresholds."""
     run: Mapping[str, Any] = describe_file(path / "run.json").facts if has_run else {}
 
     def used(name: str, default: float) -> float:
@@ -281,7 +280,6 @@ def _probability(value: Any) -> float:
 
 
 def _field_facts(path: Path) -> dict[str, object]:
-    """A grid's facts, empty for another file."""
     header: Mapping[str, Any] = describe_file(path).facts
     if header.get("format") != FORMAT or not {"shape", "first_cell", "voxel"} <= header.keys():
         return {}

@@ -122,7 +122,7 @@ def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -
 
 
 def check_grid(grid: DistanceGrid) -> Shape:
-    """Raises as `check_layout`."""
+    """A grid's cells. Raises as `check_layout`."""
     return check_layout("grid to write", {name: (v.dtype.str, v.shape) for name, v in grid.channels.items()})
 
 

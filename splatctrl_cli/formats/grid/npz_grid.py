@@ -38,7 +38,7 @@ _Members = dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]]
 
 
 def write_npz(path: Path, grid: DistanceGrid) -> None:
-    """Raises InputError for invalid channels."""
+    """Write the grid. Raises InputError for invalid channels."""
     check_grid(grid)
     members: dict[str, NDArray[np.generic]] = {
         "origin": np.asarray(grid.origin, dtype="<f8"),
@@ -90,7 +90,6 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _members(archive: zipfile.ZipFile) -> _Members:
-    """Raises ValueError if announced and stored sizes disagree."""
     members: _Members = {}
     for entry in archive.infolist():
         name = entry.filename.removesuffix(".npy")

@@ -82,7 +82,7 @@ def write_vti(path: Path, grid: DistanceGrid) -> None:
 
 
 def read_vti(path: Path) -> DistanceGrid:
-    """Undo `write_vti`. Raises InputError if missing, damaged or not ours."""
+    """Read a `write_vti` grid. Raises InputError if missing, damaged or not ours."""
     with _opened(path) as stream:
         head, starts = _head(path, stream)
         channels = {name: _values(path, stream, head, name, start) for name, start in starts.items()}

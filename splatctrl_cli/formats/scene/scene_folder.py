@@ -155,7 +155,7 @@ class SceneFolder:
 
     @cached_property
     def run(self) -> dict[str, Any]:
-        """Raises InputError if ``run.json`` cannot be read."""
+        """``run.json``. Raises InputError if unreadable."""
         file = self.path / "run.json"
         try:
             run = json.loads(file.read_text(encoding="utf-8"))
@@ -228,7 +228,7 @@ class SceneFolder:
         return run_value(self.run, ("metrics", name), kind, default, where=str(self.path / "run.json"))
 
     def gaussians(self) -> GaussianSet:
-        """Raises InputError if there are none."""
+        """The Gaussians. Raises InputError if there are none."""
         gaussians = read_gaussian_ply(self.parts.checked(self.path / "splats.ply"))[0]
         if not len(gaussians):
             raise InputError(
@@ -287,7 +287,7 @@ class SceneFolder:
         return taken
 
     def snapshot_at(self, stamp_ns: int) -> Snapshot:
-        """The newest one up to `stamp_ns`. Raises NotEvaluableError before the first."""
+        """The newest snapshot up to `stamp_ns`. Raises NotEvaluableError before the first."""
         known = [s for s in self.snapshots if s.stamp_ns <= stamp_ns]
         if not known:
             raise NotEvaluableError(
@@ -297,14 +297,14 @@ class SceneFolder:
         return known[-1]
 
     def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
-        """Occupied voxels without a splat then or, for None, finally; None in an older scene."""
+        """Occupied voxels without a splat at `stamp_ns` (None: the end); None in an older scene."""
         if stamp_ns is not None:
             return self.snapshot_at(stamp_ns).unrepresented()
         path = self.path / "occupancy.npz"
         return read_unrepresented(self.parts.checked(path)) if self.parts.has(path) else None
 
     def shell_at(self, stamp_ns: int | None) -> SplatSet | None:
-        """The shell beyond the robot's reach, for pictures, then or finally; None if absent."""
+        """The shell beyond the robot's reach, for pictures, as in `unrepresented_at`; None if absent."""
         path = self.path / SHELL_FILE if stamp_ns is None else self.snapshot_at(stamp_ns).shell_path
         return read_shell(self.parts.checked(path)) if self.parts.has(path) else None
 
@@ -313,7 +313,7 @@ class SceneFolder:
 
 
 def open_scene(path: Path) -> SceneFolder:
-    """Raises InputError for another folder."""
+    """Open a scene folder. Raises InputError for another."""
     if not path.exists():
         raise InputError(f"{path}: no such scene folder", remedy="give what 'splatctrl reconstruct' wrote")
     if path.name.endswith(PARTIAL):
@@ -349,7 +349,6 @@ class SplatFile(SceneFolder):
 
     @cached_property
     def _found(self) -> SplatSet | GaussianSet:
-        """Raises InputError if damaged, empty, or of another kind, frame or unit."""
         found, comments = read_splats(self.path)
         check_world(self.path, comments)
         if not len(found):

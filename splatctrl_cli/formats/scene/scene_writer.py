@@ -43,7 +43,7 @@ class Checkpoint:
 
 
 def read_checkpoint(folder: Path) -> Checkpoint:
-    """Raises InputError if unreadable."""
+    """Read a checkpoint. Raises InputError if unreadable."""
     path = folder / CHECKPOINT
     try:
         state = read_arrays(path, most=1 << 32)  # the largest grid takes 2.8e9 bytes, its splats the rest

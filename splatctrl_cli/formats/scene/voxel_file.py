@@ -80,7 +80,6 @@ def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
 
 @contextmanager
 def _refused(path: Path, what: str) -> Iterator[None]:
-    """Turn any error into an InputError."""
     try:
         yield
     except FileNotFoundError:
@@ -90,7 +89,7 @@ def _refused(path: Path, what: str) -> Iterator[None]:
 
 
 def read_states(path: Path) -> OccupancyGrid:
-    """Undo `write_states`. Raises InputError otherwise; never unpickles."""
+    """Read a `write_states` grid. Raises InputError otherwise; never unpickles."""
     with _refused(path, _STATES):
         arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
         header = json.loads(str(arrays["header"]))
@@ -199,7 +198,6 @@ def _balls(arrays: Arrays, voxel: float) -> Balls:
 
 
 def _edges_in(header: Mapping[str, Any]) -> set[str]:
-    """Empty for older files."""
     return {"edges"} & header.keys()
 
 

@@ -83,7 +83,7 @@ def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def gaussians_of(ply: PlyFile) -> GaussianSet:
-    """Raises as `read_gaussian_ply`."""
+    """A PLY table's Gaussians. Raises as `read_gaussian_ply`."""
     path = ply.path
     check_properties(path, ply.names, REQUIRED)
     logs = log_sigmas(ply)

@@ -264,7 +264,10 @@ def _fraction_bits(centers: Float32) -> int:
 
 
 def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
-    """(N,) little-endian words: 2 bits index the largest of x y z w, 10 (sign, size) per other."""
+    """Little-endian words (N,).
+
+    2 bits index the largest of x y z w, then 10 bits (sign, size) per other.
+    """
     quats = np.roll(quats_wxyz.astype(np.float64), -1, axis=1)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     largest = np.abs(quats).argmax(axis=1)

@@ -161,7 +161,7 @@ def check_no_shell(path: Path, comments: Mapping[str, str]) -> None:
 
 
 def read_shell(path: Path) -> SplatSet:
-    """Raises as `read_ply`, and InputError for other splats."""
+    """Read a shell. Raises as `read_ply`, and InputError for other splats."""
     splats, comments = read_ply(path)
     if not SHELL.keys() <= comments.keys():
         raise InputError(f"{path}: expected a shell, got other splats", remedy="reconstruct the scene again")
@@ -169,7 +169,7 @@ def read_shell(path: Path) -> SplatSet:
 
 
 def splats_of(ply: PlyFile) -> SplatSet:
-    """Raises as `read_ply`."""
+    """A PLY table's splats. Raises as `read_ply`."""
     path = ply.path
     if num := num_stretched(ply):
         raise InputError(
@@ -287,7 +287,7 @@ def read_spheres(path: Path) -> SplatSet:
 
 
 def describe_splats(path: Path, _head: bytes) -> Summary:
-    """Raises InputError for another kind."""
+    """Summarise a splat file. Raises InputError for another kind."""
     found, comments = read_splats(path)
     gaussians = as_gaussians(found) if isinstance(found, SplatSet) else found
     facts: dict[str, object] = {

@@ -88,7 +88,6 @@ def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def _library() -> tuple[Any, Any, Any, Any, Any]:
-    """Raises UsageError if usd-core is missing or too old."""
     try:
         from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
     except ImportError:

@@ -95,7 +95,7 @@ class CaptureSource(Recording):
         yield from filter(None, map(self._stored_frame, self._rows))
 
     def _stored_frame(self, row: Mapping[str, str]) -> StoredFrame | None:
-        """None, and counted, if an image was changed."""
+        """A row's frame; None, and counted, if an image was changed."""
         color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
         human_bytes = self._read(row["human"]) if row.get("human") else None
         camera = self._cameras[row["camera"]]
@@ -152,7 +152,6 @@ class CaptureSource(Recording):
         return data
 
     def _checked(self, name: str) -> Path:
-        """Raises InputError for a changed file."""
         file = self._path / name
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise InputError(f"{file}: lies outside the capture", remedy=AGAIN)

@@ -84,7 +84,7 @@ def is_capture(path: Path) -> bool:
 
 
 def read_capture_header(path: Path) -> dict[str, Any]:
-    """Raises InputError if not ours, or of another version."""
+    """Read capture.json. Raises InputError if not ours, or of another version."""
     file = path / "capture.json"
     try:
         header = json.loads(file.read_text(encoding="utf-8"))
@@ -102,7 +102,6 @@ def read_capture_header(path: Path) -> dict[str, Any]:
 
 
 def _check_index(path: Path) -> None:
-    """Raise InputError for a changed index file."""
     sums = FileSums(path)
     for name in INDEX_FILES:
         if not (path / name).is_file():
@@ -157,7 +156,6 @@ class FrameRows:
 
 
 def _checked(row: Mapping[str, str]) -> Mapping[str, str]:
-    """Raises ValueError if invalid."""
     int(row["stamp_ns"])
     for key in COLUMNS[4:11]:
         float(row[key])

@@ -90,12 +90,11 @@ class Journal:
         yield from (Entry(**line) for line in lines)
 
     def remove(self) -> None:
-        """Delete it after the capture."""
+        """Delete the finished journal."""
         self._stream.close()
         self._path.unlink()
 
     def _cut(self) -> None:
-        """Cut off an unfinished last line."""
         with self._path.open("rb") as stream:
             size = sum(len(line) for line in stream if line.endswith(b"\n"))
         with self._path.open("r+b") as stream:
@@ -129,7 +128,6 @@ def check_same_frame(folder: Path, before: Mapping[str, str], now: Mapping[str, 
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield whole lines of a growing file."""
     with path.open(encoding="utf-8") as stream:
         for line in stream:
             if line.endswith("\n"):
@@ -238,7 +236,7 @@ def _is_of_lens(name: str) -> bool:
 
 
 def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None:
-    """The journal is read once per image folder to bound memory."""
+    """Write sorted lines; the journal is read once per image folder to bound memory."""
     written = (name for entry in journal.entries() for _, name in entry.sums if not _is_of_lens(name))
     folders = {f"{name.rpartition('/')[0]}/" for name in written}
     with path.open("w", encoding="utf-8", newline="") as stream:
@@ -256,7 +254,6 @@ def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str,
 
 
 def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
-    """Without file names; counts the camera."""
     if stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera):
         raise InputError(
             f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="rename the camera"
@@ -307,7 +304,6 @@ def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera:
 
 
 def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
-    """An unknown byte is empty."""
     if not stored.places:
         return {}
     found = {"color": color, "depth": depth}
@@ -349,7 +345,6 @@ def _npy(depth: Float32) -> bytes:
 
 
 def _write_joints(path: Path, states: StateColumns) -> None:
-    """Write as numpy.savez, a block at a time."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         with archive.open("stamp_ns.npy", "w", force_zip64=True) as stream:
             npy.write_array(stream, states.stamp_ns, allow_pickle=False)

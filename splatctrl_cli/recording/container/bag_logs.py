@@ -88,7 +88,7 @@ class BagFile:
             return found
 
     def _record(self, stream: BinaryIO, offset: int) -> BagRecord | None:
-        """None if invalid; the stream is left after it."""
+        """Read a record or None; the stream is left after it."""
         head = self._head(stream)
         if head is None:
             return None
@@ -361,7 +361,6 @@ class Db3Log:
 
 
 def _topics(database: sqlite3.Connection) -> dict[object, Topic]:
-    """Topics by number. Raises ValueError without the tables."""
     found = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if not {"topics", "messages"} <= found:
         raise ValueError("no tables named topics and messages")

@@ -39,7 +39,7 @@ class MessageTypes:
         self._pool = DescriptorPool(files)
 
     def read(self, type_name: str, data: bytes) -> Any:
-        """Decode; unwritten fields have defaults. Raises ValueError."""
+        """Decode a message; unwritten fields have defaults. Raises ValueError."""
         try:
             return GetMessageClass(self._pool.FindMessageTypeByName(type_name)).FromString(data)
         except KeyError:
@@ -106,7 +106,7 @@ def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> A
 
 
 def as_ros(schema: str, message: Any) -> Any:
-    """Convert to its ROS message."""
+    """Convert a Foxglove message to its ROS message."""
     return _READERS[schema.replace("/", ".").rpartition(".")[2]](message)
 
 
@@ -122,7 +122,7 @@ def _object(value: Any) -> Any:
 
 
 def _header(message: Any, frame_id: str | None = None) -> Any:
-    """frame_id: for messages without that field."""
+    """A header; frame_id: for messages without that field."""
     frame_id = str(getattr(message, "frame_id", "")) if frame_id is None else frame_id
     time = getattr(message, "timestamp", None)
     seconds = _either(time, "sec", "seconds")
@@ -170,7 +170,6 @@ def _calibration(message: Any) -> Any:
 
 
 def _numbers(values: Any, count: int) -> Any:
-    """An array; `count` zeros if empty."""
     array = np.asarray([] if isinstance(values, int) else values, dtype=np.float64)
     return array if array.size else np.zeros(count)
 
@@ -188,7 +187,7 @@ def _transform(message: Any) -> Any:
 
 
 def _joint_states(message: Any) -> Any:
-    """No velocities: an unset one looks like zero."""
+    """Joint states without velocities: an unset one looks like zero."""
     return SimpleNamespace(
         header=_header(message),
         name=[str(joint.name) for joint in message.joints],
@@ -198,7 +197,7 @@ def _joint_states(message: Any) -> Any:
 
 
 def _sdk_text(message: Any) -> Any:
-    """Raises KeyError or ValueError for a missing field."""
+    """Parse an SDK text. Raises KeyError or ValueError for a missing field."""
     said = dict(part.split("=", 1) for part in message.data.split(";") if "=" in part)
     values = {key: np.array(text.split(","), np.float64) for key, text in said.items() if key in _TEXT_FIELDS}
     if "fx" in said:

@@ -120,7 +120,7 @@ class FoxgloveLog:
         self._add(topic, stamp_ns, _new("Log", level=LEVELS.index(level), message=text, name="splatctrl"))
 
     def add_numbers(self, topic: str, stamp_ns: int, values: Mapping[str, float | None]) -> None:
-        """Add a JSON object."""
+        """Add numbers as a JSON object."""
         if topic not in self._channels:
             schema = {"type": "object", "properties": {name: {"type": ["number", "null"]} for name in values}}
             made = self._writer.register_schema(f"splatctrl{topic}", "jsonschema", json.dumps(schema).encode())

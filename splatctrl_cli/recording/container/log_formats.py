@@ -62,7 +62,7 @@ class UnpackedMessagesLog(JoinedLog):
         super().__init__(log.path, (log,), log.container)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Failures are counted."""
+        """Yield unpacked messages; failures are counted."""
         budget = Budget(sum(file.stat().st_size for file in self.files))
         for message in super().messages(damage, names):
             try:
@@ -217,7 +217,7 @@ def _open_compressed(path: Path) -> RawLog:
 
 
 def _ordered_files(path: Path, told: dict[str, Any]) -> list[Path]:
-    """In recording order: metadata.yaml's, else by numbers in names."""
+    """Files in recording order: metadata.yaml's, else by numbers in names."""
     names = told.get("relative_file_paths")
     if names:
         return [path / Path(name).name for name in dict.fromkeys(names)]

@@ -139,7 +139,7 @@ class _Walk:
                 return
 
     def _part(self, offset: int, opcode: int, length: int, head: bytes) -> Part:
-        """Content is left out if too large or unknown."""
+        """Read a record, without content if too large or unknown."""
         self._count(head)
         if opcode == ATTACHMENT:
             self._check_attachment(offset, length)
@@ -283,7 +283,6 @@ def _footer(stream: BinaryIO, size: int) -> Footer | None:
 
 
 def _attachment_length(head: bytes) -> int | None:
-    """Bytes before the checksum; None if unknown."""
     at = 16
     for _ in range(2):
         if at + 4 > len(head):

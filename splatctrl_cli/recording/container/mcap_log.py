@@ -175,7 +175,6 @@ class McapLog:
             yield from self._chunk_messages(content, index.chunk_start_offset, damage, names, is_cut=False)
 
     def _forget_changed(self) -> tuple[int, int]:
-        """The file's state; forgets checksums if it changed."""
         stat = self.path.stat()
         state = stat.st_size, stat.st_mtime_ns
         self._whole = self._whole if state == self._whole else None
@@ -220,7 +219,6 @@ class McapLog:
     def _message(
         self, records: bytes, start: int, end: int, offset: int, damage: Damage, names: Collection[str] | None
     ) -> RawMessage | None:
-        """A message, None if unwanted or invalid."""
         if end - start < _MESSAGE.size:
             damage.add(f"{self.path.name}: a message record of {end - start} bytes")
             return None

@@ -24,10 +24,8 @@ class BadRecordError(ValueError):
 
 
 class _Fields(ReadDataStream):  # type: ignore[misc]
-    """A reader of fields within a record's bytes."""
-
     def read(self, length: int) -> bytes:
-        """Raises EndOfFile at a record's end, where the package returns fewer."""
+        """Read exactly `length` bytes. Raises EndOfFile, where the package returns fewer."""
         found: bytes = super().read(length)
         if len(found) < length:
             raise EndOfFile

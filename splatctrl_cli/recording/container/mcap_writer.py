@@ -49,7 +49,7 @@ class McapLog:
         self._sequence: dict[str, int] = {}
 
     def add_joint_state(self, state: JointState, joint_names: Sequence[str]) -> None:
-        """Effort is empty."""
+        """Add a /joint_states message, effort empty."""
         message = self._new(
             "sensor_msgs/msg/JointState",
             header=self._header(state.stamp_ns, ""),

@@ -207,7 +207,6 @@ def scan_folders(root: Path) -> dict[str, Path]:
 
 
 def _images(folder: Path) -> dict[int, Path]:
-    """Images by view number, preferably light 3."""
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         match = re.fullmatch(r"rect_(\d+)_(\d+|max)(_r5000)?\.(png|jpg)", path.name)
@@ -253,7 +252,6 @@ def _mask_file(folder: Path, number: int) -> Path:
 
 
 def _camera_file(root: Path, number: int) -> Path:
-    """The training images' camera, else the full images'."""
     candidates = [root / "Cameras" / part / f"{number:08d}_cam.txt" for part in ("train", ".")]
     for path in candidates:
         if path.is_file():

@@ -34,7 +34,7 @@ class CameraTable:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Pixel (0, 0) is centred at u = v = 0."""
+        """Intrinsics with pixel (0, 0) centred at u = v = 0."""
         return Intrinsics(
             fx=self.fx,
             fy=self.fy,
@@ -192,7 +192,7 @@ def _refused(what: str) -> InputError:
 
 
 def read_description(path: Path, root: Path | None = None) -> Description:
-    """Raises InputError naming an unknown, missing or wrong key."""
+    """Parse a description. Raises InputError naming an unknown, missing or wrong key."""
     return _read(_content(path), path, root)
 
 
@@ -218,7 +218,7 @@ def read_table(
 
 
 def has_table(path: Path, name: str) -> bool:
-    """Raises InputError if not TOML."""
+    """True with table [name]. Raises InputError if not TOML."""
     return name in _content(path)
 
 

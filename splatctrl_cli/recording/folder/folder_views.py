@@ -164,7 +164,6 @@ def _pose(table: PosesTable | None, view: ListedView, lens: CameraTable, options
 
 
 def _scale(description: Description, view: ListedView, options: SourceOptions) -> float:
-    """Metres per count. Raises InputError if impossible."""
     if options.depth_scale is not None:
         return options.depth_scale
     scale = description.depth.scale if view.depth_scale is None else view.depth_scale
@@ -204,7 +203,7 @@ def _listed(description: Description, options: SourceOptions, loss: LossReport) 
 
 
 def _masks(description: Description, names: list[str], loss: LossReport) -> dict[str, Path]:
-    """Missing ones are noted in `loss`."""
+    """Masks by view name; missing ones are noted in `loss`."""
     assert description.frames is not None
     pattern = description.frames.human_mask
     if not pattern:
@@ -222,7 +221,6 @@ def _masks(description: Description, names: list[str], loss: LossReport) -> dict
 
 
 def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float64]:
-    """Matrices as written, by view name."""
     table, root = description.poses, description.root
     if table is None:
         raise InputError(
@@ -250,7 +248,7 @@ def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float
 
 
 def _holdout(description: Description, names: list[str], options: SourceOptions) -> set[str]:
-    """An entry is a name, else a position."""
+    """Held-out names; an entry is a name, else a position."""
     entries = description.split.holdout if options.holdout is None else options.holdout
     held = set()
     for entry in entries:
@@ -267,7 +265,7 @@ def _holdout(description: Description, names: list[str], options: SourceOptions)
 
 
 def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
-    """The layout's, else by file name, frame rate, or one second a frame."""
+    """Stamp by layout, file name, frame rate, or one second a frame."""
     stamps = description.stamps
     if view.stamp_ns is not None:
         return view.stamp_ns

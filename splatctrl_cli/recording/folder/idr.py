@@ -112,7 +112,6 @@ def projection(view: DtuView) -> Float64:
 
 
 def _sphere(views: Sequence[DtuView]) -> tuple[Float64, float]:
-    """Centre (3,) and radius [mm]."""
     centers = MILLIMETRES * np.array([view.T_world_camera[:3, 3] for view in views])
     axes = np.array([view.T_world_camera[:3, 2] for view in views])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # what of a vector is no way along the axis
@@ -137,7 +136,10 @@ def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
 
 
 def _numbered(folder: Path, num: int) -> dict[int, Path]:
-    """In order if there are `num` images, else by name. Raises InputError for another name."""
+    """Images by camera number: in order if there are `num`, else by name.
+
+    Raises InputError for another name.
+    """
     paths = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
     if len(paths) == num:
         return dict(enumerate(paths))

@@ -251,7 +251,7 @@ def by_numbers(name: str) -> tuple[list[int], str]:
 
 
 def pose_or_none(matrix: Float64) -> Float64 | None:
-    """None if not finite: how trackers write a loss."""
+    """The matrix, None if not finite: how trackers write a loss."""
     return matrix if np.isfinite(matrix).all() else None
 
 
@@ -261,7 +261,7 @@ def read_pose(path: Path) -> Float64 | None:
 
 
 def read_json(path: Path) -> Any:
-    """Raises InputError if unreadable."""
+    """Read JSON. Raises InputError if unreadable."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:

@@ -56,7 +56,7 @@ TRAJECTORY = "lowres_wide.traj"
 
 
 def read_arkit(folder: Path, options: SourceOptions) -> Description:
-    """Lenses that differ become separate cameras."""
+    """Describe the folder; different lenses become separate cameras."""
     options.refuse(("intrinsics",), "a video of ARKitScenes", folder)
     root = _frames(folder)
     assert root is not None
@@ -97,7 +97,6 @@ def _stamp_ns(path: Path) -> int | None:
 
 
 def _poses(path: Path) -> dict[str, Float64]:
-    """T_world_camera by stamp [s] as written."""
     poses = {}
     for where, words, values in read_rows(path):
         if len(values) != 7 or not np.isfinite(values).all():
@@ -139,7 +138,7 @@ COLOR_FOLDERS = ("rgb", "gray")
 
 
 def read_bop(folder: Path, options: SourceOptions) -> Description:
-    """No poses without cam_R_w2c."""
+    """Describe the scene, without poses if cam_R_w2c is missing."""
     options.refuse(("intrinsics",), "a BOP scene", folder)
     views: list[ListedView] = []
     num_colors = num_depths = 0
@@ -201,7 +200,6 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
 
 
 def _pose(entry: dict[str, Any]) -> Float64 | None:
-    """World to camera [m], or None."""
     if "cam_R_w2c" not in entry or "cam_t_w2c" not in entry:
         return None
     return pose_at(
@@ -222,7 +220,7 @@ _ESTIMATED = ("est", "mvsnet")  # in the names of folders with a network's depth
 
 
 def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
-    """A lens per K; --depth-scale is metres per length of cameras and depth."""
+    """Describe the folder, a lens per K; --depth-scale is metres per length of cameras and depth."""
     options.refuse(("intrinsics",), "an MVSNet scene", folder)
     files = {path.name.removesuffix("_cam.txt"): path for path in sorted(folder.glob(_CAMERAS))}
     cameras = {stem: read_camera_file(path) for stem, path in files.items()}
@@ -261,7 +259,6 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
 
 
 def _images(folder: Path, stems: set[str]) -> dict[str, Path]:
-    """Images of the folder with most of them."""
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and "depth" not in path.name.lower()]
     found = [{stem: path for stem, path in images_of(place).items() if stem in stems} for place in (*inner, folder)]
     most = max(found, key=len)
@@ -273,7 +270,6 @@ def _images(folder: Path, stems: set[str]) -> dict[str, Path]:
 
 
 def _depths(folder: Path) -> tuple[dict[int, Path], list[str]]:
-    """Depth by number, and a note on skipped folders."""
     found = {
         path.name: dict(_maps(path)) for path in folder.iterdir() if path.is_dir() and "depth" in path.name.lower()
     }

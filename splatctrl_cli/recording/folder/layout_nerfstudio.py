@@ -34,7 +34,7 @@ _SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
 
 
 def read(folder: Path, options: SourceOptions) -> Description:
-    """Depth is in millimetres by default."""
+    """Describe the folder; depth defaults to millimetres."""
     options.refuse(("intrinsics",), "a folder with transforms.json", folder)
     file = next(name for name in FILES if (folder / name).is_file())
     poses = PosesTable(format="nerfstudio", file=file, axes="opengl")
@@ -82,7 +82,6 @@ def _view(
     description: Description,
     matrices: dict[str, Float64],
 ) -> ListedView:
-    """A frame's values override the file's."""
     name, said = str(entry["file_path"]), {**content, **entry}
     color = _image(path.parent / _with_slashes(name))
     depth, scale = _only(entry, _DEPTHS, path), _only(said, _SCALES, path)
@@ -106,7 +105,7 @@ def _view(
 
 
 def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
-    """None without any. Raises InputError if two differ."""
+    """The value of any key, or None. Raises InputError if two differ."""
     found = {key: said[key] for key in keys if said.get(key) not in (None, "")}
     if len(set(found.values())) > 1:
         both = " and ".join(f"{key} = {value}" for key, value in found.items())
@@ -119,7 +118,7 @@ def _with_slashes(name: str) -> str:
 
 
 def _image(path: Path) -> Path:
-    """The name may omit `.png` or `.jpg`, as in Blender's scenes."""
+    """An image whose name may omit `.png` or `.jpg`, as in Blender's scenes."""
     if path.suffix:
         return path
     return next((file for end in (".png", ".jpg") if (file := path.with_name(path.name + end)).is_file()), path)

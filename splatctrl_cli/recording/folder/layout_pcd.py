@@ -58,7 +58,7 @@ class Cloud:
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Raises InputError if not organised or without colour."""
+    """Read an organised coloured cloud. Raises InputError for another."""
     said = _head(path)
     size = (said.height, said.width)
     try:
@@ -144,7 +144,6 @@ def read(path: Path, options: SourceOptions) -> Description:
 
 
 def _fitted(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[str]]:
-    """Camera, is_world of the points, and notes."""
     cloud, given = read_cloud(path), options.intrinsics.get(CAMERA)
     fits = []
     for is_world in (False, True):
@@ -176,7 +175,7 @@ def _library() -> Any:
 
 
 def _head(path: Path) -> Any:
-    """Raises InputError if not organised or without colour."""
+    """Read a header. Raises InputError if not organised or without colour."""
     lines: list[str] = []
     try:
         with path.open("rb") as stream:
@@ -211,7 +210,7 @@ def _unreadable(path: Path, error: Exception) -> InputError:
 
 
 def _viewpoint(said: Any) -> Float64:
-    """(4, 4) of x, y, z, qw, qx, qy, qz."""
+    """T_world_camera (4, 4) of x, y, z, qw, qx, qy, qz."""
     x, y, z, qw, qx, qy, qz = said.viewpoint
     return transform_from((x, y, z), (qx, qy, qz, qw))
 
@@ -221,7 +220,6 @@ def _is_seen(points: Float64) -> Bool:
 
 
 def _color_file(path: Path) -> bytes:
-    """PNG, empty if unreadable."""
     try:
         color = read_cloud(path).color
     except InputError:

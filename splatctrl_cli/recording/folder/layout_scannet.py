@@ -74,7 +74,7 @@ class _Sens:
 
 
 def read_sens(path: Path, options: SourceOptions) -> Description:
-    """The file, or a folder's only one; depth is registered to colour."""
+    """Describe the file, or a folder's only one; depth is registered to colour."""
     files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"))
     if len(files) > 1:
         raise InputError(f"{path}: {len(files)} files *{SUFFIX}", remedy=f"give one of them, such as {files[0]}")
@@ -194,7 +194,6 @@ def _part(path: Path, first: int, length: int) -> bytes:
 
 
 def _png(read: Callable[[], bytes], sens: _Sens) -> bytes:
-    """Empty for another number of words."""
     data, (width, height) = read(), sens.depth_size
     num = 2 * width * height
     if sens.is_packed:

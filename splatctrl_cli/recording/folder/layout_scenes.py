@@ -101,7 +101,6 @@ def read_frames(folder: Path, options: SourceOptions) -> Description:
 
 
 def _files(folder: Path, pattern: str, kind: str) -> dict[str, Path]:
-    """Paths up to `kind`, sorted by numbers."""
     paths = sorted(folder.glob(pattern), key=lambda p: by_numbers(p.relative_to(folder).as_posix()))
     return {path.relative_to(folder).as_posix().partition(kind)[0]: path for path in paths}
 

@@ -101,7 +101,7 @@ _BONN_NOTE = (
 
 
 def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
-    """Pairs within the tolerance, poses interpolated."""
+    """Describe pairs within the tolerance, with interpolated poses."""
     colors, depths = listed(folder / "rgb.txt"), listed(folder / "depth.txt")
     series = _series(folder)
     file = folder / "groundtruth.txt"
@@ -182,7 +182,7 @@ ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
 
 
 def read_sun3d(folder: Path, options: SourceOptions) -> Description:
-    """Images within the tolerance of a depth image."""
+    """Describe images within the tolerance of a depth image."""
     colors, depths = _by_stamp(folder / "image"), _by_stamp(folder / "depth")
     extrinsics = sorted((folder / "extrinsics").glob("*.txt"))
     poses = _poses(extrinsics[-1]) if extrinsics else []
@@ -204,7 +204,6 @@ def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
 
 
 def _poses(path: Path) -> list[Float64]:
-    """T_world_camera (4, 4) per image."""
     values = read_numbers(path)
     if len(values) % 12:
         raise InputError(f"{path}: expected 3x4 matrices, got {len(values)} numbers", remedy="copy the file again")

@@ -30,7 +30,7 @@ def has_views(path: Path) -> bool:
 
 
 def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
-    """Raises InputError for an unknown layout."""
+    """Open a dataset's folder. Raises InputError for an unknown layout."""
     check_not_partial(folder)
     layout = layout_of(folder)
     if layout is None and ((folder / "Rectified").is_dir() or idr_scans(folder)):

@@ -143,7 +143,7 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
 
 
 def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info: str) -> bool:
-    """True if depth is on colour pixels: equal size, frame (or by name), K and distortion."""
+    """True if depth is on colour pixels: equal size, frame (or name), K and distortion."""
     color_image, depth_image = survey.topics[color].image, survey.topics[depth].image
     if (color_image.width, color_image.height) != (depth_image.width, depth_image.height):
         return False
@@ -161,7 +161,6 @@ def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info:
 
 
 def _same_distortion(one: Calibration, two: Calibration) -> bool:
-    """Missing coefficients are 0."""
     bent = [is_distorted(c.distortion_model, c.distortion) for c in (one, two)]
     if not all(bent):
         return not any(bent)
@@ -278,7 +277,6 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
 
 
 def _named_unlike(survey: Survey) -> str:
-    """Topics and why, after a semicolon."""
     found = []
     for topic in image_topics(survey, "unlike"):
         image, name = topic.image, topic.topic.name

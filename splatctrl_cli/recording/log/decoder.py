@@ -132,7 +132,6 @@ def pack_image(header: Any, pixels: NDArray[np.uint8]) -> bytes:
 
 
 def _unpack_image(data: bytes) -> Any:
-    """Undo `pack_image`."""
     _, seconds, nanoseconds, height, width, length = _IMAGE_HEAD.unpack_from(data)
     start, stamp = _IMAGE_HEAD.size + length, SimpleNamespace(sec=seconds, nanosec=nanoseconds)
     return SimpleNamespace(

@@ -402,7 +402,6 @@ def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
 
 
 def _numbers(data: bytes) -> NDArray[np.int64]:
-    """All numbers of a stream, padding included."""
     words = np.frombuffer(data, dtype="<u4", count=len(data) // 4)
     nibbles = ((words[:, None] >> np.arange(28, -4, -4, dtype=np.uint32)) & 15).astype(np.int64).ravel()
     ends = np.flatnonzero(nibbles < 8)

@@ -302,15 +302,15 @@ class Undistortion:
         self._map_u[~is_seen] = -10.0  # folded back into the image, or outside of it
 
     def color(self, image: UInt8) -> UInt8:
-        """(H, W, 3), interpolated."""
+        """Undistort (H, W, 3), interpolated."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_LINEAR), dtype=np.uint8)
 
     def labels(self, image: UInt8) -> UInt8:
-        """(H, W), nearest pixel."""
+        """Undistort (H, W), nearest pixel."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.uint8)
 
     def depth(self, image: Float32) -> Float32:
-        """(H, W) [m], nearest pixel."""
+        """Undistort (H, W) [m], nearest pixel."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.float32)
 
 
@@ -323,15 +323,15 @@ class Lens:
     depth_to_color: DepthToColor | None = None
 
     def color(self, image: UInt8) -> UInt8:
-        """(H, W, 3), undistorted."""
+        """Undistort (H, W, 3)."""
         return image if self.undistortion is None else self.undistortion.color(image)
 
     def labels(self, image: UInt8) -> UInt8:
-        """(H, W), undistorted."""
+        """Undistort (H, W)."""
         return image if self.undistortion is None else self.undistortion.labels(image)
 
     def depth(self, image: Float32) -> Float32:
-        """Recorded [m] to colour's pixels (H, W)."""
+        """Map recorded depth [m] to colour's pixels (H, W)."""
         if self.depth_to_color is not None:
             return self.depth_to_color.warp(image)
         return image if self.undistortion is None else self.undistortion.depth(image)

@@ -60,7 +60,7 @@ class Camera(Lens):
     human_topic: str = ""
 
     def pose_at(self, tf: TfTree, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
-        """None if tf does not know it."""
+        """T_world_camera, None if tf does not know it."""
         if self.fixed_pose is not None:
             return self.fixed_pose
         return tf.lookup(self.world_frame, self.frame_id, stamp_ns, tolerance_ns)
@@ -146,7 +146,7 @@ def intrinsics_of(calibration: Calibration) -> Intrinsics:
 
 
 def _rectified(calibration: Calibration) -> Calibration:
-    """P if set, without distortion; valid if the lens is known."""
+    """The rectified camera: P if set, without distortion; valid if the lens is known."""
     K = calibration.projection if calibration.projection[0, 0] > 0 else calibration.K
     pinhole = replace(calibration, K=K, distortion_model="plumb_bob", distortion=np.zeros(0))
     model = lens_model(calibration.distortion_model)
@@ -190,7 +190,7 @@ class _Builder:
         self._topics = topics
 
     def build(self) -> Camera:
-        """Raises InputError for the first problem."""
+        """Build the camera. Raises InputError for the first problem."""
         topics = self._topics
         self._check_depth()
         self._check_clock()
@@ -214,7 +214,7 @@ class _Builder:
         )
 
     def problems(self) -> list[str]:
-        """Empty if `build` succeeds."""
+        """List all problems; empty if `build` succeeds."""
         found = []
         intrinsics = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
         steps: list[Callable[[], object]] = [
@@ -308,7 +308,6 @@ class _Builder:
         )
 
     def _check_depth(self) -> None:
-        """Raise InputError if not depth, or ambiguous."""
         topics = self._topics
         image = self._survey.topics[topics.depth].image
         if image.kind != "depth":
@@ -363,7 +362,6 @@ class _Builder:
             raise InputError(f"{self._where}: {info}: {error.message}", remedy=error.remedy) from None
 
     def _registration(self, color: Intrinsics) -> DepthToColor:
-        """Depth's warp into colour. Raises InputError if K or the transform is unknown."""
         topics, tf, color_frame = self._topics, self._survey.tf, self._frame_id
         depth_image = self._survey.topics[topics.depth].image
         size = f"{depth_image.encoding} {depth_image.width}x{depth_image.height}"

@@ -77,7 +77,7 @@ class RosLogSource(Recording):
 
     @property
     def loss(self) -> LossReport:
-        """Undecodable images are those of the fullest pass."""
+        """The loss; undecodable images are the fullest pass's."""
         loss, most = self._loss, max(self._passes, key=lambda one: (one.damage.count, one.num_invalid))
         return replace(
             loss,
@@ -150,7 +150,6 @@ class RosLogSource(Recording):
     def _add(
         self, plan: FramePlan, found: Survey, camera: Camera, stamp_ns: Index, color: Index, depth: Index
     ) -> None:
-        """Plan posed pairs. Raises InputError without any."""
         tolerance_ns = round(self._options.pose_tolerance_s * SECOND_NS)
         pairing_ns = round(self._options.pairing_tolerance_s * SECOND_NS)
         masks = _mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
@@ -240,7 +239,6 @@ def _stored_frame(
 
 
 def _rig(log: RawLog, found: Survey, options: SourceOptions) -> tuple[Camera, ...]:
-    """Raises InputError, naming damage that may be the cause."""
     try:
         return build_cameras(log, found, options)
     except InputError as error:

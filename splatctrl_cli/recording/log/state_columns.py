@@ -168,7 +168,7 @@ class StateCollector:
         self._columns = ColumnWriter({name: joints if name in OF_JOINTS else pose for name in COLUMNS}, {})
 
     def add(self, state: JointState) -> None:
-        """Raises InputError for another number of joints."""
+        """Add a state. Raises InputError for another number of joints."""
         if np.shape(state.position) != (self._num_joints,):
             raise InputError(
                 f"joint state {len(self._stamps)}: expected {self._num_joints} joints, got {np.size(state.position)}"
@@ -184,7 +184,6 @@ class StateCollector:
 
 
 def _optional(values: Table | None, first: int, last: int) -> list[Float64 | None]:
-    """Values of a range, None if not finite."""
     if values is None:
         return [None] * (last - first)
     return [value if np.isfinite(value).all() else None for value in values[first:last]]

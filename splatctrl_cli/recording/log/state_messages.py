@@ -59,7 +59,7 @@ def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoint
 
 
 def rigid_or_none(T: Float64) -> Float64 | None:
-    """None unless finite and a rotation: an unfilled field is zeros."""
+    """The pose (4, 4); None unless finite and a rotation (an unfilled field is zeros)."""
     R = T[:3, :3]
     is_rigid = np.isfinite(T).all() and np.abs(R.T @ R - np.eye(3)).max() < _MAX_SKEW and np.linalg.det(R) > 0
     return T if is_rigid else None
@@ -211,7 +211,7 @@ class JointStream:
         return self._columns.tables()
 
     def add(self, state: RawJoints) -> None:
-        """Raises OverflowError for a time beyond 64 bits."""
+        """Add a state. Raises OverflowError for a time beyond 64 bits."""
         times = array("q", (state.stamp_ns, state.log_time_ns))  # both, before either is kept
         self._stamps.append(times[0])
         self._log_times.append(times[1])
@@ -253,7 +253,7 @@ class JointLog:
         return list(self._streams.values())
 
     def extend(self, states: Iterable[RawJoints]) -> None:
-        """Raises OverflowError for a time beyond 64 bits."""
+        """Add states. Raises OverflowError for a time beyond 64 bits."""
         for state in states:
             self.notes.update(filter(None, [state.note]))
             if state.names:

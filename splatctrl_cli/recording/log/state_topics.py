@@ -35,8 +35,6 @@ _COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoi
 
 @dataclass(frozen=True, kw_only=True)
 class _Stream:
-    """States of a topic with equal joints; `names` may be renamed."""
-
     where: str
     names: tuple[str, ...]
     states: JointStream
@@ -316,7 +314,6 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
 
 
 def _is_still(table: Table, before: Index, after: Index) -> Bool:
-    """True (T,) for pairs without a moved joint."""
     changes = (table[after[first:last]] - table[before[first:last]] for first, last in ranges(len(before)))
     return np.concatenate([np.zeros(0, np.bool_), *(np.abs(c).max(axis=1) < STATES_STILL for c in changes)])
 

@@ -231,7 +231,6 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
 
 
 def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
-    """Velocity (T, J), missing ones from positions."""
     num_taken, is_zero, why = _missing_velocities(raw)
     if not num_taken:
         thinned = raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // fixed.STATES_COMPARED))
@@ -271,7 +270,6 @@ def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
 
 
 def _compare_units(raw: RawTrack, loss: LossReport) -> None:
-    """Note other units; reads all states at once."""
     position, velocity = raw.position[: len(raw.stamp_ns)], raw.velocity[: len(raw.stamp_ns)]
     slopes: Float64 = differentiated(raw.stamp_ns, position)
     is_fast = np.abs(slopes) > fixed.STATES_SPEED

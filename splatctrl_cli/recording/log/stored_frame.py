@@ -140,7 +140,6 @@ def write_rows(stream: IO[bytes], rows: Table) -> None:
 
 
 def _blocks(path: Path) -> Iterator[Float64]:
-    """Raises ValueError for a file not of `write_rows`."""
     with path.open("rb") as stream:
         shape, is_by_columns, dtype = npy_head(stream)
         if dtype != np.dtype("<f8") or is_by_columns or not shape:
@@ -181,17 +180,17 @@ class StoredFrame:
 
     @cached_property
     def color(self) -> UInt8:
-        """Raises InputError if undecodable."""
+        """The colour. Raises InputError if undecodable."""
         return self._read(self.read_color)
 
     @cached_property
     def depth(self) -> Float32:
-        """Raises InputError if undecodable."""
+        """The depth. Raises InputError if undecodable."""
         return self._read(self.read_depth)
 
     @property
     def frame(self) -> RgbdFrame:
-        """Raises InputError if undecodable."""
+        """The decoded frame. Raises InputError if undecodable."""
         return RgbdFrame(
             stamp_ns=self.stamp_ns,
             camera=self.camera,

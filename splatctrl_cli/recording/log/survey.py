@@ -90,7 +90,7 @@ class StampClock:
 
     @property
     def went_back(self) -> bool:
-        """True if it did; single stamps may err."""
+        """True after several such stamps; single ones may err."""
         return self.num_back >= IMAGES_FEWEST_BACK
 
 
@@ -298,7 +298,7 @@ def _calibration(message: Any) -> Calibration | None:
 
 
 def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints]:
-    """Log time shifts all of a message."""
+    """Joint states; log time shifts all of a message."""
     states = read_states(decoded, message.topic.type_name, message.log_time_ns)
     if not result.by_log_time:
         return states
@@ -340,7 +340,6 @@ def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:
 
 
 def _first_chunks(index: LogIndex) -> list[ChunkIndex]:
-    """Each channel's first chunk and the file's first, within bounds."""
     wanted = {chunk.chunk_start_offset: chunk for chunk in index.chunks[:4]}
     for channel in sorted(index.counts):
         first = next((c for c in index.chunks if channel in c.message_index_offsets), None)

@@ -136,7 +136,6 @@ def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[Ra
 
 
 def _decode(context: Any, data: bytes | None, number: int) -> tuple[list[Any], bool]:
-    """The images, and True if the decoder reported a loss."""
     av = of_extra(LIBRARY, EXTRA, "video topics")
     packet = None if data is None else av.Packet(data)
     if packet is not None:
@@ -217,7 +216,7 @@ class VideoFileLog:
         return (self._topic,)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Raises InputError if images and stamps differ in number."""
+        """Yield the images. Raises InputError if they and the stamps differ in number."""
         if names is not None and self._topic.name not in names:
             return
         num, found = 0, Damage()
@@ -234,7 +233,6 @@ class VideoFileLog:
             )
 
     def _frames(self, damage: Damage) -> Iterator[Any]:
-        """Images in display order, None if damaged."""
         try:
             with self._av.open(str(self.path)) as container:
                 if not container.streams.video:
@@ -257,7 +255,6 @@ class VideoFileLog:
 
 
 def _read_stamps(path: Path) -> Stamps:
-    """Stamps [ns] in order. Raises InputError."""
     text = path.read_text(encoding="utf-8", errors="replace")
     lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     rows, column = [re.split(r"[,;\s]+", line) for line in lines], 0

@@ -100,7 +100,7 @@ class CsvTable:
 
 
 def read_csv(path: Path) -> CsvTable:
-    """Raises InputError for a file without states."""
+    """Open a CSV. Raises InputError without states."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             lines = list(islice((line for line in csv.reader(stream) if line), 2))
@@ -172,7 +172,6 @@ def _block(table: CsvTable, name: str, num: int) -> list[int] | None:
 
 
 def _sent(table: CsvTable, num: int) -> list[int] | None:
-    """The commanded velocities' columns, else the desired ones'."""
     sent = [table.names.index(n) for i in range(num) if (n := f"cmd.dq_d[{i}]") in table.names]
     if not sent:
         sent = [_last(table.names, n) for i in range(num) if table.names.count(n := f"dq_d[{i}]") == 2]

@@ -111,7 +111,6 @@ def _of_table(path: Path, name: str) -> LoggedTwists:
 
 
 def _checked(where: str, stamps: Stamps, twists: Float64, frames: list[str], notes: list[str]) -> LoggedTwists:
-    """Finite twists, sorted, one per stamp, in one frame."""
     if len(set(frames)) > 1:
         raise InputError(
             f"{where}: expected twists in one frame, got {', '.join(sorted(set(frames)))}",
