@@ -1,8 +1,8 @@
 """Arrays in ``.npz`` without timestamps (same arrays, same bytes), read within a size limit.
 
 Ten megabytes of ``.npz`` can hide ten gigabytes of zeros. NPZ, HDF5 and Parquet (extra `tables`: h5py, pyarrow) are
-read in blocks of rows (T, ...). HDF5 names arrays by path (``observations/qpos``), Parquet by column; equal lists
-make an array (T, K).
+read in blocks of rows. HDF5 names arrays by path (``observations/qpos``), Parquet by column; equal lists make an
+array (T, K).
 """
 
 import tokenize
@@ -124,9 +124,9 @@ def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> ND
 
 
 def npy_of(data: bytes) -> NDArray[np.generic]:
-    """The array of ``.npy`` bytes, allocated only if they suffice, unlike `np.load`.
+    """The array of ``.npy`` bytes. Raises ValueError for objects or too few bytes.
 
-    Raises ValueError for objects or too few bytes.
+    `np.load` would allocate what the header announces.
     """
     return _array(BytesIO(data), "", len(data), None)
 

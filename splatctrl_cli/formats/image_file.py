@@ -1,6 +1,6 @@
-"""Image files: heads of JPEG and PNG without decoding, pixels, and portable float maps.
+"""Image files: heads of JPEG and PNG without decoding, pixels, portable float maps.
 
-PFM has one float32 channel, as MVSNet stores depth, with rows from the bottom.
+PFM: one float32 channel, as MVSNet's depth, rows from the bottom.
 """
 
 import re

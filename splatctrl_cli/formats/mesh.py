@@ -36,9 +36,9 @@ class TriangleMesh:
 def load_mesh(path: Path) -> TriangleMesh:
     """Load a mesh that trimesh reads (OBJ, STL, PLY, OFF, GLB, COLLADA), all parts as one.
 
-    Vertices at one place are merged: a texture seam is not a hole. COLLADA is scaled by its unit; its up axis is
-    ignored, as in RViz. Bytes after a binary STL's faces are ignored, with a note. Raises InputError if unreadable,
-    without triangles, or not finite.
+    Vertices at one place are merged: a texture seam is not a hole. COLLADA is scaled by its unit, without its up
+    axis, as in RViz. Bytes after a binary STL's faces are noted. Raises InputError if unreadable, without triangles,
+    or not finite.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected a mesh, got no such file")

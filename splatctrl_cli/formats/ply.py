@@ -131,9 +131,8 @@ def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) 
 def write_table(path: Path, rows: NDArray[Any], comments: Mapping[str, str]) -> None:
     """Write `rows` (float32 and uint8 fields) as element vertex. Same input, same bytes.
 
-    Some readers expect the vertex count in line three, so comments follow the properties. They stop at characters
-    outside ASCII, which become backslash escapes. Raises UsageError for a comment of several lines, or a key with a
-    colon.
+    Some readers want the vertex count in line three, so comments follow the properties; some stop outside ASCII,
+    which becomes backslash escapes. Raises UsageError for a comment of several lines, or a key with a colon.
     """
     fields: Mapping[str, Any] = rows.dtype.fields or {}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
@@ -266,9 +265,8 @@ _Line = tuple[int, list[str]]
 def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
     """Yield a CSV's points (Q, 3) float64 [m] of x, y, z, at most `POINTS_PER_BLOCK` at once.
 
-    A first line of numbers is no header, and then has three columns. Ignores other columns and empty lines. Raises
-    InputError naming `name`, line and column for a missing column, another length, or no finite number within
-    `MAX_PLACE`.
+    Without a header (a first line not all numbers) it has three columns; other columns are ignored. Raises InputError
+    naming `name`, line and column for a missing column, another length, or no finite number within `MAX_PLACE`.
     """
     reader = csv.reader(stream)
     lines: Iterator[_Line] = ((reader.line_num, row) for row in reader if row)

@@ -105,7 +105,7 @@ def correction_of(options: SourceOptions, where: str) -> Correction | None:
 
 
 def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
-    """Return the source, corrected and then perturbed as the options ask.
+    """The source, corrected and then perturbed as the options ask.
 
     Raises InputError for another recording's calibration, UsageError as `Perturbation.of`.
     """
@@ -118,8 +118,8 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
 class CalibratedSource(Recording):
     """Another source's records, corrected by a calibration.
 
-    Joint states move to the frames' clock. A moving camera's pose is recorded at the frame's time on the robot's
-    clock: by a log's transforms, else between frames. Frames without a pose within `tolerance_ns` are left out and
+    Joint states move to the frames' clock. A moving camera takes its pose at the frame's time on the robot's clock:
+    from a log's transforms, else between frames. Frames without a pose within `tolerance_ns` are left out and
     counted.
     """
 

@@ -80,7 +80,7 @@ def lacks_depth(source: FrameSource) -> InputError | None:
 def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
     """Open one input, or several logs recorded at once.
 
-    Raises as `open_source`, and InputError if one of several is not a log.
+    Raises as `open_source`, and InputError if one of several is no log.
     """
     log = open_logs(paths)
     options = options or SourceOptions()
@@ -105,7 +105,7 @@ def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescript
 def open_logs(paths: Sequence[Path]) -> RawLog | None:
     """Open a log, or several of one session; None for a single path of another kind.
 
-    Raises InputError if missing, or if one of several is not a log.
+    Raises InputError if missing, or if one of several is no log.
     """
     for path in paths:
         if not path.exists():

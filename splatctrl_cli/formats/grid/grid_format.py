@@ -1,10 +1,9 @@
 """The file formats of a baked distance grid: declarations, channels and headers.
 
-A channel may be a memory map larger than memory, so functions copy at most `CHUNK` bytes at once.
+A channel may exceed memory as a memory map, so at most `CHUNK` bytes are copied at once.
 
-`GridSlabs` fills a grid on disk along x: one ``NAME.npy`` per channel, at full size from the start, and
-``progress.json`` with the plan and finished layers. A slab of layers is one run of bytes in each file, so an
-interrupted bake can continue.
+`GridSlabs` fills a grid on disk along x: a ``NAME.npy`` per channel at full size, and ``progress.json`` with the plan
+and finished layers. A slab is one run of bytes in each file, so an interrupted bake can continue.
 """
 
 import json
@@ -169,10 +168,10 @@ class GridFormat:
     """A file format, listed in its module's ``ENTRIES``, for the program and its docs.
 
     `name`: the --formats value. `write`: to a path with `suffix`, or a file per channel if `is_per_channel`.
-    `describe`: from a path and its first bytes; None for another kind. `needs`: channels, one of which is required.
-    `holds_unknown`: cells can lack a distance. `bytes_per_cell`: on disk, None for all channels' bytes. `check`
-    raises UsageError without a library. `docs`: row in docs/artefacts.md, cells between bars: name, file, who opens
-    it, checked, cost.
+    `describe`: from a path and its first bytes; None for another kind. `needs`: one of these channels.
+    `holds_unknown`: cells can lack a distance. `bytes_per_cell`: on disk, None for all channels'. `check` raises
+    UsageError without a library. `docs`: row in docs/artefacts.md, cells between bars: name, file, who opens it,
+    checked, cost.
     """
 
     name: str
@@ -258,9 +257,9 @@ class GridSlabs:
         self.num_layers, self.counts = num_layers, counts or {}
 
     def write(self, slab: Mapping[str, NDArray[np.generic]], counts: Mapping[str, int] | None = None) -> None:
-        """Write the next x layers, ``(L, Y, Z[, 3])`` per channel, then the progress.
+        """Write the next x layers, ``(L, Y, Z[, 3])`` per channel, then the progress with `counts`.
 
-        counts: the baker's, recorded with it. Raises InputError if channels or shapes differ from the plan.
+        Raises InputError if channels or shapes differ from the plan.
         """
         if slab.keys() != set(self.plan.channels):
             raise InputError(f"slab: expected the channels {', '.join(self.plan.channels)}, got {', '.join(slab)}")

@@ -38,8 +38,8 @@ def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: s
 def write_grid(folder: Path, grid: DistanceGrid, names: Sequence[str]) -> tuple[Path, ...]:
     """Write the grid in the formats `names` into `folder`; return the files.
 
-    Memory-mapped channels are never whole in memory (but for vdb). Raises as `check_formats`, and NotEvaluableError
-    for a surface that does not exist.
+    Memory maps are never whole in memory (but for vdb). Raises as `check_formats`, and NotEvaluableError without a
+    surface.
     """
     check_formats(names, grid.channels)
     kinds = [FORMATS[name] for name in dict.fromkeys(names)]

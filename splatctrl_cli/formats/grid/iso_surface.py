@@ -1,6 +1,6 @@
 """The zero surface of a baked distance as a triangle mesh: ``.ply``, ``.obj``, ``.stl``.
 
-Marching cubes of scikit-image (Lewiner et al. 2003) by slab; slabs share a layer of cells, where vertices are joined.
+Marching cubes of scikit-image (Lewiner et al. 2003) by slab, joined at a shared layer of cells.
 """
 
 from dataclasses import dataclass

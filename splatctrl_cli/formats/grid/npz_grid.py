@@ -51,8 +51,8 @@ def write_npz(path: Path, grid: DistanceGrid) -> None:
 def read_npz(path: Path) -> DistanceGrid:
     """Read the grid of `write_npz`; never unpickles.
 
-    Raises InputError if missing, damaged, of another version or not ours; types, shapes, checksums and finiteness are
-    checked. NaN is allowed in sdf and gradient if the header's ``unknown`` is ``nan``.
+    Raises InputError if missing, damaged (checksums included), not finite, of another version or not ours. NaN is
+    allowed in sdf and gradient if the header's ``unknown`` is ``nan``.
     """
     with _opened(path) as archive:
         head = _head(path, archive, _members(archive))

@@ -105,8 +105,8 @@ ROUNDING = 1e-6  # [m] of float32 values a metre or two from their origin
 def write_moveit(path: Path, grid: DistanceGrid) -> None:
     """Write occupied cells: a splat may reach the cell's cube, or sdf is not above 0.
 
-    A splat may reach if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. The sdf test includes unknown
-    space as obstacle, and NaN. Raises InputError without bound and hard.
+    A splat may if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. The sdf test includes unknown space
+    as obstacle, and NaN. Raises InputError without bound and hard.
     """
     shape = check_grid(grid)
     if not {"bound", "hard"} & grid.channels.keys():

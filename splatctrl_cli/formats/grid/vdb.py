@@ -1,8 +1,8 @@
 """Distance fields as OpenVDB's ``.vdb``: a FloatGrid per scalar channel, a Vec3SGrid for the gradient.
 
-Written by OpenVDB's Python module (``openvdb``, formerly ``pyopenvdb``), which is not on PyPI and needs all channels
-in memory. Voxel (i, j, k) is cell (i, j, k): the transform takes whole index coordinates to cell centres. NaN cells
-and zero gradients, the background's value, are inactive.
+Needs OpenVDB's Python module (``openvdb``, formerly ``pyopenvdb``), which is not on PyPI, and all channels in memory.
+Voxel (i, j, k) is cell (i, j, k): the transform takes whole indices to cell centres. NaN cells and zero gradients,
+the background's value, are inactive.
 """
 
 import json

@@ -180,8 +180,8 @@ class SceneFolder:
     def made_from(self) -> dict[str, Any]:
         """Facts that tell if the scene belongs to a log and a robot.
 
-        Digests of files read (`inputs`), first frames, joints and links, depth correction, and how far off the
-        cameras see the robot.
+        Digests (`inputs`), first frames, joints and links, depth correction, and how far off the cameras see the
+        robot.
         """
         metrics = self.run.get("metrics", {})
         bend = {"depth_bend": metrics["depth_bend"]} if metrics.get("depth_bend") else {}

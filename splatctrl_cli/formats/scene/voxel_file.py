@@ -218,10 +218,7 @@ def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Map
 
 
 def known_space(grid: OccupancyGrid, thresholds: OccupancyConfig) -> dict[str, object]:
-    """A grid's extent [m], share of each `VoxelState`, robot and human voxels.
-
-    States are lower case, as in other commands and files.
-    """
+    """A grid's extent [m], share of each `VoxelState` (lower case), robot and human voxels."""
     states = grid.states(thresholds.free_below, thresholds.occupied_above)
     counts = np.bincount(states.ravel(), minlength=len(VoxelState))
     return {

@@ -75,8 +75,8 @@ def rows_of(gaussians: GaussianSet, dtype: "np.dtype[Any]") -> NDArray[Any]:
 def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """Read a 3D-GS PLY (binary or ASCII, any property order) and its ``key: value`` comments.
 
-    Harmonics have the degree of ``f_rest_*`` (0, 9, 24 or 45), without all-zero degrees. Quaternions are normalised;
-    a missing label is 0 (object). Raises InputError if truncated, invalid or without a property.
+    Harmonics have the degree of ``f_rest_*`` (0, 9, 24 or 45), less all-zero degrees. Quaternions are normalised; a
+    missing label is 0 (object). Raises InputError if truncated, invalid or without a property.
     """
     ply = read_table(path, "vertex", REQUIRED)
     return gaussians_of(ply), ply.pairs()

@@ -1,8 +1,8 @@
 """Gaussians as glTF 2.0 in one binary file (``.glb``), with KHR_gaussian_splatting.
 
-One primitive of points with float32 centre, rotation (x y z w), sigmas (linear), opacity, and harmonics of red,
-green, blue; COLOR_0 serves plain point readers. Values are in world; their node turns z up to glTF's y. The container
-is a JSON document and one buffer of tables.
+A primitive of points has float32 centre, rotation (x y z w), sigmas (linear), opacity, harmonics of red, green, blue;
+COLOR_0 serves plain point readers. Values are in world; the node turns z up to glTF's y. The container is JSON and
+one buffer of tables.
 """
 
 import json
@@ -140,7 +140,7 @@ def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
 def read_gltf(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """Read a ``.glb`` file in its mesh's axes (no node's transform), and its extras.
 
-    Raises InputError if truncated, packed, or without exactly one primitive of Gaussians.
+    Raises InputError if truncated, packed, or without exactly one Gaussian primitive.
     """
     document, binary = read_glb(path)
     primitive = _primitive(path, document)

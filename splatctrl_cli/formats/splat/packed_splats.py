@@ -86,9 +86,9 @@ def held_by_splat(gaussians: GaussianSet) -> GaussianSet:
 
 
 def splat_bound(gaussians: GaussianSet) -> Differences:
-    """Return half a step of each byte: 1/510 of colour and opacity, 1/256 of a quaternion component.
+    """Half a step of each byte: 1/510 of colour and opacity, 1/256 of a quaternion component.
 
-    Four components of 1/256 move a unit quaternion by at most 2/256, which turns by twice that angle: 0.9 degrees.
+    Four components of 1/256 move a unit quaternion by at most 2/256, which turns by twice that: 0.9 degrees.
     """
     return Differences(center=0.0, sigma=0.0, rotation=0.9, color=0.5001 / 255, opacity=0.5001 / 255, harmonics=0.0)
 
@@ -165,10 +165,10 @@ def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
 
 
 def spz_bound(gaussians: GaussianSet) -> Differences:
-    """Return half a step of each value, with a margin for float32.
+    """Half a step of each value, with a margin for float32.
 
-    Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511, 1.2e-3 together. The fourth
-    follows and is at least 1/2, which at most doubles it; a rotation turns by twice that angle: 0.28 degrees.
+    Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511 are 1.2e-3 together. The fourth
+    follows and is at least 1/2, which at most doubles it; a rotation turns by twice that: 0.28 degrees.
     """
     return Differences(
         center=0.5001 * (2.0 ** -_fraction_bits(gaussians.centers)),

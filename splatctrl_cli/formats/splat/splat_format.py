@@ -88,7 +88,7 @@ class Differences:
 def float32_bound(gaussians: GaussianSet) -> Differences:
     """A float32 format's bound: centres exact, one rounding of the rest.
 
-    A sigma's logarithm is at most 88 in size, so half a unit of its last place is 88 * 2^-24 = 5e-6 of the sigma.
+    A log sigma is at most 88 in size, so half a unit of its last place is 88 * 2^-24 = 5e-6 of sigma.
     """
     largest_color = float(np.abs(gaussians.harmonics[:, 0]).max(initial=1.0))
     return Differences(center=0.0, sigma=6e-6, rotation=1e-4, color=1e-6 * largest_color, opacity=1e-6, harmonics=0.0)

@@ -84,7 +84,7 @@ def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
 def nearest_splats(gaussians: GaussianSet) -> SplatSet:
     """Splats of the Gaussians' volume (geometric mean of sigmas), opacity and mean colour.
 
-    Loses orientation, flatness (a flat Gaussian becomes thicker and narrower) and view-dependent colour.
+    Loses orientation, flatness (flat Gaussians become thicker and narrower) and view-dependent colour.
     """
     return _round_splats(
         gaussians, np.exp(np.log(gaussians.scales.astype(np.float64)).mean(axis=1)).astype(np.float32)
@@ -225,7 +225,7 @@ def format_of(path: Path) -> SplatFormat:
 def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
     """Read any splat file and its comments; a SplatSet if all are round without view-dependent colour.
 
-    Raises InputError if missing, truncated, of an unknown kind or invalid.
+    Raises InputError if missing, truncated, unknown or invalid.
     """
     kind = _known_format(path)
     if kind is not FORMATS[".ply"]:

@@ -1,6 +1,6 @@
 """A writer of capture folders (docs/capture.md) by frame, in bounded memory.
 
-A journal lists written frames, so that a killed run can continue.
+A journal of written frames lets a killed run continue.
 """
 
 import csv
@@ -161,9 +161,9 @@ def write_capture(
 ) -> CaptureSummary:
     """Write all of `source` into `folder`, empty or of an interrupted run. Same input, same bytes.
 
-    JPEG and PNG colour is kept byte for byte if it has the frame's pixels. Depth becomes 16-bit PNG in its recorded
-    unit, or .npy [m] if none fits. topics: all joint states as recorded, where `source` has one topic's. robot: the
-    log's URDF, or "". Raises InputError without a frame, UsageError if existing frames differ.
+    JPEG and PNG colour with the frame's pixels is kept byte for byte. Depth becomes 16-bit PNG in its recorded unit,
+    or .npy [m] if none fits. topics: all joint states as recorded, where `source` has one topic's. robot: the log's
+    URDF, or "". Raises InputError without a frame, UsageError if existing frames differ.
     """
     states = StateCollector(len(source.joint_names))
     cameras: dict[str, dict[str, Any]] = {}

@@ -1,10 +1,10 @@
 """The messages of ROS bags: ROS 1, and ROS 2 sqlite3; damage is skipped and counted.
 
-A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body. They are read in order,
-in bounded memory, without the index: a cut or growing bag has none.
+A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body, read in order in bounded
+memory. Its index is not used: a cut or growing bag has none.
 
-rosbags' ROS 2 reader (rosbags/rosbag2/storage_sqlite3.py) counts messages first, so one bad page makes it refuse.
-Tables of rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions.
+rosbags (rosbags/rosbag2/storage_sqlite3.py) counts messages first, so one bad page makes it refuse. Tables of
+rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions.
 """
 
 import shutil

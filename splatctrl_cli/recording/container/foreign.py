@@ -17,7 +17,7 @@ _ENDS = 1 << 20  # bytes at either end of a file that are searched for its marks
 class Foreign:
     """An unsupported format: what it is, the remedy, and its marks.
 
-    Marks: name endings, first bytes with a mark near the file's ends, or an entry of a zip file or folder.
+    Marks: name endings, first bytes with a mark near either end, or an entry of a zip file or folder.
     """
 
     what: str
@@ -69,7 +69,7 @@ FOREIGN = (
 
 
 def refuse_foreign(path: Path) -> None:
-    """Raise InputError for a known unsupported format, with its name and how to export it.
+    """Raise InputError for a known unsupported format, with its name and export.
 
     Some are supported containers with other contents (a .svo2 is an MCAP, an Azure Kinect's .mkv a video).
     """

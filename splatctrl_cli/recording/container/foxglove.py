@@ -96,9 +96,9 @@ def standing_in(topic: Topic) -> Topic:
 
 
 def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> Any:
-    """Decode `data` to its ROS message; definition: protobuf's FileDescriptorSet, a byte a character.
+    """Decode to a ROS message; definition: protobuf's FileDescriptorSet, a byte a character.
 
-    Raises ValueError, KeyError, TypeError or AttributeError if undecodable.
+    Raises ValueError, KeyError, TypeError or AttributeError.
     """
     if encoding == "json":
         return as_ros(schema, _object(json.loads(data)))

@@ -111,7 +111,7 @@ class SessionLog(JoinedLog):
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield the messages of all parts by log time.
 
-        If parts share a topic, all are read: skipping would change its messages' order between passes.
+        If parts share a topic, all are read: skipping would reorder its messages between passes.
         """
         pushed = None if names is None or self._share(names) else names
         parts = (part.messages(damage, pushed) for part in self._parts)
@@ -130,9 +130,9 @@ class SessionLog(JoinedLog):
 
 
 def open_raw_log(path: Path) -> RawLog:
-    """Open .mcap, .bag, .db3 or a ROS 2 bag folder; zstd messages are unpacked.
+    """Open .mcap, .bag, .db3 or a ROS 2 bag folder, with zstd messages unpacked.
 
-    Raises InputError for others, and if unreadable.
+    Raises InputError for others.
     """
     if path.is_dir():
         return _open_folder(path)

@@ -50,9 +50,9 @@ class McapFile:
         self.size = path.stat().st_size
 
     def parts(self, damage: Damage, *, is_known: bool = False) -> Iterator[Part]:
-        """Yield the records in order; losses and faults go to `damage`, checksums of the file included.
+        """Yield records in order; losses and faults go to `damage`, checksums included.
 
-        is_known: skip these checksums, as they were compared before.
+        is_known: skip checksums that were compared before.
         """
         places = [index.chunk_start_offset for index in self.chunk_indexes()]  # where records are known to begin
         places += [part.offset for part in self.summary()[:1]]

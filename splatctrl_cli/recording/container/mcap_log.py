@@ -1,7 +1,7 @@
 """An MCAP file's messages by its own records, and its index without a full read.
 
-Damage is skipped and counted. The `mcap` package allocates what a record announces; its indexed reader raises on
-valid files without a summary, and yields nothing from a truncated one.
+Damage is skipped and counted. The `mcap` package allocates what records announce; its indexed reader raises on valid
+files without summary, and yields nothing from truncated ones.
 """
 
 import struct
@@ -150,7 +150,7 @@ class McapLog:
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; skips damage, reads a cut chunk to its cut.
 
-        Checksums are compared until one full pass finds all of them right.
+        Checksums are compared until one full pass finds them right.
         """
         self._budget = Budget(self._file.size)
         state, count = self._forget_changed(), damage.count

@@ -1,6 +1,6 @@
-"""The MCAP records whose fields are read, each parsed within its own bytes.
+"""The MCAP records whose fields are read, each within its own bytes.
 
-The `mcap` package reads the fields (mcap.dev/spec). Bytes after the last field are allowed, as specified.
+The `mcap` package reads them (mcap.dev/spec). Bytes after the last field are allowed, as specified.
 """
 
 import struct

@@ -14,8 +14,8 @@ class Topic:
     """A channel of a log.
 
     type_name: ``package/msg/Type`` for ROS. encoding: ``cdr``, ``ros1`` or the file's (json, protobuf, ...).
-    definition: the type's text or "", in definition_format ``msg``, ``idl`` or ``protobuf`` (a FileDescriptorSet, a
-    byte a character). schema: the original type if type_name is the ROS message it stands for (Foxglove), else "".
+    definition: the type's text or "", as definition_format ``msg``, ``idl`` or ``protobuf`` (a FileDescriptorSet, a
+    byte a character). schema: the original type if type_name stands for it in ROS (Foxglove), else "".
     """
 
     name: str
@@ -30,7 +30,7 @@ class Topic:
 class RawMessage:
     """A message: topic, log time [ns] and bytes, the same for every container.
 
-    file, offset: the byte where its record, or its chunk's, begins; -1 if the container has none.
+    file, offset: the byte where its record, or its chunk's, begins; -1 if unknown.
     """
 
     topic: Topic
@@ -42,9 +42,9 @@ class RawMessage:
 
 @dataclass(kw_only=True)
 class Damage:
-    """A record of the parts of a log that a pass could not read.
+    """A record of what a pass over a log could not read.
 
-    remarks: counts of what is no damage, such as messages of an unsupported form.
+    remarks: counts of what is no damage, such as unsupported forms.
     """
 
     count: int = 0

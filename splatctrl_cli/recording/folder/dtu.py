@@ -62,7 +62,7 @@ def read_dtu(
 
     `shrink` maps each view before the next is read. K is scaled to the images (the file's may be for 1600x1200 or a
     quarter). Depth of another size is sampled, not blended: larger maps at the image's pixels, smaller ones only at
-    their own. Views without depth are left out. Raises InputError naming the file.
+    their own. Drops views without depth. Raises InputError naming the file.
     """
     scan, folder = chosen_scan(root, scan_folders(root), scan)
 
@@ -151,7 +151,7 @@ def read_views(
 def check_lengths(where: str, views: Sequence[DtuView]) -> None:
     """Raise InputError if depth or camera distances are not millimetres.
 
-    Plausible is a table seen from near, not from a thousandth or thousand times that.
+    It expects a table seen from near; a wrong unit is a thousand times off.
     """
     known = [view.depth[view.depth > 0] for view in views]
     medians = [float(np.median(depth)) for depth in known if depth.size]
@@ -262,7 +262,7 @@ def _camera_file(root: Path, number: int) -> Path:
 def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
     """Read K (3, 3) [px], T_camera_world (4, 4) and least depth of a MVSNet camera file.
 
-    Lengths have the file's unit; a depth of 0 means none.
+    Lengths have the file's unit; depth 0 is none.
     """
     words = path.read_text(encoding="utf-8", errors="replace").split()
     try:

@@ -28,10 +28,9 @@ def view_numbers(words: Sequence[str]) -> list[int]:
 class DtuSource:
     """A scan's views by number (view 0 is ``rect_001``), which is also the stamp.
 
-    The scene is static, so there is no clock. Views in `holdout` belong to camera ``holdout``, others to ``camera``;
-    a `protocol` assigns or drops views instead. masks, depths: folders for what the layout does not have. downscale:
-    shrink factor; None: to the protocol's size, if whole. layout: ``MVSNet`` or ``IDR``; split: training and held-out
-    views.
+    The scene is static, so there is no clock. Views in `holdout` belong to camera ``holdout``, others to ``camera``,
+    unless a `protocol` assigns or drops them. masks, depths: folders the layout misses. downscale: shrink factor;
+    None: to the protocol's size, if whole. layout: ``MVSNet`` or ``IDR``; split: training and held-out views.
     """
 
     joint_names: tuple[str, ...] = ()

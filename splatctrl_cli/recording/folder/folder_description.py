@@ -49,7 +49,7 @@ class CameraTable:
 class FramesTable:
     """``[frames]``: globs with one ``*``; files with equal text for it belong together.
 
-    human_mask: 8-bit grey images, not 0 on a person.
+    human_mask: 8-bit grey, not 0 on a person.
     """
 
     color: str
@@ -204,7 +204,7 @@ def read_table(
     beside: Collection[str] = (),
     fill: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
 ) -> T:
-    """Read table [name] of a TOML file; other tables must be in `beside`; `fill` adds missing keys.
+    """Read table [name] of a TOML file with no others but `beside`; `fill` adds keys.
 
     Raises as `read_description`.
     """

@@ -61,8 +61,8 @@ class View:
 def length_unit(median: float, apart: float) -> float:
     """Metres per length of a recording with this median depth and camera distance.
 
-    1 unless depth is too large for metres and the cameras agree. If depth alone is too large, its scale is wrong, and
-    the cameras are relatively close. `reconstruct` then compares the views.
+    1 unless depth is too large for metres and the cameras agree. If depth alone is, its scale is wrong: the cameras
+    are relatively close. `reconstruct` then compares the views.
     """
     if median <= PLAUSIBLE_DEPTH[1] or apart < UNIT_APART * median:
         return 1.0

@@ -83,7 +83,7 @@ def read_idr(
 def write_idr(root: Path, scan: str, views: Sequence[DtuView]) -> Path:
     """Write views as one scan folder, with their masks; returns it.
 
-    The object's sphere is centred nearest to the cameras' axes, with half the nearest camera's distance as radius.
+    The object's sphere is centred nearest to the cameras' axes; its radius is half the nearest camera's distance.
     """
     folder = root / scan
     (folder / "image").mkdir(parents=True)

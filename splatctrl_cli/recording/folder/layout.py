@@ -93,7 +93,7 @@ class Lenses:
 
 @dataclass(frozen=True, kw_only=True)
 class Pairs:
-    """A layout's views, described at `path`, and its numbers of unpaired colour and depth files.
+    """A layout's views, described at `path`, and numbers of unpaired colour and depth files.
 
     Raises InputError without a view.
     """
@@ -168,7 +168,7 @@ def described(
 ) -> Description:
     """Describe paired views with the lens of --intrinsics, else `lens` of the first image.
 
-    Without `lens` each view has its own. Raises InputError if impossible.
+    Without `lens` each view has one. Raises InputError if impossible.
     """
     first = pairs.views[0]
     camera = first.camera if lens is None else given_lens(options, first.color) or lens(first.color)

@@ -1,4 +1,4 @@
-"""The RGB-D cameras of a log, and poses from messages of their own instead of tf.
+"""A log's RGB-D cameras, and their poses from messages instead of tf.
 
 Poses: nav_msgs/Odometry (child_frame_id in header.frame_id), geometry_msgs/PoseStamped, PoseWithCovarianceStamped and
 TransformStamped.
@@ -42,9 +42,9 @@ _ENCODINGS = ("cdr", "ros1", "protobuf", "json")  # of messages
 
 
 def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
-    """Return topics whose first image is color, depth, other or ``unlike``.
+    """Topics whose first image is color, depth, other or ``unlike``.
 
-    ``unlike``: the name contradicts the image, such as infrared of 16 bits or depth in a JPEG.
+    ``unlike``: the name contradicts the image, such as 16-bit infrared or depth in a JPEG.
     """
     topics = [(t, t.first_image) for t in survey.of_type(IMAGE, COMPRESSED_IMAGE)]
     return [t for t, image in topics if image is not None and kind == ("unlike" if _unlike(t) else image.kind)]
@@ -124,8 +124,8 @@ def _family(name: str) -> tuple[str, ...]:
 def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | None = None) -> str:
     """The CameraInfo topic of an image topic, "" if none.
 
-    It shares more path than the camera's namespace, is in the image's or namespace's folder, or has the image's frame
-    and size.
+    It shares more path than the namespace, is in the image's or namespace's folder, or has the image's frame and
+    size.
     """
     folder = _parts(image.topic.name)[:-1]
     level = len(folder) - 1 if namespace is None else len(namespace)

@@ -108,7 +108,7 @@ class MessageDecoder:
 def header_stamp_ns(message: RawMessage) -> int:
     """Stamp of a message that begins with a std_msgs/Header, without decoding the rest.
 
-    It is two 32-bit words after four bytes (CDR's encapsulation, or ROS 1's `seq`). Foxglove's are decoded. Raises
+    Two 32-bit words follow four bytes (CDR's encapsulation, or ROS 1's `seq`). Foxglove's are decoded. Raises
     UndecodableMessageError if too short.
     """
     if message.topic.schema == TEXT:

@@ -1,6 +1,6 @@
-"""The images of a log that become frames, and the pass that reads them in plan order.
+"""A log's images that become frames, and the pass that reads them in plan order.
 
-The plan takes some fifty bytes of memory a frame.
+A frame's plan takes some fifty bytes.
 """
 
 import tempfile
@@ -150,7 +150,7 @@ def planned_images(
 ) -> Iterator[tuple[Planned, list[RawMessage]]]:
     """Yield each planned frame with its colour, depth and mask messages, in any log order.
 
-    `held` keeps waiting messages; missing frames go to `damage`.
+    `held` keeps waiting ones; missing frames go to `damage`.
     """
     uses, position, num = plan.uses(), 0, len(plan)
     numbers, planned = dict.fromkeys(uses, 0), plan[0]

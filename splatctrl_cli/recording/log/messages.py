@@ -226,7 +226,7 @@ def _decoded(packed: _Packed, *, color: bool) -> NDArray[Any]:
 
 
 def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
-    """Convert pixels of `raw_pixels` to colour (H, W, 3) uint8; Bayer mosaics are interpolated linearly.
+    """Convert `raw_pixels` to colour (H, W, 3) uint8; Bayer mosaics are interpolated linearly.
 
     Of 16 bits, 65535 becomes 255, as in cv_bridge (src/cv_bridge.cpp), whatever the sensor's depth.
     """
@@ -303,7 +303,7 @@ def num_invalid(depth: NDArray[Any]) -> int:
 def measured(depth: NDArray[Any], scale: float) -> Float32:
     """Convert float depth (H, W) to float32 [m]; 0 = no return.
 
-    No return: 0, negative and non-finite values (REP 118), 65535 and 65.535 (its metres), and from `FARTHEST` on.
+    No return: 0, negative, non-finite (REP 118), 65535, 65.535 (its metres), and from `FARTHEST` on.
     """
     is_code = (depth == NO_RETURN) | (np.abs(depth - NO_RETURN_M) < 1e-4)
     return np.where((depth > 0) & (depth < FARTHEST) & ~is_code, depth * np.float32(scale), 0).astype(np.float32)
@@ -312,7 +312,7 @@ def measured(depth: NDArray[Any], scale: float) -> Float32:
 def metres(counts: NDArray[Any], scale: float) -> Float32:
     """Convert depth counts (H, W) to float32 [m], 0 at `NO_RETURN`.
 
-    The only such formula, so that re-reading gives the same bits.
+    The only such formula: re-reading gives the same bits.
     """
     depth = counts.astype(np.float32)
     depth[counts == NO_RETURN] = 0.0

@@ -108,8 +108,8 @@ class TfTree:
         """Add T_parent_child at a time; one that `holds` is valid always while it is the only one.
 
         A frame keeps its first parent; edges that would close a loop are left out. Differing static transforms are
-        valid from their stamps on, the first also before; of one stamp the last wins. All are noted. Raises
-        ValueError for no rigid transform (a zero quaternion, NaN).
+        valid from their stamps on, the first also before; of one stamp the last. All is noted. Raises ValueError if
+        not rigid (a zero quaternion, NaN).
         """
         parent, child = parent.strip("/"), child.strip("/")
         if not (np.isfinite(position).all() and 0.5 < float(np.linalg.norm(quat_xyzw)) < 2.0):

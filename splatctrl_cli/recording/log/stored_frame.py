@@ -48,7 +48,7 @@ AGAIN = "run `splatctrl ingest` again"
 class JointTopics:
     """Topics with joint states, their `loss` and the user's chosen topic.
 
-    first_note: index of the loss's notes in the whole report.
+    first_note: the loss's first note in the whole report.
     """
 
     topics: Sequence[TopicSurvey]
@@ -104,9 +104,9 @@ def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) 
 
 
 def read_topics(folder: Path, described: Mapping[str, Any], checked: Callable[[str], Path]) -> JointTopics:
-    """Read what `write_topics` wrote; `checked` returns the path of a file with the right checksum.
+    """Read what `write_topics` wrote; `checked` returns the path of an unchanged file.
 
-    Raises InputError for a damaged file.
+    Raises InputError if damaged.
     """
     try:
         topics = [_topic(entry, checked) for entry in described["topics"]]
@@ -276,9 +276,9 @@ def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:
 
 
 def check_depth(depth: Float32, where: str, scale: float) -> bool:
-    """True if a depth image [m] has any depth. Raises InputError for an implausible median.
+    """True with any depth [m]. Raises InputError for an implausible median.
 
-    scale: the metres per count it was read with.
+    scale: metres per count it was read with.
     """
     valid = depth[depth > 0]
     if valid.size == 0:

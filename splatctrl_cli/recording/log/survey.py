@@ -1,7 +1,7 @@
 """A first pass over a log: topics, stamps, frames, calibrations, joints and first images.
 
-Pairs images by stamp, counts repeats, gaps and clocks that went back, and finds ``robot_description``, latched or a
-node's parameter.
+Pairs images, counts repeats, gaps and clocks that went back, and finds ``robot_description``, latched or a node's
+parameter.
 """
 
 from array import array
@@ -188,9 +188,9 @@ class Survey:
 
 
 def survey(log: RawLog, *, by_log_time: bool = False) -> Survey:
-    """Read `log` once; a message that does not decode is counted as damage.
+    """Read `log` once; undecodable messages are damage.
 
-    by_log_time: use log times as stamps of images, transforms and joint states.
+    by_log_time: stamp images, transforms and joint states by log time.
     """
     result = Survey(by_log_time=by_log_time)
     decoder = MessageDecoder()

@@ -1,9 +1,8 @@
 """Compressed video, decoded as a log with its images; in messages, or a file with stamps.
 
 Reads H.264 and H.265 of foxglove.CompressedVideo (Annex B, an image per message; docs.foxglove.dev, CompressedVideo)
-and ffmpeg_image_transport's FFMPEGPacket. Images without a key frame before them, or after a missing image, are
-dropped and counted until the next key frame. FFmpeg would show them with wrong blocks; its log reveals a missing
-packet.
+and ffmpeg_image_transport's FFMPEGPacket. Images without a prior key frame, or after a missing image, are dropped and
+counted until the next key frame: FFmpeg shows them with wrong blocks. Its log reveals a missing packet.
 """
 
 import re

@@ -57,9 +57,9 @@ class StateSource(Recording):
 
 
 def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> FrameSource | StateSource:
-    """Open an input's states of `joints` (a robot's), where it has them, and its frames, if any.
+    """Open an input's states of `joints` (a robot's) and its frames, where it has them.
 
-    Raises InputError if missing, or without usable joint states.
+    Raises InputError if missing, or without usable states.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="check the path")
