@@ -34,7 +34,7 @@ class TriangleMesh:
 
 
 def load_mesh(path: Path) -> TriangleMesh:
-    """Load a mesh that trimesh reads (OBJ, STL, PLY, OFF, GLB, COLLADA), all parts as one.
+    """Load a mesh with trimesh (OBJ, STL, PLY, OFF, GLB, COLLADA), all parts as one.
 
     Vertices at one place are merged: a texture seam is not a hole. COLLADA is scaled by its unit, without its up
     axis, as in RViz. Bytes after a binary STL's faces are noted. Raises InputError if unreadable, without triangles,

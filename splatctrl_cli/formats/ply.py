@@ -96,9 +96,9 @@ class _Element:
 
 
 def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
-    """Read an element of a PLY (ASCII or binary, either byte order) with the `required` properties.
+    """Read an element of a PLY (ASCII or binary, either byte order).
 
-    Raises InputError if missing, no PLY, of another length, compressed, or without a property.
+    Raises InputError if missing, no PLY, of another length, compressed, or without a `required` property.
     """
     content = read_bytes(path)
     form, elements, comments, length = _parse_header(path, content)
@@ -263,7 +263,7 @@ _Line = tuple[int, list[str]]
 
 
 def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
-    """Yield a CSV's points (Q, 3) float64 [m] of x, y, z, at most `POINTS_PER_BLOCK` at once.
+    """Yield a CSV's points x, y, z as (Q, 3) float64 [m], `POINTS_PER_BLOCK` at once.
 
     Without a header (a first line not all numbers) it has three columns; other columns are ignored. Raises InputError
     naming `name`, line and column for a missing column, another length, or no finite number within `MAX_PLACE`.

@@ -257,9 +257,9 @@ class GridSlabs:
         self.num_layers, self.counts = num_layers, counts or {}
 
     def write(self, slab: Mapping[str, NDArray[np.generic]], counts: Mapping[str, int] | None = None) -> None:
-        """Write the next x layers, ``(L, Y, Z[, 3])`` per channel, then the progress with `counts`.
+        """Write the next x layers, ``(L, Y, Z[, 3])`` per channel, then the progress.
 
-        Raises InputError if channels or shapes differ from the plan.
+        counts: recorded with it. Raises InputError if channels or shapes differ from the plan.
         """
         if slab.keys() != set(self.plan.channels):
             raise InputError(f"slab: expected the channels {', '.join(self.plan.channels)}, got {', '.join(slab)}")

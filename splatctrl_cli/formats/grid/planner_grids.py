@@ -103,7 +103,7 @@ ROUNDING = 1e-6  # [m] of float32 values a metre or two from their origin
 
 
 def write_moveit(path: Path, grid: DistanceGrid) -> None:
-    """Write occupied cells: a splat may reach the cell's cube, or sdf is not above 0.
+    """Write occupied cells: a splat may reach the cube, or sdf is not above 0.
 
     A splat may if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. The sdf test includes unknown space
     as obstacle, and NaN. Raises InputError without bound and hard.

@@ -86,7 +86,7 @@ def held_by_splat(gaussians: GaussianSet) -> GaussianSet:
 
 
 def splat_bound(gaussians: GaussianSet) -> Differences:
-    """Half a step of each byte: 1/510 of colour and opacity, 1/256 of a quaternion component.
+    """Half a step of each byte: 1/510 of colour and opacity, 1/256 of quaternions.
 
     Four components of 1/256 move a unit quaternion by at most 2/256, which turns by twice that: 0.9 degrees.
     """

@@ -19,7 +19,7 @@ Comments = dict[str, str]
 
 
 def logit(opacities: Float32) -> Float64:
-    """log(p / (1 - p)) of (N,) in [0, 1], finite for 0 and 1, which `sigmoid` restores."""
+    """log(p / (1 - p)) of (N,) in [0, 1], finite at 0 and 1 (restored by `sigmoid`)."""
     inside = (opacities > 0) & (opacities < 1)
     p = np.where(inside, opacities, 0.5).astype(np.float64)
     return np.where(inside, np.log(p) - np.log1p(-p), np.where(opacities > 0.5, LOGIT_OF_ONE, LOGIT_OF_ZERO))

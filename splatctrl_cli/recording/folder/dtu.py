@@ -28,7 +28,7 @@ LEAST_SPREAD = 0.005  # of the depth, by which the cameras stand apart
 
 @dataclass(frozen=True, kw_only=True)
 class DtuView:
-    """A view: color (H, W, 3) uint8 RGB, depth (H, W) float32 [m], K [px], camera pose [m].
+    """A view: color (H, W, 3) uint8 RGB, depth (H, W) float32 [m], K [px], pose [m].
 
     Depth 0 = none. mask (H, W): True on the object, None if unknown.
     """
@@ -260,7 +260,7 @@ def _camera_file(root: Path, number: int) -> Path:
 
 
 def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
-    """Read K (3, 3) [px], T_camera_world (4, 4) and least depth of a MVSNet camera file.
+    """Read K (3, 3) [px], T_camera_world (4, 4) and least depth of MVSNet's file.
 
     Lengths have the file's unit; depth 0 is none.
     """

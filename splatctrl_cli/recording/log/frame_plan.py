@@ -105,7 +105,7 @@ Key = tuple[str, int]  # topic, number of the message within it
 
 
 class HeldMessages:
-    """Waiting messages, half of a log that stores topics apart."""
+    """Waiting messages, which can be half of a log that stores topics apart."""
 
     def __init__(self) -> None:
         self._messages: dict[Key, RawMessage] = {}

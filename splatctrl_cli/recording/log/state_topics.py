@@ -319,7 +319,7 @@ def _is_still(table: Table, before: Index, after: Index) -> Bool:
 
 
 def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossReport) -> Stamps:
-    """Stamps (T,) [ns] in file order: the headers', or the log's if no header has one.
+    """Stamps (T,) [ns] in file order, of headers, or the log's if none has one.
 
     Notes another clock, drift and steps in `loss`. Raises InputError for two clocks.
     """

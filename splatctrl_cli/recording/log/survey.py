@@ -68,7 +68,7 @@ def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.
 
 @dataclass(kw_only=True)
 class StampClock:
-    """A detector of header clocks that go back during logging: a bag in a loop, a reset.
+    """A detector of header clocks that go back: a bag in a loop, a reset.
 
     num_back: stamps over a second behind an earlier one; back_ns: the first one's distance, at log time back_log_ns.
     """
