@@ -1,1 +1,1 @@
-"""File formats: splats, grids, scene folders, and the arrays, images and point tables in them."""
+"""File formats of splats, grids, scenes, arrays, images and points."""

@@ -1,9 +1,8 @@
-"""Arrays in a ``.npz`` without the clock in it: the same arrays give the same bytes; and arrays out of one, no more
-than may be meant: ten megabytes of a ``.npz`` can hold ten gigabytes of zeros.
+"""Arrays in ``.npz`` without timestamps (same arrays, same bytes), read within a size limit.
 
-Files of arrays (T, ...) are read as columns, a block of rows at a time: NPZ, HDF5 and Parquet (extra `tables`: h5py,
-pyarrow). An array of HDF5 is named by its path (``observations/qpos``), one of Parquet by its column; a column of
-lists of one length is an array (T, K).
+Ten megabytes of ``.npz`` can hide ten gigabytes of zeros. NPZ, HDF5 and Parquet (extra `tables`: h5py, pyarrow) are
+read in blocks of rows. HDF5 names arrays by path (``observations/qpos``), Parquet by column; equal lists make an
+array (T, K).
 """
 
 import tokenize
@@ -35,7 +34,7 @@ DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a 
 
 @dataclass(frozen=True, kw_only=True)
 class Pieces:
-    """An array that is made while it is written: its dtype and shape, and its values in C order, piece by piece."""
+    """An array made while written; its values in C order, by piece."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -43,7 +42,7 @@ class Pieces:
 
 
 def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, level: int = 6) -> None:
-    """What `np.savez_compressed` writes, at zlib's `level` (0: stored), one array at a time."""
+    """Write as `np.savez_compressed`, at zlib's `level` (0: stored), by array."""
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     with zipfile.ZipFile(path, "w", method, compresslevel=level) as archive:
         for name, array in arrays.items():
@@ -59,10 +58,9 @@ def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, lev
 
 
 def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, NDArray[np.generic]]:
-    """The arrays `names` (default: all) of a ``.npz``, of together at most `most` bytes.
+    """Read the arrays `names` (default: all) of a ``.npz``, at most `most` bytes together.
 
-    Raises OSError, KeyError for an array that is not there, ValueError for objects, for more bytes than
-    `most` and for other bytes than the array's own head says, and what is in `DAMAGE`.
+    Raises OSError, KeyError for a missing array, ValueError for objects or another size than announced, and `DAMAGE`.
     """
     with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
         chosen = (
@@ -77,7 +75,7 @@ def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) 
 
 
 def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
-    """Whether a file, whose first bytes are `head`, is a ``.npz`` with all of these arrays."""
+    """True for a ``.npz`` with these arrays; head: its first bytes."""
     if not head.startswith(b"PK\x03\x04"):
         return False
     try:
@@ -88,9 +86,9 @@ def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
 
 
 def npy_head(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether by columns, and type of the array whose ``.npy`` begins here; the stream is left behind it.
+    """Read a ``.npy`` header: shape, is_by_columns and dtype. Raises ValueError for none.
 
-    Raises ValueError for none.
+    The stream is left after it.
     """
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -126,9 +124,9 @@ def _array(member: IO[bytes], name: str, file_size: int, most: int | None) -> ND
 
 
 def npy_of(data: bytes) -> NDArray[np.generic]:
-    """The array of a ``.npy`` file's bytes. Raises ValueError for one that announces more than there is, or objects.
+    """The array of ``.npy`` bytes. Raises ValueError for objects or too few bytes.
 
-    `np.load` allocates what the header announces before it looks.
+    `np.load` would allocate what the header announces.
     """
     return _array(BytesIO(data), "", len(data), None)
 
@@ -138,7 +136,7 @@ MOST_RATIO = 100  # times the file's size; joint states as recorded compress 2 t
 
 
 class ArrayFile(ABC):
-    """A file of columns: arrays (T, ...) by name, of which each row is flattened."""
+    """A file of arrays (T, ...); flattened rows are columns."""
 
     names: Sequence[str]
 
@@ -147,16 +145,14 @@ class ArrayFile(ABC):
 
     @abstractmethod
     def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
-        """Shape and type of an array, None where it is not there. Raises InputError for what cannot be read."""
+        """Shape and dtype, None if missing. Raises InputError if unreadable."""
 
     @abstractmethod
     def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
-        """The rows of an array, about `BLOCK` at a time. Raises InputError for what cannot be read."""
+        """Yield about `BLOCK` rows at a time. Raises InputError if unreadable."""
 
     def columns(self, names: Sequence[str]) -> Rows:
-        """(T, K) of the columns of arrays side by side. Raises InputError for arrays that are not there, hold no
-        numbers, or are of several lengths.
-        """
+        """Arrays side by side as columns (T, K). Raises InputError if missing, not numbers or of several lengths."""
         headers = [self._checked(name) for name in names]
         lengths = [shape[0] for shape, _ in headers]
         if len(set(lengths)) > 1:
@@ -173,17 +169,17 @@ class ArrayFile(ABC):
     def read(
         self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
     ) -> tuple[Stamps, dict[str, Rows]]:
-        """`stamps`, and of each group of names its `columns`."""
+        """Read `stamps`, and each group's `columns`."""
         columns = {key: self.columns(names) for key, names in groups.items()}
         return self.stamps(time, unit_ns, epoch_ns), columns
 
     def rows(self, name: str) -> Rows:
-        """An array (T, ...), each row in its shape; T may be 0. Raises InputError where it holds no numbers."""
+        """An array (T, ...); T may be 0. Raises InputError if not numbers."""
         shape, _ = self._checked(name, least=0)
         return Rows(RowFile(shape[1:], (block.astype(np.float64) for block in self._blocks(name))))
 
     def stamps(self, name: str, unit_ns: int, epoch_ns: int, *, least: int = 1) -> Stamps:
-        """Stamps (T,) [ns] of an array of times in units of `unit_ns`, or of a type that says its unit."""
+        """Stamps (T,) [ns] of times in `unit_ns`, or of a dtype with its own unit."""
         _, dtype = self._checked(name, least=least, kinds="iufM")
         times = np.concatenate([np.zeros(0, dtype), *(block.reshape(-1) for block in self._blocks(name))])
         if times.dtype.kind == "M":
@@ -197,7 +193,6 @@ class ArrayFile(ABC):
         return np.asarray(whole.astype(np.int64) * unit_ns + parts + epoch_ns)
 
     def _checked(self, name: str, *, least: int = 1, kinds: str = "iuf") -> tuple[tuple[int, ...], np.dtype[Any]]:
-        """Shape and type of an array of `least` rows or more, of types of these kinds."""
         header = self._header(name)
         if header is not None and header[1].kind in kinds and header[0]:
             shape, dtype = header
@@ -227,7 +222,7 @@ _DAMAGE = (OSError, *DAMAGE)
 
 class NpzFile(ArrayFile):
     def __init__(self, path: Path) -> None:
-        """Raises InputError for a file of another kind."""
+        """Raises InputError for another kind of file."""
         super().__init__(path)
         try:
             with zipfile.ZipFile(path) as archive:
@@ -243,7 +238,7 @@ class NpzFile(ArrayFile):
             return shape, dtype
 
     def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
-        """One that is stored by columns is read at once."""
+        """Yield the rows; an array stored by columns is read at once."""
         with ExitStack() as stack:
             shape, dtype, is_by_columns, stream = self._opened(stack, name)
             try:
@@ -263,7 +258,6 @@ class NpzFile(ArrayFile):
                 raise self._unreadable("NPZ", error) from None
 
     def _opened(self, stack: ExitStack, name: str) -> tuple[tuple[int, ...], np.dtype[Any], bool, IO[bytes]]:
-        """Shape, type, whether by columns, and the stream behind the header."""
         try:
             stream = stack.enter_context(stack.enter_context(zipfile.ZipFile(self.path)).open(f"{name}.npy"))
             shape, is_by_columns, dtype = npy_head(stream)
@@ -285,7 +279,7 @@ _EXTRA = "tables"
 
 class Hdf5File(ArrayFile):
     def __init__(self, path: Path) -> None:
-        """Raises InputError for a file of another kind."""
+        """Raises InputError for another kind of file."""
         super().__init__(path)
         self._h5py = of_extra("h5py", _EXTRA, "HDF5 files")
         self.names = found = list[str]()
@@ -318,10 +312,10 @@ class Hdf5File(ArrayFile):
 
 
 class ParquetFile(ArrayFile):
-    """A Parquet file, or of one its rows whose column `only` has a value."""
+    """A Parquet file, or its rows whose column `only` has a value."""
 
     def __init__(self, path: Path, only: tuple[str, int] | None = None) -> None:
-        """Raises InputError for a file of another kind."""
+        """Raises InputError for another kind of file."""
         super().__init__(path)
         self._arrow, self._parquet = (
             of_extra(name, _EXTRA, "Parquet files") for name in ("pyarrow", "pyarrow.parquet")
@@ -345,7 +339,6 @@ class ParquetFile(ArrayFile):
         return ((0,), np.dtype(np.float64)) if block is None else ((self._num, *block.shape[1:]), block.dtype)
 
     def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
-        """Raises InputError for a column whose lists differ in length."""
         shape: tuple[int, ...] | None = None
         names = [name] if self._only is None else list(dict.fromkeys([name, self._only[0]]))
         with self._opened() as file:
@@ -360,7 +353,6 @@ class ParquetFile(ArrayFile):
                     yield values
 
     def _values(self, column: Any, name: str) -> NDArray[Any]:
-        """A column (T, ...), of floats NaN where it has no value."""
         if not hasattr(column.type, "value_type") or self._arrow.types.is_dictionary(column.type):
             return np.asarray(column.to_numpy(zero_copy_only=False))
         if column.null_count or len(set(column.value_lengths().to_numpy(zero_copy_only=False).tolist())) > 1:

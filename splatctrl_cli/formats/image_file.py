@@ -1,6 +1,6 @@
-"""Image files: what a JPEG or PNG says of itself and whether it is whole, without decoding it; and their pixels.
+"""Image files: heads of JPEG and PNG without decoding, pixels, portable float maps.
 
-Portable float maps, too: one float32 channel, as MVSNet stores depth, whose rows are kept bottom first in the file.
+PFM: one float32 channel, as MVSNet's depth, rows from the bottom.
 """
 
 import re
@@ -31,7 +31,7 @@ _PNG_CHUNKS = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}  # that must be understood
 
 @dataclass(frozen=True, kw_only=True)
 class ImageHead:
-    """Size [px], channels (1 or 3) and bits of a channel of a file whose bytes can be kept as they are."""
+    """Size [px], channels (1 or 3) and bits per channel."""
 
     width: int
     height: int
@@ -40,10 +40,10 @@ class ImageHead:
 
 
 def image_head(data: bytes) -> ImageHead | None:
-    """The head of a whole JPEG or PNG of the plain kinds; None for any other, which only decoding can judge.
+    """Read the head of a whole, plain JPEG or PNG; None for others, which need decoding.
 
-    Plain are Huffman-coded JPEG of 8 bits, grey or of three channels, up to its closing mark, and PNG of grey or RGB
-    without transparency or interlace, every chunk of which has the checksum that it says (ITU-T T.81; W3C PNG).
+    Plain: Huffman-coded 8-bit JPEG of one or three channels, with its closing mark; grey or RGB PNG without
+    transparency or interlace, all checksums right (ITU-T T.81; W3C PNG).
     """
     head = (_jpeg_head if data.startswith(JPEG) else _png_head)(data)
     return None if head is None or not 0 < head.width * head.height <= MOST_PIXELS else head
@@ -104,10 +104,9 @@ def _png_head(data: bytes) -> ImageHead | None:
 
 
 def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
-    """Pixels of a JPEG, PNG, WebP, ... file, its orientation tag ignored: RGB of eight bits, or (not color) as OpenCV
-    has them, of three channels in its order BGR.
+    """Decode a JPEG, PNG, WebP, ..., ignoring its orientation tag; None if invalid or truncated.
 
-    None if it is none, or was cut: OpenCV would fill the missing rows of a JPEG with grey.
+    color: 8-bit RGB; else as OpenCV has it, in BGR. OpenCV alone would fill a cut JPEG with grey.
     """
     if any(data.startswith(start) and end not in data[-TAIL:] for start, end in _CLOSING_MARKS):
         return None
@@ -127,9 +126,9 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
 
 
 def _says_more_than_it_holds(png: bytes) -> bool:
-    """Whether a PNG announces an image, or a chunk, that its bytes do not hold: OpenCV takes memory for either.
+    """True if a PNG announces more than its bytes (OpenCV would allocate it).
 
-    So it does for one without pixels, or with a chunk that must be understood and that no PNG has.
+    Also without pixels, or with an unknown critical chunk.
     """
     if len(png) < _PNG_HEAD.size:
         return True
@@ -144,15 +143,15 @@ def _says_more_than_it_holds(png: bytes) -> bool:
 
 
 def write_pfm(path: Path, image: Float32) -> None:
-    """Write an image (H, W) as little-endian grey PFM."""
+    """Write (H, W) as little-endian grey PFM."""
     header = f"Pf\n{image.shape[1]} {image.shape[0]}\n-1.0\n".encode()
     path.write_bytes(header + np.ascontiguousarray(image[::-1], dtype="<f4").tobytes())
 
 
 def read_pfm(path: Path) -> Float32:
-    """The image (H, W) float32 of a grey PFM of either byte order; |scale| must be 1.
+    """Read a grey PFM (H, W) float32 of either byte order; |scale| must be 1.
 
-    Raises InputError for a missing file, another format, or a length other than the header's.
+    Raises InputError if missing, of another format or length.
     """
     content = read_bytes(path)
     header = re.match(rb"(PF|Pf)\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s", content[:128])

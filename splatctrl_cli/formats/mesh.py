@@ -1,4 +1,4 @@
-"""Triangle meshes out of files."""
+"""Triangle meshes from files."""
 
 from dataclasses import dataclass
 from io import BytesIO
@@ -16,10 +16,10 @@ STL_HEADER, STL_FACE = 84, 50  # bytes; the header ends with the number of faces
 
 @dataclass(frozen=True, kw_only=True)
 class TriangleMesh:
-    """vertices (V, 3) float64 [m]; faces (F, 3) int64, counter-clockwise seen from outside.
+    """vertices (V, 3) float64 [m]; faces (F, 3) int64, counter-clockwise from outside.
 
-    is_closed: every edge has two faces that run through it in opposite directions, so that there is an inside.
-    note: what of its file was ignored, in words.
+    is_closed: every edge has two faces in opposite directions, so there is an inside. note: ignored parts of the
+    file.
     """
 
     vertices: Float64
@@ -29,17 +29,16 @@ class TriangleMesh:
 
     @property
     def corners(self) -> Float64:
-        """(F, 3, 3): the three corners of each face."""
+        """(F, 3, 3) by face."""
         return self.vertices[self.faces]
 
 
 def load_mesh(path: Path) -> TriangleMesh:
-    """The mesh in a file that trimesh reads (OBJ, STL, PLY, OFF, GLB, COLLADA), all its parts as one.
+    """Load a mesh with trimesh (OBJ, STL, PLY, OFF, GLB, COLLADA), all parts as one.
 
-    Vertices at the same place become one, whatever their texture and normal: a seam of a texture is not a hole.
-    COLLADA is scaled by the file's unit; its up axis is ignored, as RViz does. What follows the faces of a binary STL
-    is ignored, with a note.
-    Raises InputError where the file cannot be read, or holds no triangle or a coordinate that is not finite.
+    Vertices at one place are merged: a texture seam is not a hole. COLLADA is scaled by its unit, without its up
+    axis, as in RViz. Bytes after a binary STL's faces are noted. Raises InputError if unreadable, without triangles,
+    or not finite.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected a mesh, got no such file")
@@ -68,9 +67,7 @@ def load_mesh(path: Path) -> TriangleMesh:
 
 
 def _opened(path: Path) -> tuple[BytesIO | Path, str]:
-    """A binary STL less what follows its faces, whatever its header begins with, and how much that is; a text, other
-    than in UTF-8 without the letters that are not.
-    """
+    """A binary STL without trailing bytes, and a note; or text as UTF-8."""
     content = path.read_bytes()
     num = int.from_bytes(content[STL_HEADER - 4 : STL_HEADER], "little")
     end = STL_HEADER + STL_FACE * num  # of a text: gigabytes
@@ -92,6 +89,5 @@ def _opened(path: Path) -> tuple[BytesIO | Path, str]:
 
 
 def _collada_unit(path: Path) -> float:
-    """Metres in a unit of a COLLADA file."""
     unit = ElementTree.parse(path).find("{*}asset/{*}unit")
     return 1.0 if unit is None else float(unit.get("meter", "1"))

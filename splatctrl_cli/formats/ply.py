@@ -1,6 +1,4 @@
-"""One element of a PLY file as a table of numbers, read strictly: every byte the header promises, and none more; and
-coloured point clouds, as structure from motion leaves them. Points in CSV: x, y and z in metres, a block at a time.
-"""
+"""PLY elements as tables of exactly the promised bytes; points in PLY or CSV."""
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +26,7 @@ BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "
 
 @dataclass(frozen=True, kw_only=True)
 class PlyFile:
-    """The rows of one element, a structured array, and the header's comment lines."""
+    """An element's rows, a structured array, and the header's comments."""
 
     path: Path
     rows: NDArray[Any]
@@ -42,16 +40,16 @@ class PlyFile:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The properties, in the file's order."""
+        """Properties in the file's order."""
         return self.rows.dtype.names or ()
 
     def pairs(self) -> dict[str, str]:
-        """The ``key: value`` comments; one without a colon is a key with an empty value."""
+        """``key: value`` comments; a value may be empty."""
         parts = (line.partition(":") for line in self.comments)
         return {key.strip(): value.strip() for key, _, value in parts if key.strip()}
 
     def column(self, name: str) -> Float64:
-        """(N,) float64 values of one property; raises InputError where one is not finite, naming its index."""
+        """A property as (N,) float64. Raises InputError naming the first non-finite index."""
         values = self.rows[name].astype(np.float64)
         bad = np.flatnonzero(~np.isfinite(values))
         if len(bad):
@@ -64,7 +62,7 @@ class PlyFile:
 
 @dataclass(frozen=True, kw_only=True)
 class _Element:
-    """properties: names and scalar types; of a list those of its length and of its values, with a space between."""
+    """properties: names and scalar types; a list's are length and value, with a space."""
 
     name: str
     count: int
@@ -75,7 +73,7 @@ class _Element:
         return any(" " in kind for _, kind in self.properties)
 
     def dtype(self, path: Path, byte_order: str) -> "np.dtype[Any]":
-        """Text has more digits than its type may hold: they are kept."""
+        """The row's type; float text becomes float64 to keep its digits."""
         if self.has_lists:
             raise InputError(f"{path}: element {self.name} has list properties: expected a table of numbers")
         types = [(name, SCALARS[kind]) for name, kind in self.properties]
@@ -84,7 +82,7 @@ class _Element:
         )
 
     def end(self, content: bytes, offset: int, byte_order: str) -> int:
-        """Where the element ends that begins at `offset`; beyond `content` where that is cut short."""
+        """End of the element at `offset`; beyond `content` if truncated."""
         kinds = [[np.dtype(byte_order + SCALARS[word]) for word in kind.split()] for _, kind in self.properties]
         if not self.has_lists:
             return offset + self.count * sum(kind.itemsize for (kind,) in kinds)
@@ -98,9 +96,9 @@ class _Element:
 
 
 def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
-    """Element `element` of a PLY file (ASCII or binary, either byte order) that has all of the `required` properties.
+    """Read an element of a PLY (ASCII or binary, either byte order).
 
-    Raises InputError for a file that is missing, no PLY, cut short or too long, compressed, or lacks a property.
+    Raises InputError if missing, no PLY, of another length, compressed, or without a `required` property.
     """
     content = read_bytes(path)
     form, elements, comments, length = _parse_header(path, content)
@@ -119,7 +117,7 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
 
 
 def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) -> None:
-    """Raise InputError that names which of the `required` properties are not among `names`."""
+    """Raise InputError naming missing `required` properties."""
     missing = [name for name in required if name not in names]
     if missing:
         raise InputError(
@@ -131,11 +129,10 @@ def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) 
 
 
 def write_table(path: Path, rows: NDArray[Any], comments: Mapping[str, str]) -> None:
-    """Write the structured array `rows` (float32 and uint8 fields) as element vertex. Same input, same bytes.
+    """Write `rows` (float32 and uint8 fields) as element vertex. Same input, same bytes.
 
-    The comments follow the properties: a reader that takes the third line for the count of vertices finds it there.
-    Characters outside ASCII in comments are written as backslash escapes, because readers of the format stop at them.
-    Raises UsageError for a comment of several lines, or a key with a colon.
+    Some readers want the vertex count in line three, so comments follow the properties; some stop outside ASCII,
+    which becomes backslash escapes. Raises UsageError for a comment of several lines, or a key with a colon.
     """
     fields: Mapping[str, Any] = rows.dtype.fields or {}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
@@ -188,7 +185,6 @@ def _read_ascii(
 
 
 def _parse_header(path: Path, content: bytes) -> tuple[str, list[_Element], list[str], int]:
-    """Format, elements, comments, and the length of the header [bytes]."""
     if not content.startswith((b"ply\n", b"ply\r\n")):
         raise InputError(f"{path}: no PLY file: expected it to start with 'ply', got {content[:8]!r}")
     end = content.find(b"\nend_header")
@@ -222,9 +218,9 @@ def _parse_header(path: Path, content: bytes) -> tuple[str, list[_Element], list
 
 
 def read_points(path: Path) -> PointCloud:
-    """The points of a PLY file with x, y, z [m] and red, green, blue (0 to 255).
+    """Read a PLY's points x, y, z [m] with red, green, blue (0 to 255).
 
-    Raises InputError for a file that is not whole, lacks one of these, or has no point.
+    Raises InputError if truncated, empty or without one of these.
     """
     table = _columns(path, ("x", "y", "z", "red", "green", "blue"), "coloured point cloud")
     points, colors = table[:, :3], table[:, 3:] / 255.0
@@ -234,15 +230,14 @@ def read_points(path: Path) -> PointCloud:
 
 
 def read_positions(path: Path) -> Float64:
-    """The points (N, 3) of a PLY file, in the file's own unit, whatever else it says of them.
+    """Read a PLY's points (N, 3), in the file's unit, ignoring other properties.
 
-    Raises InputError for a file that is not whole, lacks x, y or z, or has no point.
+    Raises InputError if truncated, empty or without x, y or z.
     """
     return _columns(path, ("x", "y", "z"), "point cloud")
 
 
 def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
-    """Properties (N, K) of the points, at least one."""
     ply = read_table(path, "vertex", ())
     missing = [name for name in names if name not in ply]
     if missing:
@@ -253,7 +248,7 @@ def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
 
 
 def is_mesh(path: Path) -> bool:
-    """Whether a file holds faces: any that is not a PLY, and a PLY whose header counts some."""
+    """True for a PLY with faces, or any other file."""
     if path.suffix.lower() != ".ply":
         return True
     header = read_bytes(path, 65536).partition(b"end_header")[0]
@@ -268,11 +263,10 @@ _Line = tuple[int, list[str]]
 
 
 def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
-    """Points (Q, 3) float64 [m], at most `POINTS_PER_BLOCK` at a time, of the columns x, y, z of a CSV text.
+    """Yield a CSV's points x, y, z as (Q, 3) float64 [m], `POINTS_PER_BLOCK` at once.
 
-    Without a header, which is a first line that is not all numbers, there are to be three columns. Other columns are
-    not looked at, empty lines are skipped. Raises InputError naming `name`, the line and the column: for columns that
-    are missing, a line of another length than the first, and what is no finite number within `MAX_PLACE`.
+    Without a header (a first line not all numbers) it has three columns; other columns are ignored. Raises InputError
+    naming `name`, line and column for a missing column, another length, or no finite number within `MAX_PLACE`.
     """
     reader = csv.reader(stream)
     lines: Iterator[_Line] = ((reader.line_num, row) for row in reader if row)
@@ -296,7 +290,7 @@ def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
 
 
 def _axes(name: str, cells: Sequence[str]) -> list[int] | None:
-    """Where x, y and z stand by a header; None for a first line that is a point."""
+    """Columns of x, y, z; None if the line is a point."""
     if len(cells) == 3 and all(_number(cell) is not None for cell in cells):
         return None
     titles = [cell.strip().lstrip("\ufeff").lower() for cell in cells]
@@ -323,7 +317,6 @@ def _numbers(name: str, block: Sequence[_Line], columns: Sequence[int], num_colu
 
 
 def _first_wrong(name: str, block: Sequence[_Line], columns: Sequence[int], num_columns: int) -> InputError:
-    """What is wrong with the first line of a block that has something wrong."""
     for number, row in block:
         if len(row) != num_columns:
             return InputError(

@@ -1,6 +1,4 @@
-"""The bytes of a file; decompression that gives no more bytes than were announced, and never more than a fixed bound
-at once.
-"""
+"""File reads, and decompression to no more than announced, within a bound."""
 
 import bz2
 from pathlib import Path
@@ -20,7 +18,7 @@ _FAILURES = (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, M
 
 
 def read_bytes(path: Path, most: int = -1) -> bytes:
-    """The bytes of a file, or the first `most`. Raises InputError where it cannot be read."""
+    """Read all or the first `most` bytes. Raises InputError if unreadable."""
     try:
         with path.open("rb") as stream:
             return stream.read(most)
@@ -29,17 +27,17 @@ def read_bytes(path: Path, most: int = -1) -> bytes:
 
 
 class BadBlockError(ValueError):
-    """A block that was left out, and why."""
+    """A skipped block, and why."""
 
 
 class Budget:
-    """What all blocks of a file may unpack to, so that its size bounds the time it takes."""
+    """A bound on what a file unpacks to, so its size bounds the time."""
 
     def __init__(self, file_size: int) -> None:
         self._left = FREE_BYTES + MOST_RATIO * file_size
 
     def unpacked(self, data: bytes, compression: str, size: int) -> bytes:
-        """`unpacked`, as long as the file's budget lasts. Raises BadBlockError."""
+        """Unpack within the budget. Raises BadBlockError."""
         if size <= MAX_BLOCK:
             self._left -= size
             if self._left < 0:
@@ -48,10 +46,9 @@ class Budget:
 
 
 def unpacked(data: bytes, compression: str, size: int, largest: int = MAX_BLOCK) -> bytes:
-    """The `size` bytes that `data` holds.
+    """Unpack the `size` bytes in `data`, never making more.
 
-    Raises BadBlockError where it is compressed in an unknown way, announces more than `largest`, does not decompress,
-    or holds another number of bytes than announced (never more than announced are made).
+    Raises BadBlockError for unknown or broken compression, over `largest`, or another size.
     """
     if size > largest:
         raise BadBlockError(f"announces {size} bytes unpacked, at most {largest} are read")
@@ -64,7 +61,7 @@ def unpacked(data: bytes, compression: str, size: int, largest: int = MAX_BLOCK)
 
 
 def unpacked_start(data: bytes, compression: str, size: int) -> bytes:
-    """What the start of a block, cut somewhere, holds: at most `size` bytes and MAX_BLOCK, perhaps none."""
+    """Unpack a cut block: at most `size` bytes and MAX_BLOCK, perhaps none."""
     try:
         return _unpacked_up_to(data, compression, min(size, MAX_BLOCK))
     except BadBlockError:

@@ -1,1 +1,1 @@
-"""Any recorded input as frames and joint states: logs, captures, folders of images, tables."""
+"""Any recorded input as frames and joint states."""

@@ -1,6 +1,4 @@
-"""A recording with the poses, depths and clock that a calibration says it should have; and one whose depth is noisier
-and whose cameras stand elsewhere than recorded: its frames as they are read.
-"""
+"""Recordings corrected by a calibration, or perturbed, as they are read."""
 
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,7 +25,7 @@ from splatctrl_cli.records import SECOND_NS, Float32, Float64, LossReport, RgbdF
 
 @dataclass(frozen=True, kw_only=True)
 class Correction:
-    """A calibration as it is applied to the recording `where`."""
+    """A calibration applied to recording `where`."""
 
     file: Path
     calibration: Calibration
@@ -35,11 +33,11 @@ class Correction:
 
     @property
     def clock_ns(self) -> int:
-        """By how much the stamps of joint states are late against those of frames [ns], to be added to them."""
+        """[ns] to add to joint states' stamps."""
         return round((self.calibration.clock or 0.0) * SECOND_NS)
 
     def camera(self, name: str) -> CalibratedCamera:
-        """A camera of the recording. Raises InputError for one that was not calibrated."""
+        """A calibrated camera. Raises InputError for another."""
         cameras = self.calibration.cameras
         if name == HOLDOUT and len(cameras) == 1:  # views of the one camera, held out
             return next(iter(cameras.values()))
@@ -51,7 +49,7 @@ class Correction:
         return cameras[name]
 
     def pose(self, name: str, T_recorded: Float64) -> Float64:
-        """T_world_camera (4, 4) of what is recorded as such. Raises InputError where the calibration is not of it."""
+        """Correct a recorded T_world_camera (4, 4). Raises InputError for another recording's calibration."""
         camera = self.camera(name)
         if camera.recorded is None:
             return T_recorded @ camera.T
@@ -69,22 +67,22 @@ class Correction:
         )
 
     def late_ns(self, name: str) -> int:
-        """By how much a camera's frames are stamped late against its recorded poses [ns]: 0 where it stands still."""
+        """Delay [ns] of frame stamps against poses; 0 for a fixed camera."""
         return self.clock_ns if self.clock_ns and self.camera(name).moves else 0
 
     def depth(self, name: str, depth: Float32) -> Float32:
-        """A depth image [m] as it should be."""
+        """Correct depth [m]."""
         camera = self.camera(name)
         if (camera.scale, camera.bias) == (1.0, 0.0):
             return depth
         return np.maximum(np.where(depth > 0, camera.scale * depth + camera.bias, 0.0), 0.0).astype(np.float32)
 
     def states(self, states: StateColumns) -> StateColumns:
-        """Joint states on the clock of the frames."""
+        """Move states to the frames' clock."""
         return replace(states, stamp_ns=states.stamp_ns + self.clock_ns) if self.clock_ns else states
 
     def frame(self, frame: RgbdFrame) -> RgbdFrame:
-        """A frame whose pose is already that of its own time by the robot's clock."""
+        """Correct a frame posed on the robot's clock."""
         return replace(
             frame,
             T_world_camera=self.pose(frame.camera, frame.T_world_camera),
@@ -92,7 +90,7 @@ class Correction:
         )
 
     def notes(self, digests: Sequence[str]) -> list[str]:
-        """What a report says of it; digests: sha256 of the recording's files."""
+        """A report's notes; digests: sha256 of the recording's files."""
         text = f"poses, depths and clock are those of {self.file.name}"
         if set(digests) == set(self.calibration.digests.values()):
             return [text]
@@ -100,16 +98,16 @@ class Correction:
 
 
 def correction_of(options: SourceOptions, where: str) -> Correction | None:
-    """What the options' calibration comes to; None where there is none. Raises InputError for a file that is none."""
+    """The options' correction, or None. Raises InputError for an invalid file."""
     if options.calibration is None:
         return None
     return Correction(file=options.calibration, calibration=read_calibration(options.calibration), where=where)
 
 
 def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
-    """The source, corrected where the options have a calibration, then perturbed where they ask for it.
+    """The source, corrected and then perturbed as the options ask.
 
-    Raises InputError where the calibration is not of it, UsageError as `Perturbation.of`.
+    Raises InputError for another recording's calibration, UsageError as `Perturbation.of`.
     """
     correction, perturbation = correction_of(options, source.name), Perturbation.of(options.perturb)
     if correction is not None:
@@ -118,11 +116,11 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
 
 
 class CalibratedSource(Recording):
-    """Records of another source as a calibration corrects them.
+    """Another source's records, corrected by a calibration.
 
-    Joint states are moved to the clock of the frames. A moving camera is where the recording has it at the time of
-    its frame by the robot's clock: by a log's transforms then, of other recordings between the poses of frames. A
-    frame that has no pose within `tolerance_ns` of that time is left out, and counted.
+    Joint states move to the frames' clock. A moving camera takes its pose at the frame's time on the robot's clock:
+    from a log's transforms, else between frames. Frames without a pose within `tolerance_ns` are left out and
+    counted.
     """
 
     def __init__(self, source: FrameSource, correction: Correction, tolerance_ns: int = 0) -> None:
@@ -148,27 +146,26 @@ class CalibratedSource(Recording):
 
     @property
     def joint_topics(self) -> JointTopics | None:
-        """The topics of the joint states, None where they are on another clock."""
+        """Joint state topics, None if the clock is corrected."""
         if self._correction.clock_ns or not isinstance(self.inner, RosLogSource | CaptureSource):
             return None
         return self.inner.joint_topics
 
     @property
     def loss(self) -> LossReport:
-        """That of the source, with a note, and with the frames that the clock leaves without a pose."""
+        """The source's, a note, and frames the clock leaves unposed."""
         loss = self.inner.loss
         notes = self._correction.notes(list(self.inner.digests().values()))
         return replace(loss, without_pose=loss.without_pose + self._num_without_pose, notes=[*loss.notes, *notes])
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp."""
         for stamp, camera, T_recorded in self.inner.poses():
             T = self._pose(stamp, camera, T_recorded)
             if T is not None:
                 yield stamp, camera, T
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the source's files, and of the calibration."""
+        """sha256 of the files and the calibration."""
         return {**self.inner.digests(), f"{CALIBRATION}{self._correction.file.name}": sha256(self._correction.file)}
 
     def _frames(self) -> Iterator[StoredFrame]:
@@ -210,12 +207,10 @@ class CalibratedSource(Recording):
 
     @cached_property
     def _num_without_pose(self) -> int:
-        """Frames that have a pose as recorded, and none at their time by the robot's clock."""
         return sum(self._pose(*frame) is None for frame in self.inner.poses())
 
     @cached_property
     def _paths(self) -> dict[str, tuple[list[int], list[Float64]]]:
-        """Stamps [ns] and recorded poses by camera."""
         paths: dict[str, tuple[list[int], list[Float64]]] = {}
         for stamp, camera, T in self.inner.poses():
             stamps, poses = paths.setdefault(camera, ([], []))
@@ -225,7 +220,7 @@ class CalibratedSource(Recording):
 
 
 def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_ns: int) -> Float64 | None:
-    """The pose (4, 4) at a time between those of a path, its end within a tolerance of that, else None."""
+    """Interpolate (4, 4) on a path; its end within the tolerance, else None."""
     after = int(np.searchsorted(stamps, stamp_ns))
     if after in (0, len(stamps)):
         end = min(after, len(stamps) - 1)
@@ -244,11 +239,10 @@ LIMITS = {"depth-noise": 1.0, "pose-error": 10.0, "pose-turn": 180.0, "seed": 2*
 
 @dataclass(frozen=True, kw_only=True)
 class Perturbation:
-    """What is done to a recording; all of it is drawn from `seed`, so that twice the size is twice the same error.
+    """Errors drawn from `seed`: twice the size is twice the same error.
 
-    depth_noise: standard deviation of each pixel's depth at 1 m [m], growing with the square of the depth, as of a
-    stereo camera. pose_error [m], pose_turn [degrees]: how far each camera is moved in one direction of its own, and
-    turned about one axis of its own, the same in all its frames.
+    depth_noise: standard deviation at 1 m [m]; it grows with depth squared, as for stereo. pose_error [m], pose_turn
+    [degrees]: per camera, the same in all frames.
     """
 
     depth_noise: float = 0.0
@@ -258,7 +252,7 @@ class Perturbation:
 
     @classmethod
     def of(cls, given: Mapping[str, float]) -> "Perturbation | None":
-        """From values by name; None for one that does nothing. Raises UsageError for another name or value."""
+        """Build by name; None without effect. Raises UsageError for an unknown name or value."""
         for name, value in given.items():
             if name not in LIMITS:
                 raise UsageError(f"--perturb {name}: expected one of {', '.join(LIMITS)}", remedy="leave it out")
@@ -268,20 +262,20 @@ class Perturbation:
         return made if made.depth_noise or made.pose_error or made.pose_turn else None
 
     def depth(self, camera: str, stamp_ns: int, depth: Float32) -> Float32:
-        """A depth image (H, W) [m] with noise; what had no depth, or has none left, is 0."""
+        """Add noise to depth (H, W) [m]; 0 where none is or remains."""
         noise = self._generator(camera, stamp_ns).standard_normal(depth.shape, np.float32)
         noisy = depth + np.float32(self.depth_noise) * depth**2 * noise
         return np.where((depth > 0) & (noisy > 0), noisy, np.float32(0.0)).astype(np.float32)
 
     def pose(self, camera: str, T_world_camera: Float64) -> Float64:
-        """T_world_camera (4, 4) of a camera that stands elsewhere."""
+        """Displace and turn T_world_camera (4, 4)."""
         way, axis = self._generator(camera).standard_normal((2, 3))
         half = np.radians(self.pose_turn) / 2
         quat_xyzw = [*(np.sin(half) * axis / np.linalg.norm(axis)), np.cos(half)]
         return np.asarray(T_world_camera @ transform_from(self.pose_error * way / np.linalg.norm(way), quat_xyzw))
 
     def words(self) -> str:
-        """As on the command line."""
+        """Values as on the command line."""
         values = {"depth-noise": self.depth_noise, "pose-error": self.pose_error, "pose-turn": self.pose_turn}
         return ",".join(f"{name}={value!r}" for name, value in {**values, "seed": self.seed}.items() if value)
 
@@ -290,7 +284,7 @@ class Perturbation:
 
 
 class PerturbedSource(Recording):
-    """Records of another source, perturbed; nothing is written."""
+    """Another source's records, perturbed in memory."""
 
     def __init__(self, source: FrameSource, perturbation: Perturbation) -> None:
         self.inner, self._perturbation = source, perturbation
@@ -299,23 +293,22 @@ class PerturbedSource(Recording):
 
     @property
     def joint_topics(self) -> JointTopics | None:
-        """The topics of the joint states, where the source knows them."""
+        """Joint state topics, None if unknown."""
         found = getattr(self.inner, "joint_topics", None)
         return found if isinstance(found, JointTopics) else None
 
     @property
     def loss(self) -> LossReport:
-        """That of the source, with a note."""
+        """The source's, with a note."""
         loss = self.inner.loss
         return replace(loss, notes=[*loss.notes, f"perturbed: {self._perturbation.words()}"])
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp."""
         for stamp_ns, camera, T in self.inner.poses():
             yield stamp_ns, camera, self._perturbation.pose(camera, T)
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the source's files, and what is done to them."""
+        """sha256 of the files, and the perturbation."""
         words = self._perturbation.words()
         return {**self.inner.digests(), f"{PERTURB}{words}": words}
 

@@ -1,4 +1,4 @@
-"""Headers of single files: splats, grids, robots, JSON, arrays, images; no more than the header where it can."""
+"""Summaries of splats, grids, robots, JSON, arrays, images; by header if possible."""
 
 import json
 import zipfile
@@ -26,7 +26,7 @@ _LIST_LIMIT = 12  # longer lists are counted, not shown
 
 
 def describe_file(path: Path) -> Summary:
-    """Describe one file by its content. Raises InputError for a kind that the tool does not know."""
+    """Describe a file by content. Raises InputError if unknown."""
     if path.stat().st_size == 0:
         raise InputError(f"{path}: the file is empty (0 bytes)", remedy="write or copy it again")
     with path.open("rb") as stream:
@@ -95,7 +95,6 @@ def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], n
 
 
 def _parsed(path: Path, parse: Callable[[], Any], what: str) -> Any:
-    """What `parse` gives. Raises InputError for a file that is not `what`."""
     try:
         return parse()
     except (ValueError, EOFError, ParseError, yaml.YAMLError) as error:  # ValueError: what defusedxml forbids, too
@@ -178,7 +177,6 @@ def _image(path: Path, _head: bytes) -> Summary:
 
 
 def _find(content: Any, key: str) -> Any:
-    """The value of `key` at any depth of nested tables."""
     if not isinstance(content, dict):
         return None
     if key in content:
@@ -187,7 +185,6 @@ def _find(content: Any, key: str) -> Any:
 
 
 def _short(value: object) -> object:
-    """Plain values and small tables as they are; long lists by their length."""
     if isinstance(value, list) and (len(value) > _LIST_LIMIT or any(isinstance(v, list | dict) for v in value)):
         return f"{len(value)} entries"
     if isinstance(value, dict):

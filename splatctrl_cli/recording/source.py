@@ -1,4 +1,4 @@
-"""Opens any recorded input as records in time order, and describes what any file or folder is and holds."""
+"""Any recorded input as records in time order; descriptions of files and folders."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -51,10 +51,9 @@ __all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_s
 
 
 def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth: bool = True) -> FrameSource:
-    """The records of an MCAP, ROS 1 or ROS 2 bag, capture folder, dataset folder or file, or image folder's
-    TOML description.
+    """Open an MCAP, ROS bag, capture, dataset or image folder's TOML as records.
 
-    Raises InputError where there is nothing, or nothing that can be used, as images without depth where it is needed.
+    Raises InputError if missing, unusable, or without required depth.
     """
     options = options or SourceOptions()
     if not path.exists():
@@ -63,7 +62,6 @@ def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth
 
 
 def _opened(path: Path, options: SourceOptions, *, needs_depth: bool) -> FrameSource:
-    """As recorded."""
     if path.suffix == ".toml" or (not is_capture(path) and has_views(path)):
         source = open_image_folder(path, options) if path.suffix == ".toml" else open_layout(path, options)
         if needs_depth and (refusal := lacks_depth(source)) is not None:
@@ -75,14 +73,14 @@ def _opened(path: Path, options: SourceOptions, *, needs_depth: bool) -> FrameSo
 
 
 def lacks_depth(source: FrameSource) -> InputError | None:
-    """What to say where a recording is without depth, as only images in a folder may be."""
+    """The error for missing depth, possible only in image folders."""
     return source.no_depth() if isinstance(source, ImageFolderSource) and not source.has_depth else None
 
 
 def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
-    """The records of one input, or of several logs that were recorded at the same time.
+    """Open one input, or several logs recorded at once.
 
-    Raises InputError as `open_source`, and where one of several is not a log.
+    Raises as `open_source`, and InputError if one of several is no log.
     """
     log = open_logs(paths)
     options = options or SourceOptions()
@@ -90,9 +88,7 @@ def open_session(paths: Sequence[Path], options: SourceOptions | None = None) ->
 
 
 def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescription]]:
-    """What logs and captures of one session say of the robot, each text once, with the path that says it; other
-    recordings, and what cannot be opened, say nothing.
-    """
+    """URDFs of logs and captures, each once with its path; skips other inputs."""
     found: dict[str, tuple[Path, RobotDescription]] = {}
     for path in paths:
         said = []
@@ -107,9 +103,9 @@ def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescript
 
 
 def open_logs(paths: Sequence[Path]) -> RawLog | None:
-    """A log, or several of one session as one; None for a single path that is not a log.
+    """Open a log, or several of one session; None for a single path of another kind.
 
-    Raises InputError where there is nothing, and where one of several is not a log.
+    Raises InputError if missing, or if one of several is no log.
     """
     for path in paths:
         if not path.exists():
@@ -123,7 +119,7 @@ def open_logs(paths: Sequence[Path]) -> RawLog | None:
 
 
 def describe(path: Path, options: SourceOptions | None = None) -> Summary:
-    """Describe `path`. Raises InputError where there is nothing, or nothing known."""
+    """Describe any input. Raises InputError if missing or unknown."""
     options = options or SourceOptions()
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="check the path")
@@ -147,7 +143,7 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
 
 
 def describe_log(log: RawLog, options: SourceOptions) -> Summary:
-    """Topics, times, frames, cameras, and what a reconstruction would lack."""
+    """Topics, times, frames, cameras, and what a reconstruction misses."""
     found, sampling = survey_to_describe(log)
     with_messages = [t for t in found.topics.values() if t.count]
     facts: dict[str, object] = {
@@ -201,7 +197,6 @@ def _topic_row(entry: TopicSurvey) -> list[object]:
 
 
 def _is_read(entry: TopicSurvey) -> bool:
-    """Whether a command can read a topic, with the right options."""
     name, kind = entry.topic.name, entry.topic.type_name or ""
     types = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS)
     return kind in types or kind.startswith("geometry_msgs/") or name.endswith(f"/{ROBOT}")
@@ -265,7 +260,6 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
 
 
 def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
-    """What is known at the end of a scene, by the thresholds it was made with."""
     run: Mapping[str, Any] = describe_file(path / "run.json").facts if has_run else {}
 
     def used(name: str, default: float) -> float:
@@ -286,7 +280,6 @@ def _probability(value: Any) -> float:
 
 
 def _field_facts(path: Path) -> dict[str, object]:
-    """What a distance grid covers and how it was made; empty where the file is none of ours."""
     header: Mapping[str, Any] = describe_file(path).facts
     if header.get("format") != FORMAT or not {"shape", "first_cell", "voxel"} <= header.keys():
         return {}

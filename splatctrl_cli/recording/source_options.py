@@ -1,4 +1,4 @@
-"""How a source is to be read."""
+"""The options for reading a source."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -13,8 +13,9 @@ PERTURB = "--perturb "  # likewise, what was done to them
 
 @dataclass(frozen=True, kw_only=True)
 class CameraTopics:
-    """The topics of one RGB-D camera; an empty info or depth_info means that none was found. rivals: topics that
-    could each be its depth, where nothing tells which is.
+    """An RGB-D camera's topics; an empty info or depth_info was not found.
+
+    rivals: topics that could equally be its depth.
     """
 
     name: str
@@ -27,7 +28,7 @@ class CameraTopics:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseTopic:
-    """A topic of poses; frame: what it poses, "" for the frame that its messages name, else the camera's own."""
+    """A topic of poses; frame: posed, "" for the messages' or the camera's."""
 
     topic: str
     frame: str = ""
@@ -35,16 +36,14 @@ class PoseTopic:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceOptions:
-    """What a person may say about an input; every field has a default that fits a well-formed log.
+    """The user's settings for an input; the defaults fit a well-formed log.
 
-    world_frame: frame of poses (default: the root of the tf tree). cameras: only these (default: all).
-    camera_topics: topics by camera name, instead of those found. camera_poses: T_world_camera of fixed cameras as
-    x, y, z, qx, qy, qz, qw, instead of those recorded. camera_pose_topics: topics of poses by camera name, where tf
-    has none. human_topics: image topics by camera name, not 0 where a pixel shows a person. intrinsics: fx, fy, cx,
-    cy [px] and the coefficients of a distortion by camera name, instead of those recorded. depth_scale: [m per count]
-    of depth images. root: folder of an image folder's files. holdout: frames (index or name) of an image folder that
-    become camera `holdout`. stamps: ``header``, or ``log`` for the times of logging. calibration: what `calibrate`
-    wrote of the recording. perturb: what is done to its frames, by name (`calibrated`).
+    world_frame: of poses (default: tf's root). cameras: only these (default: all). By camera name: camera_topics
+    instead of those found; camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw; camera_pose_topics if tf
+    has none; human_topics: images not 0 on a person; intrinsics: fx, fy, cx, cy [px] and distortion coefficients,
+    instead of recorded ones. depth_scale [m per count]. root: of an image folder's files. holdout: its frames (index
+    or name) for camera `holdout`. stamps: ``header``, or ``log`` for log times. calibration: a file of `calibrate`.
+    perturb: changes to frames (`calibrated`).
     """
 
     world_frame: str | None = None
@@ -65,7 +64,7 @@ class SourceOptions:
     perturb: Mapping[str, float] = field(default_factory=dict)
 
     def refuse(self, names: tuple[str, ...], kind: str, path: Path) -> None:
-        """Raise InputError where a person gave an option that means nothing for this kind of input."""
+        """Raise InputError for a set option that does not apply to this input."""
         flags = {"camera_topics": "camera", "human_topics": "human-topic"}
         flags |= dict.fromkeys(["camera_poses", "camera_pose_topics"], "camera-pose")
         default = SourceOptions()
@@ -79,12 +78,12 @@ class SourceOptions:
 
 
 def still_note(camera: str) -> str:
-    """What a report says of a camera whose pose a person gave."""
+    """A note on a camera posed by the user."""
     return f"camera {camera}: stands still where --camera-pose puts it, not where the recording may say"
 
 
 def refuse_unknown_cameras(where: Path, asked: Iterable[str], known: Collection[str]) -> None:
-    """Raise InputError where a camera that was asked for is not among those of a recording."""
+    """Raise InputError for a requested camera not in the recording."""
     for name in asked:
         if name not in known:
             raise InputError(f"{where}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")

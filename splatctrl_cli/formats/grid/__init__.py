@@ -1,1 +1,1 @@
-"""The files that hold a baked distance grid, one format a file."""
+"""The formats of a baked distance grid, one a file."""

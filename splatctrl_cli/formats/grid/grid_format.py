@@ -1,11 +1,9 @@
-"""What a file format of a baked distance grid declares, the channels it may hold, and what `info` says of its head.
+"""The file formats of a baked distance grid: declarations, channels and headers.
 
-A channel may be a memory map larger than memory: nothing here holds more of one than `CHUNK` bytes at a time.
+A channel may exceed memory as a memory map, so at most `CHUNK` bytes are copied at once.
 
-`GridSlabs` fills the channels of a grid on disk from one end of x to the other. A folder holds one ``NAME.npy`` a
-channel, at its full size from the start, and ``progress.json``: what is being baked and how many layers of x are on
-disk. A slab of layers is one run of bytes in each file. An interrupted bake goes on from there; what is finished is
-written into every format from memory maps.
+`GridSlabs` fills a grid on disk along x: a ``NAME.npy`` per channel at full size, and ``progress.json`` with the plan
+and finished layers. A slab is one run of bytes in each file, so an interrupted bake can continue.
 """
 
 import json
@@ -37,7 +35,7 @@ FIELD_FACTS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Channel:
-    """How a channel is stored: dtype, values per cell, unit, and whether the policy on unknown space may blank it."""
+    """A channel's storage; may_be_unknown: unknown space may blank it."""
 
     dtype: str
     components: int = 1
@@ -45,7 +43,7 @@ class Channel:
     may_be_unknown: bool = False
 
     def shape(self, cells: Shape) -> tuple[int, ...]:
-        """The array's shape on a grid of `cells`."""
+        """The array's shape."""
         return cells if self.components == 1 else (*cells, self.components)
 
 
@@ -65,7 +63,7 @@ CHANNELS: Mapping[str, Channel] = {
 
 @dataclass(frozen=True, kw_only=True)
 class GridHead:
-    """A file of a distance grid without its values: origin (3,) float64 and voxel [m], cells along x, y, z."""
+    """A grid file's head: origin (3,) float64 and voxel [m], cells along x, y, z."""
 
     origin: NDArray[np.float64]
     voxel: float
@@ -75,7 +73,7 @@ class GridHead:
 
 
 def file_header(grid: DistanceGrid) -> dict[str, object]:
-    """The header as files hold it: with the format and version that they are written in."""
+    """The header with format and version."""
     return {**grid.header, "format": FORMAT, "version": VERSION}
 
 
@@ -84,7 +82,7 @@ def header_text(grid: DistanceGrid) -> str:
 
 
 def parse_header(name: str, text: str) -> dict[str, object]:
-    """The header that `text` is. Raises InputError naming `name` for other text, or another version."""
+    """Parse a header. Raises InputError naming `name` if invalid or of another version."""
     try:
         parsed = json.loads(text)
     except json.JSONDecodeError as error:
@@ -98,10 +96,9 @@ def parse_header(name: str, text: str) -> dict[str, object]:
 
 
 def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -> Shape:
-    """Cells along x, y and z of channels given as dtype and shape by name.
+    """Cells along x, y, z of channels given as dtype and shape.
 
-    Raises InputError naming `name` and the channel where there is no sdf, or one of a name, dtype or shape that a
-    grid does not have.
+    Raises InputError without sdf, or for an unknown name, dtype or shape.
     """
     strange = [channel for channel in arrays if channel not in CHANNELS]
     if strange or "sdf" not in arrays:
@@ -124,12 +121,12 @@ def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -
 
 
 def check_grid(grid: DistanceGrid) -> Shape:
-    """Cells along x, y and z of a grid to write. Raises InputError as `check_layout` does."""
+    """A grid's cells. Raises as `check_layout`."""
     return check_layout("grid to write", {name: (v.dtype.str, v.shape) for name, v in grid.channels.items()})
 
 
 def check_finite(name: str, grid: DistanceGrid) -> None:
-    """Raise InputError for a value that is not finite, where the header's policy on unknown space is not `nan`."""
+    """Raise InputError for a non-finite value; the policy `nan` allows NaN in unknown cells."""
     for channel, values in grid.channels.items():
         if not np.issubdtype(values.dtype, np.floating):
             continue
@@ -143,14 +140,14 @@ def check_finite(name: str, grid: DistanceGrid) -> None:
 
 
 def slabs(values: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
-    """The channel in runs of layers of x, of `CHUNK` bytes or one layer."""
+    """Yield x layers in runs of `CHUNK` bytes, or one layer."""
     step = max(1, CHUNK // max(1, values.nbytes // len(values)))
     for start in range(0, len(values), step):
         yield np.ascontiguousarray(values[start : start + step])
 
 
 def x_fastest(values: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
-    """The channel in runs of planes of z, as (z, y, x) or (z, y, x, 3), of `CHUNK` bytes or one plane."""
+    """Yield z planes, (z, y, x[, 3]), in runs of `CHUNK` bytes or one plane."""
     x, y, z = values.shape[:3]
     step = max(1, CHUNK // max(1, values.nbytes // z))
     for start in range(0, z, step):
@@ -162,20 +159,18 @@ def x_fastest(values: NDArray[np.generic]) -> Iterator[NDArray[np.generic]]:
 
 
 def from_x_fastest(planes: NDArray[np.generic]) -> NDArray[np.generic]:
-    """The channel (X, Y, Z[, 3]) of values that lie as `x_fastest` yields them."""
+    """Undo `x_fastest`: (X, Y, Z[, 3])."""
     return np.ascontiguousarray(planes.transpose(2, 1, 0, *range(3, planes.ndim)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class GridFormat:
-    """One kind of file, in the ``ENTRIES`` of its module: all that the program and its docs know of it.
+    """A file format, listed in its module's ``ENTRIES``, for the program and its docs.
 
-    `name` is what --formats takes; `write` writes the grid as a path that ends in `suffix`, or with `is_per_channel`
-    a file a channel beside it; `describe` takes a path and the file's first bytes and returns None for a file of
-    another kind; `read` gives back a grid that was written.
-    `needs` are channels of which the grid must have one; `holds_unknown`: it can mark cells without a distance;
-    `bytes_per_cell` is its size on the disk, None for that of all channels; `check` raises UsageError where what
-    writes it is not installed. `docs` is its row in docs/artefacts.md, cells between bars: name, file, who opens it,
+    `name`: the --formats value. `write`: to a path with `suffix`, or a file per channel if `is_per_channel`.
+    `describe`: from a path and its first bytes; None for another kind. `needs`: one of these channels.
+    `holds_unknown`: cells can lack a distance. `bytes_per_cell`: on disk, None for all channels'. `check` raises
+    UsageError without a library. `docs`: row in docs/artefacts.md, cells between bars: name, file, who opens it,
     checked, cost.
     """
 
@@ -193,17 +188,17 @@ class GridFormat:
     docs: str = ""
 
     def files(self, channels: Collection[str]) -> tuple[str, ...]:
-        """The names of the files that hold a grid of some channels."""
+        """File names for these channels."""
         stems = [f"{STEM}.{channel}" for channel in channels] if self.is_per_channel else [STEM]
         return tuple(f"{stem}{self.suffix}" for stem in stems)
 
     def size_per_cell(self, bytes_of_channels: int) -> int:
-        """Bytes on the disk for a cell whose channels have so many in memory."""
+        """Bytes per cell on disk."""
         return bytes_of_channels if self.bytes_per_cell is None else self.bytes_per_cell
 
 
 def covers(first_cell: Any, voxel: float, shape: Any) -> dict[str, object]:
-    """Cells, extent and the centres of the first and last cell [m] of a grid."""
+    """Cells, extent and the centres of the first and last cell [m]."""
     first, sides = np.asarray(first_cell, np.float64), voxel * (np.asarray(shape) - 1)
     return {
         "shape": [int(n) for n in shape],
@@ -215,12 +210,11 @@ def covers(first_cell: Any, voxel: float, shape: Any) -> dict[str, object]:
 
 
 def header_facts(header: Mapping[str, Any]) -> dict[str, object]:
-    """How a grid was made, of what its header says."""
+    """Return the header's `FIELD_FACTS`."""
     return {key: header[key] for key in FIELD_FACTS if header.get(key) is not None}
 
 
 def summary_of(path: Path, kind: str, head: GridHead) -> Summary:
-    """What a grid covers, how it was made, and its channels."""
     rows = [[name, CHANNELS[name].dtype.lstrip("<|"), CHANNELS[name].unit or "-"] for name in head.channels]
     facts = {**covers(head.origin, head.voxel, head.shape), **header_facts(head.header)}
     table = Grid(name="channels", header=("channel", "dtype", "unit"), rows=rows)
@@ -228,7 +222,7 @@ def summary_of(path: Path, kind: str, head: GridHead) -> Summary:
 
 
 def json_value(text: object) -> object:
-    """What a JSON text holds; any other value as it is."""
+    """Parse JSON text; return another value as it is."""
     try:
         return json.loads(text) if isinstance(text, str) else text
     except ValueError:
@@ -240,7 +234,7 @@ PROGRESS = "progress.json"
 
 @dataclass(frozen=True, kw_only=True)
 class SlabPlan:
-    """What is baked: origin and voxel [m], cells, channels, and the settings that decide their values (JSON)."""
+    """A bake's plan: origin and voxel [m], cells, channels, and settings (JSON)."""
 
     origin: tuple[float, float, float]
     voxel: float
@@ -254,7 +248,7 @@ class SlabPlan:
 
 
 class GridSlabs:
-    """The channels of a `SlabPlan` in `folder`; `num_layers` of x are on disk, and what was counted up to there."""
+    """A `SlabPlan` in `folder`: `num_layers` of x are on disk, with the baker's `counts`."""
 
     def __init__(
         self, folder: Path, plan: SlabPlan, num_layers: int, counts: Mapping[str, int] | None = None
@@ -263,11 +257,9 @@ class GridSlabs:
         self.num_layers, self.counts = num_layers, counts or {}
 
     def write(self, slab: Mapping[str, NDArray[np.generic]], counts: Mapping[str, int] | None = None) -> None:
-        """Put the next layers of x, ``(L, Y, Z[, 3])`` of every channel, on disk, and count them when they are there.
+        """Write the next x layers, ``(L, Y, Z[, 3])`` per channel, then the progress.
 
-        counts: what the maker of the slabs counted up to the end of this one.
-
-        Raises InputError for channels or shapes that are not those of the plan.
+        counts: recorded with it. Raises InputError if channels or shapes differ from the plan.
         """
         if slab.keys() != set(self.plan.channels):
             raise InputError(f"slab: expected the channels {', '.join(self.plan.channels)}, got {', '.join(slab)}")
@@ -286,11 +278,11 @@ class GridSlabs:
         _write_progress(self.folder, self.plan, self.num_layers, self.counts)
 
     def is_whole(self) -> bool:
-        """Whether every layer is on disk."""
+        """True if all layers are on disk."""
         return self.num_layers == self.plan.shape[0]
 
     def grid(self, header: Mapping[str, object]) -> DistanceGrid:
-        """The grid, its channels read-only memory maps. Raises InputError before every layer is there."""
+        """Open as read-only memory maps. Raises InputError before it is whole."""
         if not self.is_whole():
             raise InputError(
                 f"{self.folder}: expected {self.plan.shape[0]} layers, got {self.num_layers}",
@@ -316,7 +308,7 @@ class GridSlabs:
 
 
 def start_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
-    """An empty store in `folder`, which is made: every file at its full size. A full disk is an OSError here."""
+    """Create an empty store at full size. A full disk is an OSError here."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / PROGRESS).unlink(missing_ok=True)
     for name in plan.channels:
@@ -330,9 +322,9 @@ def start_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
 
 
 def resume_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
-    """The store that an interrupted bake of the same plan left in `folder`, an empty one where it left none.
+    """The store of an interrupted bake of this plan, or a new one.
 
-    Raises UsageError where it was of another plan, naming what differs, InputError where it is damaged.
+    Raises UsageError naming another plan's differences, InputError if damaged.
     """
     try:
         progress = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))

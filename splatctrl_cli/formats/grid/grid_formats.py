@@ -1,4 +1,4 @@
-"""The files in which a baked distance grid can be written, by the name that ``sdf-bake --formats`` takes."""
+"""The distance grid formats by ``sdf-bake --formats`` name."""
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -12,9 +12,9 @@ FORMATS: Mapping[str, GridFormat] = {kind.name: kind for kind in entries_of(__pa
 
 
 def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: str = "free") -> None:
-    """Raise UsageError where `write_grid` could not write one of `names`: to be asked before a bake that takes long.
+    """Raise UsageError if `write_grid` would fail for `names`: a check before a long bake.
 
-    `unknown` is the policy on unknown space, which blanks cells where it is ``nan``.
+    unknown: the policy on unknown space, which blanks cells if ``nan``.
     """
     strange = [name for name in names if name not in FORMATS]
     if strange or not names:
@@ -36,10 +36,10 @@ def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: s
 
 
 def write_grid(folder: Path, grid: DistanceGrid, names: Sequence[str]) -> tuple[Path, ...]:
-    """Write the grid in each of the formats `names` into `folder`, and return the files.
+    """Write the grid in the formats `names` into `folder`; return the files.
 
-    Channels may be memory maps: none is held in memory whole (but for vdb). Raises as `check_formats`
-    does, and NotEvaluableError where a surface is asked for that the grid does not have.
+    Memory maps are never whole in memory (but for vdb). Raises as `check_formats`, and NotEvaluableError without a
+    surface.
     """
     check_formats(names, grid.channels)
     kinds = [FORMATS[name] for name in dict.fromkeys(names)]

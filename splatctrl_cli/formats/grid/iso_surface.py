@@ -1,7 +1,6 @@
-"""The surface on which a baked distance is 0, as a triangle mesh: ``.ply``, ``.obj``, ``.stl``.
+"""The zero surface of a baked distance as a triangle mesh: ``.ply``, ``.obj``, ``.stl``.
 
-Marching cubes of scikit-image (Lewiner et al. 2003), a slab of the grid at a time; the slabs share a layer of cells,
-where their vertices are the same numbers and are joined.
+Marching cubes of scikit-image (Lewiner et al. 2003) by slab, joined at a shared layer of cells.
 """
 
 from dataclasses import dataclass
@@ -24,16 +23,16 @@ FURTHEST = np.float32(1e9)  # [m] in the place of what is not known, where no cu
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """Triangles: vertices (V, 3) float64 [m], world; faces (F, 3) int64, seen anticlockwise from larger distances."""
+    """vertices (V, 3) float64 [m], world; faces (F, 3) int64, anticlockwise from larger distances."""
 
     vertices: Float64
     faces: NDArray[np.int64]
 
 
 def iso_surface(grid: DistanceGrid) -> Surface:
-    """Where `sdf` is 0, linear between cell centres. Cubes with a corner that is NaN have no surface.
+    """Extract the zero set of `sdf`, linear between cell centres; cubes with a NaN corner have none.
 
-    Raises NotEvaluableError where no cube crosses 0.
+    Raises NotEvaluableError if no cube crosses 0.
     """
     shape, values = check_grid(grid), grid.channels["sdf"]
     if min(shape) < 2:
@@ -65,7 +64,7 @@ def iso_surface(grid: DistanceGrid) -> Surface:
 
 
 def write_surface(path: Path, surface: Surface) -> None:
-    """Write by the suffix: ``.ply`` and ``.obj`` with normals at the vertices, ``.stl`` with those of the faces."""
+    """Write ``.ply`` and ``.obj`` with vertex normals, ``.stl`` with face normals."""
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     options: dict[str, dict[str, object]] = {
         ".ply": {"vertex_normal": True},
@@ -77,7 +76,7 @@ def write_surface(path: Path, surface: Surface) -> None:
 
 
 def _marching_cubes(slab: Float32, is_known: NDArray[np.bool_]) -> tuple[Float64, NDArray[np.int32]] | None:
-    """Vertices [cells] and faces, None where no cube of eight known corners crosses 0."""
+    """Vertices [cells] and faces; None if no cube of known corners crosses 0."""
     whole = np.ones([n - 1 for n in slab.shape], bool)
     for corner in np.ndindex(2, 2, 2):
         whole &= is_known[tuple(slice(i, n - 1 + i) for i, n in zip(corner, slab.shape, strict=True))]
@@ -100,7 +99,7 @@ def _marching_cubes(slab: Float32, is_known: NDArray[np.bool_]) -> tuple[Float64
 
 
 def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> Surface:
-    """The mesh with equal vertices made one, in world, without the triangles that have lost a corner by it."""
+    """Merge equal vertices, in world; drop collapsed triangles."""
     unique, index = np.unique(np.round(vertices / STEP), axis=0, return_inverse=True)
     joined = index.reshape(-1)[faces]
     first, second, third = joined.T
@@ -109,7 +108,7 @@ def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> 
 
 
 def describe_mesh(path: Path, _head: bytes) -> Summary | None:
-    """A ``.obj`` or ``.stl`` that trimesh reads, such as a surface of the field; read whole."""
+    """Summarise a ``.obj`` or ``.stl``, read whole."""
     if path.suffix.lower() not in {".obj", ".stl"}:
         return None
     try:

@@ -1,6 +1,6 @@
-"""Baked distance fields as ``.npz``, the file that programs of this project read back. Same grid, same bytes.
+"""Baked distance fields as ``.npz``, which this project reads back. Same grid, same bytes.
 
-Members: ``origin`` (3,) float64 [m], ``voxel`` () float64 [m], ``header`` () str (JSON), one array a channel
+Members: ``origin`` (3,) float64 [m], ``voxel`` () float64 [m], ``header`` () str (JSON), one array per channel
 (`grid_format.CHANNELS`), uncompressed: floats hardly compress, and readers can map them.
 """
 
@@ -38,7 +38,7 @@ _Members = dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]]
 
 
 def write_npz(path: Path, grid: DistanceGrid) -> None:
-    """Write the grid. Raises InputError for channels that a file cannot hold."""
+    """Write the grid. Raises InputError for invalid channels."""
     check_grid(grid)
     members: dict[str, NDArray[np.generic]] = {
         "origin": np.asarray(grid.origin, dtype="<f8"),
@@ -49,11 +49,10 @@ def write_npz(path: Path, grid: DistanceGrid) -> None:
 
 
 def read_npz(path: Path) -> DistanceGrid:
-    """The grid that `write_npz` wrote.
+    """Read the grid of `write_npz`; never unpickles.
 
-    Raises InputError for a file that is missing, damaged, of another version or not ours: members, types, shapes,
-    checksums and finiteness are all checked (NaN is let through in sdf and gradient where the header's ``unknown``
-    is ``nan``), and pickled objects are never loaded.
+    Raises InputError if missing, damaged (checksums included), not finite, of another version or not ours. NaN is
+    allowed in sdf and gradient if the header's ``unknown`` is ``nan``.
     """
     with _opened(path) as archive:
         head = _head(path, archive, _members(archive))
@@ -64,13 +63,13 @@ def read_npz(path: Path) -> DistanceGrid:
 
 
 def read_npz_head(path: Path) -> GridHead:
-    """What `read_npz` reads without the channels' values, which it does not check. Raises InputError as that does."""
+    """Read without values, unchecked. Raises as `read_npz`."""
     with _opened(path) as archive:
         return _head(path, archive, _members(archive))
 
 
 def describe_npz(path: Path, head: bytes) -> Summary | None:
-    """A ``field.npz``. Raises InputError for one that is damaged or of another version."""
+    """Summarise a ``field.npz``. Raises InputError if damaged or of another version."""
     is_ours = has_arrays(path, head, {*PLACE, "header", "sdf"})
     return summary_of(path, "distance grid", read_npz_head(path)) if is_ours else None
 
@@ -91,7 +90,6 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _members(archive: zipfile.ZipFile) -> _Members:
-    """Type and shape by name, as long as what the archive says is there. Raises ValueError where it is not."""
     members: _Members = {}
     for entry in archive.infolist():
         name = entry.filename.removesuffix(".npy")

@@ -1,9 +1,8 @@
-"""Baked distance fields as ``.nrrd``, a file a channel, which 3D Slicer, ITK and pynrrd read.
+"""Baked distance fields as ``.nrrd``, a file per channel, for 3D Slicer, ITK and pynrrd.
 
-Format: http://teem.sourceforge.net/nrrd/format.html (NRRD0005, attached header, raw little-endian values). Axes go x,
-y, z, x fastest, so that `nrrd.read` gives ``values[x, y, z]``; a gradient has its three components before them
-(``values[component, x, y, z]``). The header's entries are key/value pairs ``splatctrl.KEY``, each a JSON text. pynrrd
-could write this, but puts the clock into the file and holds whole channels in memory.
+Format: http://teem.sourceforge.net/nrrd/format.html (NRRD0005, attached header, raw little-endian values). x is
+fastest: `nrrd.read` gives ``values[x, y, z]``, for a gradient ``values[component, x, y, z]``. Header entries are
+pairs ``splatctrl.KEY`` of JSON text. pynrrd would add a timestamp and need whole channels in memory.
 """
 
 import json
@@ -28,7 +27,7 @@ _TYPES = {"<f4": "float", "|u1": "uint8"}
 
 
 def write_nrrd(path: Path, grid: DistanceGrid, channel: str) -> None:
-    """Write one channel; NaN is kept. Raises InputError for channels that a file cannot hold."""
+    """Write a channel; NaN is kept. Raises InputError for invalid channels."""
     shape, kind, step = check_grid(grid), CHANNELS[channel], repr(float(grid.voxel))
     directions = [f"({step},0,0)", f"(0,{step},0)", f"(0,0,{step})"]
     sizes, kinds = [str(n) for n in shape], ["domain"] * 3
@@ -59,9 +58,9 @@ def write_nrrd(path: Path, grid: DistanceGrid, channel: str) -> None:
 
 
 def read_nrrd_head(path: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """The fields and the key/value pairs of any NRRD file, as text.
+    """Read an NRRD's fields and key/value pairs as text.
 
-    Raises InputError for a file of another kind, or whose header does not end.
+    Raises InputError for another file, or a header without an end.
     """
     text = read_bytes(path, 1 << 20)  # in which the header must end
     head, end, _ = text.partition(b"\n\n")
@@ -83,7 +82,7 @@ def read_nrrd_head(path: Path) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def describe_nrrd(path: Path, head: bytes) -> Summary | None:
-    """Any NRRD file: its fields, and the header of the bake where it is ours."""
+    """Summarise an NRRD file and our bake's header."""
     if not head.startswith(b"NRRD000"):
         return None
     fields, pairs = read_nrrd_head(path)

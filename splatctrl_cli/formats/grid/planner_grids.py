@@ -1,20 +1,18 @@
-"""Baked grids for the planners of other programs: NVIDIA's cuRobo and MoveIt.
+"""Baked grids for other planners: NVIDIA's cuRobo and MoveIt.
 
-The distance as the voxel grid of NVIDIA's cuRobo: ``field.curobo.npz``, which a few lines of its user load.
+cuRobo's voxel grid is ``field.curobo.npz``, which a few lines load. It follows the source (NVlabs/curobo, 0.7.5 to
+0.7.7: geom/types.py `VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu `compute_voxel_index`), untested on it. (x, y, z)
+is flattened with z fastest; the grid is placed by its middle's pose, ``x y z qw qx qy qz``. Values are positive
+inside; ``1 + floor(dims / voxel)`` cells a side.
 
-Read in its source (NVlabs/curobo, 0.7.5 to 0.7.7: geom/types.py `VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu
-`compute_voxel_index`), not tried on it. It flattens (x, y, z) with z fastest and places the grid by the pose of its
-middle, ``x y z qw qx qy qz``. Values are positive inside; ``1 + floor(dims / voxel)`` cells a side; the kernel
-truncates ``(x - pose + dims / 2) / voxel``: cell i spans ``pose - dims / 2 + [i, i + 1] voxel``, so the pose is half
-a voxel below the middle of our cells. A sphere's centre takes the value of the cell that it lies in. In the first
-three and last two cells of an axis, and outside, all is free. (0.7.0 to 0.7.4 count cells otherwise, and add half a
-voxel to values.)
+The kernel truncates ``(x - pose + dims / 2) / voxel``: cell i spans ``pose - dims / 2 + [i, i + 1] voxel``, so the
+pose is half a voxel below our cells' middle. A sphere takes its centre's cell. The first three and last two cells of
+an axis, and the outside, are free. (0.7.0 to 0.7.4 count cells otherwise, and add half a voxel to values.)
 
-Occupied cells as the stream of MoveIt's distance field, which propagates distances from them itself.
-
-Format: moveit_core, distance_field/src/propagation_distance_field.cpp (`readFromStream`; the same in MoveIt 1 and 2)
-and voxel_grid.h. Seven lines of text, then a zlib stream of bits: x slowest, each run of z in whole bytes, lowest bit
-first. The reader takes ``int(size * (1 / resolution))`` cells a side, and puts the centre of cell 0 at the origin.
+MoveIt's distance field reads occupied cells and propagates distances itself: moveit_core,
+distance_field/src/propagation_distance_field.cpp (`readFromStream`; the same in MoveIt 1 and 2) and voxel_grid.h.
+Seven lines of text precede a zlib stream of bits: x slowest, each run of z in whole bytes, lowest bit first. There
+are ``int(size * (1 / resolution))`` cells a side; cell 0 is centred at the origin.
 """
 
 import json
@@ -71,7 +69,7 @@ def write_curobo(path: Path, grid: DistanceGrid) -> None:
 
 
 def describe_curobo(path: Path, head: bytes) -> Summary | None:
-    """A ``field.curobo.npz``. Raises InputError for one that is damaged."""
+    """Summarise a ``field.curobo.npz``. Raises InputError if damaged."""
     if not has_arrays(path, head, {"features", "dims", "voxel_size", "pose", "curobo"}):
         return None
     try:
@@ -105,11 +103,10 @@ ROUNDING = 1e-6  # [m] of float32 values a metre or two from their origin
 
 
 def write_moveit(path: Path, grid: DistanceGrid) -> None:
-    """Write the cells that are taken for occupied: a splat may reach into the cell's cube, or sdf is not above 0.
+    """Write occupied cells: a splat may reach the cube, or sdf is not above 0.
 
-    The first is ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` in a grid without bound; the second takes in the
-    distance's own zero level, unknown space where the policy makes it an obstacle, and cells that are NaN.
-    Raises InputError where the grid has neither bound nor hard.
+    A splat may if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. The sdf test includes unknown space
+    as obstacle, and NaN. Raises InputError without bound and hard.
     """
     shape = check_grid(grid)
     if not {"bound", "hard"} & grid.channels.keys():
@@ -130,7 +127,7 @@ def write_moveit(path: Path, grid: DistanceGrid) -> None:
 
 
 def is_occupied(grid: DistanceGrid, layers: slice) -> Bool:
-    """(L, Y, Z) which cells of these layers of x are written as occupied."""
+    """True (L, Y, Z) for cells written as occupied."""
     name, most = ("bound", 0.0) if "bound" in grid.channels else ("hard", REACH * grid.voxel + ROUNDING)
     reached = np.asarray(grid.channels[name][layers]) <= np.float32(most)
     is_clear: NDArray[np.bool_] = np.asarray(grid.channels["sdf"][layers]) > np.float32(0.0)  # False for NaN
@@ -138,7 +135,7 @@ def is_occupied(grid: DistanceGrid, layers: slice) -> Bool:
 
 
 def read_moveit_head(path: Path) -> tuple[dict[str, float], int]:
-    """The numbers at the head of a stream, and where its bits start. Raises InputError for a file that has none."""
+    """Read the numbers, and the bits' offset. Raises InputError if damaged."""
     with path.open("rb") as stream:
         lines = [stream.readline(128) for _ in FIELDS]
         start = stream.tell()
@@ -155,7 +152,6 @@ def read_moveit_head(path: Path) -> tuple[dict[str, float], int]:
 
 
 def describe_moveit(path: Path, head: bytes) -> Summary | None:
-    """A stream of MoveIt's distance field."""
     if re.match(rb"resolution: \S+\nsize_x: ", head) is None:
         return None
     numbers, start = read_moveit_head(path)

@@ -1,9 +1,8 @@
-"""Baked distance fields as OpenVDB's ``.vdb``: a FloatGrid for every scalar channel, a Vec3SGrid for the gradient.
+"""Distance fields as OpenVDB's ``.vdb``: a FloatGrid per scalar channel, a Vec3SGrid for the gradient.
 
-Written by OpenVDB's own Python module (``openvdb``, formerly ``pyopenvdb``), which is not on PyPI. Voxel (i, j, k) is
-cell (i, j, k): OpenVDB's voxels lie at whole index coordinates, which the grid's transform takes to cell centres. A
-cell is active where it has a value: one that is NaN is not, nor is a gradient of zero, which is the background's.
-OpenVDB holds all channels in memory while it writes.
+Needs OpenVDB's Python module (``openvdb``, formerly ``pyopenvdb``), which is not on PyPI, and all channels in memory.
+Voxel (i, j, k) is cell (i, j, k): the transform takes whole indices to cell centres. NaN cells and zero gradients,
+the background's value, are inactive.
 """
 
 import json
@@ -35,10 +34,10 @@ _NUMBERS = {"int32": "<i", "int64": "<q", "float": "<f", "double": "<d", "bool":
 
 
 def write_vdb(path: Path, grid: DistanceGrid) -> None:
-    """Write the grid. The background, read where no voxel is active, is the float next above the channel's largest.
+    """Write the grid; inactive voxels read as the float above the channel's largest.
 
-    (So it is for a level set: outside is positive. A planner must ask at active voxels only.) A gradient's is zero.
-    Raises UsageError where OpenVDB is missing, InputError for channels that a file cannot hold.
+    As in a level set, that is positive; a planner must query active voxels only. A gradient's is zero. Raises
+    UsageError without OpenVDB, InputError for an invalid layout.
     """
     check_grid(grid)
     vdb = openvdb()
@@ -71,7 +70,7 @@ def write_vdb(path: Path, grid: DistanceGrid) -> None:
 
 
 def openvdb() -> Any:
-    """OpenVDB's Python module under either of its names. Raises UsageError where neither can be imported."""
+    """Import OpenVDB by either name. Raises UsageError without it."""
     try:
         import openvdb as module
     except ImportError:
@@ -83,21 +82,22 @@ def openvdb() -> Any:
 
 
 def _above(values: Any) -> float:
-    """The float next above the largest value: no cell is the background."""
+    """The float above the largest value: no cell is background."""
     largest = max((float(np.nanmax(layers)) for layers in slabs(values) if not np.isnan(layers).all()), default=0.0)
     return float(np.nextafter(np.float32(largest), np.float32(np.inf)))
 
 
 def _plain(value: object) -> object:
-    """What OpenVDB can hold as metadata: text, or a number; JSON of all else."""
+    """Text or a number for OpenVDB; JSON of all else."""
     is_number = isinstance(value, float) or (isinstance(value, int) and abs(value) < 2**31)
     return value if isinstance(value, str | bool) or is_number else json.dumps(value, allow_nan=False)
 
 
 def read_vdb_head(path: Path) -> list[tuple[str, str, dict[str, object]]]:
-    """Name, type and metadata of every grid of a ``.vdb``, without OpenVDB. Raises InputError for what is none.
+    """Read name, type and metadata of a ``.vdb``'s grids, without OpenVDB.
 
-    The layout is that of OpenVDB's io/Archive.cc, io/GridDescriptor.cc and MetaMap.cc, since file version 222.
+    The layout is OpenVDB's io/Archive.cc, io/GridDescriptor.cc and MetaMap.cc, since file version 222. Raises
+    InputError.
     """
     with path.open("rb") as stream:
         if stream.read(8) != MAGIC:
@@ -146,7 +146,7 @@ def _metadata(stream: BinaryIO) -> dict[str, object]:
 
 
 def describe_vdb(path: Path, head: bytes) -> Summary | None:
-    """Any OpenVDB file: its grids, and the header of the bake where it is ours."""
+    """Summarise an OpenVDB file and our bake's header."""
     if not head.startswith(MAGIC):
         return None
     grids = read_vdb_head(path)

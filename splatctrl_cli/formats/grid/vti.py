@@ -1,7 +1,7 @@
-"""Baked distance fields as ParaView's ``.vti``: VTK ImageData whose points are the cell centres.
+"""Baked distance fields as ParaView's ``.vti``: VTK ImageData with points at cell centres.
 
-Raw appended little-endian blocks, x fastest, each behind its length; the header is a string in FieldData.
-Format: VTK's user guide and the XML file formats page of its documentation.
+Raw appended little-endian blocks, x fastest, each after its length; the header is a string in FieldData. Format:
+VTK's user guide and its page on XML file formats.
 """
 
 import re
@@ -41,7 +41,7 @@ _REMEDY = "give a .vti that sdf-bake wrote, or bake it again"
 
 
 def write_vti(path: Path, grid: DistanceGrid) -> None:
-    """Write the grid; NaN is kept. Raises InputError for channels that a file cannot hold."""
+    """Write the grid; NaN is kept. Raises InputError for invalid channels."""
     x, y, z = check_grid(grid)
     extent = f"0 {x - 1} 0 {y - 1} 0 {z - 1}"
     arrays, offset = [], 0
@@ -82,7 +82,7 @@ def write_vti(path: Path, grid: DistanceGrid) -> None:
 
 
 def read_vti(path: Path) -> DistanceGrid:
-    """The grid that `write_vti` wrote. Raises InputError for a file that is missing, damaged or not ours."""
+    """Read a `write_vti` grid. Raises InputError if missing, damaged or not ours."""
     with _opened(path) as stream:
         head, starts = _head(path, stream)
         channels = {name: _values(path, stream, head, name, start) for name, start in starts.items()}
@@ -92,7 +92,7 @@ def read_vti(path: Path) -> DistanceGrid:
 
 
 def read_vti_head(path: Path) -> GridHead:
-    """What `read_vti` reads without the channels' values. Raises InputError as that does."""
+    """Read without values. Raises as `read_vti`."""
     with _opened(path) as stream:
         return _head(path, stream)[0]
 
@@ -107,7 +107,7 @@ def _opened(path: Path) -> BinaryIO:
 
 
 def _head(path: Path, stream: BinaryIO) -> tuple[GridHead, dict[str, int]]:
-    """The head, and by channel where in the file [bytes] the length before its values stands."""
+    """The head, and offsets [bytes] of each channel's length."""
     text = stream.read(1 << 22)  # bytes in which the XML must end
     mark = text.find(_APPENDED)
     begin = text.find(b"_", mark) + 1
@@ -177,7 +177,7 @@ def _triple(values: object) -> str:
 
 
 def describe_vti(path: Path, head: bytes) -> Summary | None:
-    """A ``.vti``: as a distance grid where it is ours, as what its XML says where not."""
+    """Summarise a ``.vti``: a distance grid if ours, else its XML."""
     if path.suffix != ".vti" and b'type="ImageData"' not in head[:512]:
         return None
     text = head.decode("latin-1")

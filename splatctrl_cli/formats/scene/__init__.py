@@ -1,1 +1,1 @@
-"""The folder of a reconstruction: splats, voxels and snapshots."""
+"""A reconstruction's folder: splats, voxels and snapshots."""

@@ -1,4 +1,4 @@
-"""Reads the ``scene/`` folder that `SceneWriter` writes, or a bare file of splats in its place.
+"""The ``scene/`` folder that `SceneWriter` writes, or a bare splat file in its place.
 
 splats.ply  shell.ply  occupancy.npz  audit.jsonl  snapshots.csv  checkpoint/state.npz  run.json
 snapshots/NNNNNN.ply, .shell.ply and .npz
@@ -42,7 +42,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, kw_only=True)
 class Snapshot:
-    """The splat set as it was after the frames of `stamp_ns`."""
+    """Splats after the frames of `stamp_ns`."""
 
     stamp_ns: int
     path: Path
@@ -51,19 +51,19 @@ class Snapshot:
 
     @property
     def occupancy_path(self) -> Path:
-        """What was known of each voxel then."""
+        """File of the voxels."""
         return self.path.with_suffix(".npz")
 
     def occupancy(self) -> OccupancyGrid | None:
-        """The grid of that moment, as coarse as `write_states` keeps it; None in a scene of an older version."""
+        """The grid, as coarse as `write_states`; None in an older scene."""
         return self._read_voxels(read_states)
 
     def seen(self) -> SeenVoxels | None:
-        """When each voxel was last seen; None in a scene of an older version."""
+        """When voxels were last seen; None in an older scene."""
         return self._read_voxels(read_seen)
 
     def unrepresented(self) -> Balls | None:
-        """The occupied voxels that had no splat then; None in a scene of an older version."""
+        """Occupied voxels without a splat; None in an older scene."""
         return self._read_voxels(read_unrepresented)
 
     def splats(self) -> SplatSet:
@@ -71,7 +71,7 @@ class Snapshot:
 
     @property
     def shell_path(self) -> Path:
-        """The file of what lay beyond the robot's reach; absent where nothing did."""
+        """File of the shell, absent if none."""
         return self.path.with_suffix(f".{SHELL_FILE}")
 
     def _read_voxels(self, read: Callable[[Path], T]) -> T | None:
@@ -83,9 +83,9 @@ class Snapshot:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewCorrection:
-    """Where a training view is instead of where it was recorded, T_world_camera (4, 4), by what its red, green and
-    blue are divided, gain (3,), and of what its depth was freed, bend (rows, columns) [1/m]; None where they were
-    taken as recorded.
+    """The correction of a training view; None where used as recorded.
+
+    T_world_camera (4, 4); gain (3,) divides red, green, blue; bend (rows, columns) [1/m] was removed from depth.
     """
 
     T_world_camera: Float64 | None
@@ -96,9 +96,9 @@ class ViewCorrection:
 def run_value(
     run: Mapping[str, Any], keys: Sequence[str], kind: Callable[[Any], T], default: object = None, *, where: str
 ) -> T:
-    """What `kind` makes of the value at `keys` of a ``run.json``; of the default where it is not there.
+    """`kind` of the value at `keys` of a ``run.json``, or of the default.
 
-    Raises InputError naming `where` for a value that is missing without a default, or of another kind.
+    Raises InputError naming `where` if missing without a default, or of another kind.
     """
     value: Any = run
     try:
@@ -140,7 +140,6 @@ def _bends(bends: Mapping[str, Mapping[str, Any]]) -> dict[str, Float64]:
 
 
 def _inside(name: str) -> str:
-    """The name itself. Raises ValueError where it leads out of its folder."""
     if Path(name).is_absolute() or ".." in Path(name).parts:
         raise ValueError(f"{name} lies outside the scene")
     return name
@@ -148,7 +147,7 @@ def _inside(name: str) -> str:
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """A scene that `reconstruct` wrote."""
+    """A scene from `reconstruct`."""
 
     path: Path
     names_its_views: ClassVar[bool] = True
@@ -156,7 +155,7 @@ class SceneFolder:
 
     @cached_property
     def run(self) -> dict[str, Any]:
-        """``run.json``. Raises InputError where it is none."""
+        """``run.json``. Raises InputError if unreadable."""
         file = self.path / "run.json"
         try:
             run = json.loads(file.read_text(encoding="utf-8"))
@@ -169,19 +168,20 @@ class SceneFolder:
 
     @cached_property
     def parts(self) -> Parts:
-        """By which every file is checked when it is opened."""
+        """Digests that check every opened file."""
         return Parts.of_run(self.path, self.run)
 
     @property
     def has_digests(self) -> bool:
-        """False for a scene of an older version, whose files cannot be checked."""
+        """False for an older scene."""
         return self.parts.digests is not None
 
     @property
     def made_from(self) -> dict[str, Any]:
-        """Digests of the files that were read (`inputs`), the first frame of each camera, the robot's joints and
-        links, by how much depth was corrected, where it was, and how far off the cameras see the robot: what tells
-        whether it belongs to a log and a robot.
+        """Facts that tell if the scene belongs to a log and a robot.
+
+        Digests (`inputs`), first frames, joints and links, depth correction, and how far off the cameras see the
+        robot.
         """
         metrics = self.run.get("metrics", {})
         bend = {"depth_bend": metrics["depth_bend"]} if metrics.get("depth_bend") else {}
@@ -190,45 +190,45 @@ class SceneFolder:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The cameras that trained the scene."""
+        """Cameras that trained the scene."""
         return self._metric("cameras", lambda names: tuple(map(str, names)))
 
     @property
     def training_stamps_ns(self) -> frozenset[int]:
-        """The views that trained a scene without a clock, by their made-up stamps."""
+        """Made-up stamps of training views without a clock."""
         return self._metric("training_stamps_ns", frozenset[int], ())
 
     @property
     def has_clock(self) -> bool:
-        """False where the stamps are made up."""
+        """False if the stamps are made up."""
         return self._metric("has_clock", bool)
 
     @property
     def stamp_ns(self) -> int:
-        """Of the last frame."""
+        """Stamp of the last frame."""
         return self._metric("stamp_ns", int)
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """What is seen where no splat is: a colour in [0, 1]; black in a scene of an older version."""
+        """Colour in [0, 1] behind the splats; black in an older scene."""
         return self._metric("background", _color, (0.0, 0.0, 0.0))
 
     @property
     def corrections(self) -> dict[tuple[str, int], ViewCorrection]:
-        """Of training views, by camera and stamp; empty where they were taken as recorded."""
+        """Corrections by camera and stamp; may be empty."""
         rows, bends = self._metric("corrected_views", _corrections, ()), self._metric("depth_bends", _bends, {})
         return {key: replace(row, bend=bends.get(key[0])) for key, row in rows.items()}
 
     @property
     def is_anisotropic(self) -> bool:
-        """True for what 3D Gaussian splatting made: `gaussians` instead of splats and occupancy."""
+        """True for 3D Gaussian splatting: `gaussians`, no splats and occupancy."""
         return self._metric("method", "3dgs".__eq__, "")
 
     def _metric(self, name: str, kind: Callable[[Any], T], default: object = None) -> T:
         return run_value(self.run, ("metrics", name), kind, default, where=str(self.path / "run.json"))
 
     def gaussians(self) -> GaussianSet:
-        """The Gaussians of a scene that is anisotropic. Raises InputError where it has none."""
+        """The Gaussians. Raises InputError if there are none."""
         gaussians = read_gaussian_ply(self.parts.checked(self.path / "splats.ply"))[0]
         if not len(gaussians):
             raise InputError(
@@ -241,7 +241,7 @@ class SceneFolder:
         return read_world_splats(self._isotropic("splats.ply"))
 
     def _isotropic(self, name: str) -> Path:
-        """A file of the scene, checked. Raises InputError where the splats are not isotropic."""
+        """The checked file. Raises InputError if splats are not isotropic."""
         if self.is_anisotropic:
             raise InputError(
                 f"{self.path}: made by 3D Gaussian splatting; distances are defined on isotropic splats",
@@ -254,16 +254,16 @@ class SceneFolder:
         return read_occupancy(self._isotropic("occupancy.npz"))
 
     def known(self) -> KnownVoxels | None:
-        """What was known at the end, and when it was last seen; None in a scene of an older version."""
+        """Final voxels, and when last seen; None in an older scene."""
         return read_known_occupancy(self._isotropic("occupancy.npz"))
 
     def seen(self) -> SeenVoxels | None:
-        """When each voxel was last seen, at the end; None in a scene of an older version."""
+        """When voxels were last seen; None in an older scene."""
         return read_seen(self._isotropic("occupancy.npz"))
 
     @cached_property
     def snapshots(self) -> tuple[Snapshot, ...]:
-        """By time. Raises InputError for a table that is not the one written, or whose stamps do not ascend."""
+        """Snapshots by time. Raises InputError for a bad table or stamps that do not ascend."""
         path = self._isotropic("snapshots.csv")
         try:
             with path.open(encoding="utf-8", newline="") as stream:
@@ -287,7 +287,7 @@ class SceneFolder:
         return taken
 
     def snapshot_at(self, stamp_ns: int) -> Snapshot:
-        """The newest snapshot not later than `stamp_ns`; NotEvaluableError before the first."""
+        """The newest snapshot up to `stamp_ns`. Raises NotEvaluableError before the first."""
         known = [s for s in self.snapshots if s.stamp_ns <= stamp_ns]
         if not known:
             raise NotEvaluableError(
@@ -297,26 +297,23 @@ class SceneFolder:
         return known[-1]
 
     def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
-        """The occupied voxels without a splat, of `snapshot_at` or (None) at the end; None in an older scene."""
+        """Occupied voxels without a splat at `stamp_ns` (None: the end); None in an older scene."""
         if stamp_ns is not None:
             return self.snapshot_at(stamp_ns).unrepresented()
         path = self.path / "occupancy.npz"
         return read_unrepresented(self.parts.checked(path)) if self.parts.has(path) else None
 
     def shell_at(self, stamp_ns: int | None) -> SplatSet | None:
-        """What lay beyond the robot's reach, for pictures alone, of `snapshot_at` or (None) at the end; None where
-        nothing did, and in a scene of an older version.
-        """
+        """The shell beyond the robot's reach, for pictures, as in `unrepresented_at`; None if absent."""
         path = self.path / SHELL_FILE if stamp_ns is None else self.snapshot_at(stamp_ns).shell_path
         return read_shell(self.parts.checked(path)) if self.parts.has(path) else None
 
     def splats_at(self, stamp_ns: int) -> SplatSet:
-        """The splats of `snapshot_at`."""
         return self.snapshot_at(stamp_ns).splats()
 
 
 def open_scene(path: Path) -> SceneFolder:
-    """The scene in a folder. Raises InputError where it is none."""
+    """Open a scene folder. Raises InputError for another."""
     if not path.exists():
         raise InputError(f"{path}: no such scene folder", remedy="give what 'splatctrl reconstruct' wrote")
     if path.name.endswith(PARTIAL):
@@ -331,28 +328,27 @@ def open_scene(path: Path) -> SceneFolder:
 
 @dataclass(frozen=True)
 class SplatFile(SceneFolder):
-    """Splats that are rendered as they are: of any shape, with what harmonics they have, before black."""
+    """A splat file rendered as it is, on black."""
 
     names_its_views: ClassVar[bool] = False
 
     @cached_property
     def run(self) -> dict[str, Any]:
-        """What is known of how they were made: nothing."""
+        """An empty record: the origin is unknown."""
         return {"metrics": {"cameras": [], "has_clock": False, "stamp_ns": 0}, "inputs": {}, "config": {}}
 
     @cached_property
     def parts(self) -> Parts:
-        """Of the file alone."""
+        """The file, without digests."""
         return Parts(folder=self.path.parent)
 
     @property
     def is_anisotropic(self) -> bool:
-        """Whether any is stretched, or changes its colour by side."""
+        """True if stretched or with view-dependent colour."""
         return isinstance(self._found, GaussianSet)
 
     @cached_property
     def _found(self) -> SplatSet | GaussianSet:
-        """Raises InputError for a file that is damaged, of an unknown kind, in another frame or unit, or empty."""
         found, comments = read_splats(self.path)
         check_world(self.path, comments)
         if not len(found):
@@ -360,12 +356,10 @@ class SplatFile(SceneFolder):
         return found
 
     def gaussians(self) -> GaussianSet:
-        """Where they are anisotropic."""
         assert isinstance(self._found, GaussianSet)
         return self._found
 
     def splats(self) -> SplatSet:
-        """Where they are not."""
         assert isinstance(self._found, SplatSet)
         return self._found
 
@@ -378,5 +372,5 @@ class SplatFile(SceneFolder):
 
 
 def open_splats(path: Path) -> SceneFolder:
-    """The scene in a folder, or a file of splats. Raises InputError where it is neither."""
+    """Open a scene folder or splat file. Raises InputError for neither."""
     return SplatFile(path) if path.is_file() else open_scene(path)

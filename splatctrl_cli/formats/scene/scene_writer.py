@@ -1,4 +1,4 @@
-"""Writes the ``scene/`` folder, and the checkpoint from which an interrupted run goes on."""
+"""A writer of the ``scene/`` folder and its checkpoints."""
 
 import csv
 import json
@@ -30,9 +30,9 @@ State = Mapping[str, NDArray[np.generic]]
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
-    """An interrupted run: `progress` as it was given to `SceneWriter.checkpoint`, the fitter's `state`, and what of
-    the folder was written then (bytes of the audit; stamp and number of splats of each snapshot; sha256 of the
-    snapshots' files by name, None in a checkpoint of an older version).
+    """An interrupted run: `SceneWriter.checkpoint`'s `progress`, the fitter's `state`, and the files.
+
+    snapshots: (stamp, number of splats). parts: sha256 of the snapshots' files by name, None in an older checkpoint.
     """
 
     progress: dict[str, Any]
@@ -43,7 +43,7 @@ class Checkpoint:
 
 
 def read_checkpoint(folder: Path) -> Checkpoint:
-    """The checkpoint in a partial scene folder. Raises InputError where it cannot be read."""
+    """Read a checkpoint. Raises InputError if unreadable."""
     path = folder / CHECKPOINT
     try:
         state = read_arrays(path, most=1 << 32)  # the largest grid takes 2.8e9 bytes, its splats the rest
@@ -60,10 +60,9 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 class SceneWriter:
-    """Writes a scene into a folder as the fitter goes: an empty folder, or one with `SELF_MODEL` or the
-    checkpoint to go on from.
+    """A writer of a scene during fitting, into an empty or a checkpoint's folder.
 
-    Snapshots are written while the fitter goes on; what goes wrong with one is raised by the next call.
+    An empty folder may have `SELF_MODEL`. Snapshots are written in the background; the next call raises errors.
     """
 
     def __init__(self, folder: Path, comments: Mapping[str, str], checkpoint: Checkpoint | None = None) -> None:
@@ -82,7 +81,6 @@ class SceneWriter:
             self._go_back_to(checkpoint)
 
     def _go_back_to(self, checkpoint: Checkpoint) -> None:
-        """Drop what was written after the checkpoint."""
         self.snapshots += [
             Snapshot(stamp_ns=stamp_ns, path=self._place(index), num_splats=num_splats)
             for index, (stamp_ns, num_splats) in enumerate(checkpoint.snapshots)
@@ -110,21 +108,21 @@ class SceneWriter:
         return self.folder / "snapshots" / f"{index:06d}.ply"
 
     def audit(self, row: object) -> None:
-        """Append one row to ``audit.jsonl``."""
+        """Append to ``audit.jsonl``."""
         assert is_dataclass(row) and not isinstance(row, type)
         with self._audit.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(asdict(row)) + "\n")
 
     def audited(self) -> list[dict[str, Any]]:
-        """The rows written so far."""
+        """Rows written so far."""
         return [json.loads(line) for line in self._audit.read_text(encoding="utf-8").splitlines()]
 
     def snapshot(
         self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, states: UInt8, shell: SplatSet | None = None
     ) -> None:
-        """Write the splats and the shell as they are at `stamp_ns`, and the `states` (X, Y, Z) of the voxels then.
+        """Write splats, shell and voxel `states` (X, Y, Z) of `stamp_ns`.
 
-        The arrays are the writer's from now on. `settle` says when they are in the files.
+        The writer owns the arrays from then on; `settle` waits for the files.
         """
         snapshot = Snapshot(stamp_ns=stamp_ns, path=self._place(len(self.snapshots)), num_splats=len(splats))
 
@@ -138,21 +136,21 @@ class SceneWriter:
         self.snapshots.append(snapshot)
 
     def settle(self, *, but: int = 0) -> None:
-        """Wait until all snapshots, or all but the last so many, are written. Raises what went wrong with one."""
+        """Wait for all snapshots but the last `but`. Raises their errors."""
         while len(self._unwritten) > but:
             self._unwritten.popleft().result()
 
     def close(self) -> None:
-        """Wait for the snapshot that is being written, whatever comes of it."""
+        """Wait for the current snapshot, ignoring errors."""
         self._thread.shutdown()
 
     def _write_shell(self, path: Path, stamp_ns: int, shell: SplatSet | None) -> None:
-        """A file of its own: what reads splats does not meet it."""
+        """Write a separate file, which readers of splats skip."""
         if shell is not None and len(shell):
             write_ply(path, shell, self.comments | SHELL | {"stamp_ns": str(stamp_ns)})
 
     def checkpoint(self, progress: Mapping[str, Any], state: State, *, is_last: bool = False) -> None:
-        """Replace the checkpoint in one step, when all that it counts on is on disk; the last is compressed."""
+        """Replace the checkpoint atomically after its files; the last is compressed."""
         self.settle()
         flush(self._audit)
         for snapshot in self.snapshots[self._num_flushed :]:
@@ -170,7 +168,7 @@ class SceneWriter:
         write_durably(self.folder / CHECKPOINT, lambda path: savez(path, arrays, level=1 if is_last else 0))
 
     def finish(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, shell: SplatSet | None = None) -> None:
-        """Write the final splats and shell, the occupancy grid and the index of snapshots."""
+        """Write final splats, shell, occupancy and the index of snapshots."""
         self.settle()
         write_ply(self.folder / "splats.ply", splats, self.comments | {"stamp_ns": str(stamp_ns)})
         self._write_shell(self.folder / SHELL_FILE, stamp_ns, shell)

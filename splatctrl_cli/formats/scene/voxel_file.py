@@ -1,4 +1,4 @@
-"""Voxel files of a scene: ``occupancy.npz`` and the states beside each snapshot, with the evidence behind them."""
+"""Voxel files of a scene: ``occupancy.npz`` and snapshots' states, with evidence."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -37,21 +37,20 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def write_occupancy(path: Path, known: KnownVoxels) -> None:
-    """Write ``occupancy.npz``: log_odds, num_updates, entity, what `_evidence` says, and a JSON header."""
+    """Write ``occupancy.npz``: log_odds, num_updates, entity, `_evidence` and a JSON header."""
     values = "log_odds of occupancy; num_updates 0 = never seen; entity bits 001 robot, 010 human, 100 swept"
     header = _header(known, {"format": "splatctrl-occupancy 2", "values": values})
     savez(path, {"header": header, **{name: getattr(known.grid, name) for name in _GRID}, **_evidence(known)})
 
 
 def write_states(path: Path, known: KnownVoxels, states: UInt8) -> None:
-    """Write `states` (X, Y, Z) of the voxels instead of their log-odds: a tenth of the size."""
+    """Write `states` (X, Y, Z) instead of log-odds: a tenth of the size."""
     values = {state.name.lower(): int(state) for state in VoxelState}
     header = _header(known, {"format": "splatctrl-voxel-states 2", "values": values})
     savez(path, {"header": header, "states": states, **_evidence(known)}, level=3)
 
 
 def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.generic]:
-    """The JSON header: `special` and what both files have in common."""
     common = {
         "frame": "world",
         "units": "m",
@@ -69,7 +68,7 @@ def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.gen
 
 
 def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
-    """The arrays that both files have in common; last_seen in one byte where that holds it: twice as fast."""
+    """Arrays of both files; last_seen in one byte is twice as fast."""
     balls = known.unrepresented
     return {
         "last_seen": known.last_seen.astype(np.uint8 if len(known.step_stamps_ns) < FIRST_REASON else np.uint16),
@@ -81,7 +80,6 @@ def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
 
 @contextmanager
 def _refused(path: Path, what: str) -> Iterator[None]:
-    """Whatever goes wrong within, as an InputError that says what the file is not."""
     try:
         yield
     except FileNotFoundError:
@@ -91,7 +89,7 @@ def _refused(path: Path, what: str) -> Iterator[None]:
 
 
 def read_states(path: Path) -> OccupancyGrid:
-    """An occupancy grid with the states of `write_states`. Raises InputError for anything else, never unpickles."""
+    """Read a `write_states` grid. Raises InputError otherwise; never unpickles."""
     with _refused(path, _STATES):
         arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
         header = json.loads(str(arrays["header"]))
@@ -100,9 +98,9 @@ def read_states(path: Path) -> OccupancyGrid:
 
 
 def read_seen(path: Path) -> SeenVoxels | None:
-    """When the voxels of either file were last seen, and nothing else: a replay asks for it five times a second.
+    """Read only when voxels were last seen, which a replay does five times a second.
 
-    None where an older version wrote the file. Raises InputError for anything else.
+    None for an older file. Raises InputError for another one.
     """
     with _refused(path, _OURS):
         header = _read_header(path)
@@ -125,14 +123,14 @@ def _read_header(path: Path) -> dict[str, Any]:
 
 
 def read_occupancy(path: Path) -> OccupancyGrid:
-    """Read the grid of ``occupancy.npz``. Raises InputError for anything else, never unpickles."""
+    """Read the ``occupancy.npz`` grid. Raises InputError otherwise; never unpickles."""
     with _refused(path, _OCCUPANCY):
         arrays = read_arrays(path, ("header", *_GRID), most=_HEADER + 7 * MOST_VOXELS)
         return _grid_of(arrays, json.loads(str(arrays["header"])))
 
 
 def read_known_occupancy(path: Path) -> KnownVoxels | None:
-    """All of ``occupancy.npz``, None where an older version wrote it. Raises as `read_occupancy`."""
+    """Read all of ``occupancy.npz``; None if older. Raises as `read_occupancy`."""
     with _refused(path, _OCCUPANCY):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
@@ -154,10 +152,7 @@ def read_known_occupancy(path: Path) -> KnownVoxels | None:
 
 
 def read_unrepresented(path: Path) -> Balls | None:
-    """The unrepresented voxels of either file, without the rest; None where an older version wrote it.
-
-    Raises InputError for anything else.
-    """
+    """Read only unrepresented voxels; None if older. Raises InputError for another file."""
     with _refused(path, _OURS):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
@@ -174,9 +169,9 @@ def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
 
 
 def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) -> NDArray[Any]:
-    """`last_seen` as it was stored, in one byte or two. Its largest numbers say why a voxel was never seen.
+    """`last_seen` in one byte or two; the largest numbers say why a voxel was never seen.
 
-    Raises ValueError for another shape, or time steps that there are not.
+    Raises ValueError for another shape, or too many time steps.
     """
     is_short = stored.dtype == np.uint8
     stored = _voxels(stored, "last_seen", np.uint8 if is_short else np.uint16, header)
@@ -192,7 +187,6 @@ def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) 
 
 
 def _balls(arrays: Arrays, voxel: float) -> Balls:
-    """Raises ValueError for other types or shapes."""
     centers, labels = arrays["unrepresented"], arrays["unrepresented_labels"]
     if centers.dtype != np.float32 or labels.dtype != np.uint8 or centers.shape != (labels.size, 3):
         raise ValueError(
@@ -204,12 +198,10 @@ def _balls(arrays: Arrays, voxel: float) -> Balls:
 
 
 def _edges_in(header: Mapping[str, Any]) -> set[str]:
-    """The array of lost edges, which older versions did not write."""
     return {"edges"} & header.keys()
 
 
 def _edges(arrays: Arrays) -> LostEdges:
-    """Raises ValueError for other types or shapes."""
     if "edges" not in arrays:
         return NO_EDGES
     edges = arrays["edges"]
@@ -219,7 +211,6 @@ def _edges(arrays: Arrays) -> LostEdges:
 
 
 def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Mapping[str, Any]) -> NDArray[Any]:
-    """An array of one value a voxel. Raises ValueError for one of another type or shape than the header's."""
     wanted = (np.dtype(kind), tuple(header["shape"]))
     if (values.dtype, values.shape) != wanted or len(values.shape) != 3:
         raise ValueError(f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}")
@@ -227,10 +218,7 @@ def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Map
 
 
 def known_space(grid: OccupancyGrid, thresholds: OccupancyConfig) -> dict[str, object]:
-    """The size of a grid [m], the share of its voxels in each `VoxelState`, and how many the robot and people are in.
-
-    Names are those of the states, in lower case, as the other commands and files have them.
-    """
+    """A grid's extent [m], share of each `VoxelState` (lower case), robot and human voxels."""
     states = grid.states(thresholds.free_below, thresholds.occupied_above)
     counts = np.bincount(states.ravel(), minlength=len(VoxelState))
     return {

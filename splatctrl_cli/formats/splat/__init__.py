@@ -1,1 +1,1 @@
-"""The files that hold splats, one format a file."""
+"""The splat file formats, one a file."""

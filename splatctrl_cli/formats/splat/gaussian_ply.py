@@ -1,10 +1,9 @@
-"""Sets of anisotropic Gaussians as 3D-GS PLY files: the reference implementation's 62 properties.
+"""Anisotropic Gaussians as 3D-GS PLY files: the reference implementation's 62 properties.
 
-Layout: ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``, all float. ``scale_*`` is log(sigma),
-``rot_*`` a quaternion w x y z, ``opacity`` a logit; ``f_dc_*`` and ``f_rest_*`` are the harmonics' coefficients of
-red, green and blue: f_rest has all of red first, then green, then blue. A ``label`` (uchar) follows only where some
-Gaussian is not an object, so that readers of a fixed stride can read every other file. Where ``scale_0`` stands
-alone it is of all three axes.
+``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``, all float. ``scale_*`` is log(sigma), ``rot_*``
+a quaternion w x y z, ``opacity`` a logit. ``f_dc_*`` and ``f_rest_*`` are harmonics; f_rest has all of red, then
+green, then blue. A ``label`` (uchar) follows only if some Gaussian is not an object, for readers of a fixed stride. A
+lone ``scale_0`` is for all axes.
 """
 
 from collections.abc import Mapping
@@ -48,10 +47,10 @@ HEADER_COMMENTS = {
 
 
 def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    """Write `gaussians`; frame, units, what the scales mean and `comments` go in the header. Same input, same bytes.
+    """Write `gaussians`, with frame, units and `comments` in the header. Same input, same bytes.
 
-    Harmonics above the set's degree are zeros; opacities of exactly 0 and 1 read back as that.
-    Raises InputError for a value the format cannot hold, naming its index; UsageError for a comment of several lines.
+    Harmonics above the set's degree are 0; opacities 0 and 1 read back exactly. Raises InputError naming an invalid
+    index, UsageError for a comment of several lines.
     """
     check_gaussians("Gaussians to write", gaussians)
     has_labels = bool((gaussians.labels != Label.OBJECT).any())
@@ -60,7 +59,7 @@ def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str
 
 
 def rows_of(gaussians: GaussianSet, dtype: "np.dtype[Any]") -> NDArray[Any]:
-    """The Gaussians (N,) as rows of the properties of `dtype`, 0 where a property is none of theirs."""
+    """Rows (N,) of `dtype`, 0 in other properties."""
     g = gaussians
     rest = np.zeros((len(g), 3, 15), dtype=np.float32)
     rest[:, :, : g.harmonics.shape[1] - 1] = g.harmonics[:, 1:].transpose(0, 2, 1)
@@ -74,18 +73,17 @@ def rows_of(gaussians: GaussianSet, dtype: "np.dtype[Any]") -> NDArray[Any]:
 
 
 def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
-    """The Gaussians of a 3D-GS PLY file (binary or ASCII, properties in any order) and its ``key: value`` comments.
+    """Read a 3D-GS PLY (binary or ASCII, any property order) and its ``key: value`` comments.
 
-    Harmonics have the degree of ``f_rest_*`` (0, 9, 24 or 45 of them), less degrees that are zero throughout.
-    Quaternions are scaled to length one; a missing label is 0 (object); other properties are ignored.
-    Raises InputError for a file that is not whole, lacks a property or holds a value that no Gaussian can have.
+    Harmonics have the degree of ``f_rest_*`` (0, 9, 24 or 45), less all-zero degrees. Quaternions are normalised; a
+    missing label is 0 (object). Raises InputError if truncated, invalid or without a property.
     """
     ply = read_table(path, "vertex", REQUIRED)
     return gaussians_of(ply), ply.pairs()
 
 
 def gaussians_of(ply: PlyFile) -> GaussianSet:
-    """The Gaussians that a table of a PLY file holds. Raises InputError as `read_gaussian_ply` does."""
+    """A PLY table's Gaussians. Raises as `read_gaussian_ply`."""
     path = ply.path
     check_properties(path, ply.names, REQUIRED)
     logs = log_sigmas(ply)
@@ -107,13 +105,14 @@ class RoundedError(InputError):
 
 
 def exact_centers(ply: PlyFile) -> Float64:
-    """(N, 3) float64 [m], as the file has them."""
+    """(N, 3) float64 [m], as in the file."""
     return np.column_stack([ply.column(name) for name in "xyz"])
 
 
 def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
-    """(N, 3) float32 [m]. Raises InputError where float32 would move the splats, or moved them before, against their
-    `sigmas` (N,) or (N, 3) [m] and the length of their box.
+    """Centres (N, 3) float32 [m]. Raises InputError if float32 moves, or moved, the splats too far.
+
+    The measure is `sigmas` (N,) or (N, 3) [m] and their box's length.
     """
     exact = exact_centers(ply)
     centers = exact.astype(np.float32)
@@ -139,8 +138,9 @@ def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
 
 
 def log_sigmas(ply: PlyFile) -> Float64:
-    """(N, 3) log(sigma [m]). Raises InputError for splats of two scales, and for scales that are no logarithms: all
-    above 0, which makes every splat SPARSEST times as large as their spacing.
+    """(N, 3) log(sigma [m]). Raises InputError for two scales, or scales that are no logarithms.
+
+    Those are all above 0, with splats SPARSEST times as large as their spacing.
     """
     found = [name for name in SCALES if name in ply]
     if len(found) == 2:
@@ -167,7 +167,7 @@ def log_sigmas(ply: PlyFile) -> Float64:
 
 
 def labels_of(ply: PlyFile) -> UInt8:
-    """(N,) labels; all 0 (object) where the file has none. Raises InputError for other values."""
+    """Labels (N,), 0 (object) by default. Raises InputError for other values."""
     if "label" not in ply:
         return np.zeros(len(ply), dtype=np.uint8)
     values = ply.column("label")
@@ -177,7 +177,7 @@ def labels_of(ply: PlyFile) -> UInt8:
 
 
 def without_zero_degrees(harmonics: Float32) -> Float32:
-    """`harmonics` (N, K, 3) up to the last degree that has a coefficient other than zero: the same colours."""
+    """(N, K, 3) up to the last nonzero degree: the same colours."""
     degree = 3
     while degree and not harmonics[:, degree * degree :].any():
         degree -= 1
@@ -185,7 +185,7 @@ def without_zero_degrees(harmonics: Float32) -> Float32:
 
 
 def check_gaussians(where: str, gaussians: GaussianSet) -> None:
-    """Raise InputError at the first Gaussian that has no place in the world, naming its index."""
+    """Raise InputError naming the first invalid Gaussian's index."""
     g = gaussians
     groups: dict[str, NDArray[np.generic]] = {"center": g.centers, "sigma": g.scales, "rotation": g.quats_wxyz}
     groups |= {"opacity": g.opacities, "harmonics": g.harmonics}
@@ -199,7 +199,7 @@ def check_gaussians(where: str, gaussians: GaussianSet) -> None:
 
 
 def _harmonics(ply: PlyFile) -> Float32:
-    """(N, K, 3) coefficients; f_rest has all of a channel's in a row."""
+    """(N, K, 3); f_rest has each channel's in a row."""
     num_rest = sum(name.startswith("f_rest_") for name in ply.names)
     names = [f"f_rest_{index}" for index in range(num_rest)]
     if num_rest not in REST_PER_DEGREE or not all(name in ply for name in names):

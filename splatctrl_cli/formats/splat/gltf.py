@@ -1,9 +1,8 @@
-"""Gaussians as glTF 2.0 in one binary file (``.glb``), with the extension KHR_gaussian_splatting.
+"""Gaussians as glTF 2.0 in one binary file (``.glb``), with KHR_gaussian_splatting.
 
-One primitive of points whose attributes are float32: centre, rotation (x y z w), sigmas (linear), opacity, and every
-harmonic's coefficient of red, green, blue; COLOR_0 holds the colour for readers that know points alone. The values
-are in world as they are; glTF's up is y, so the node that holds them turns a world whose z is up. The container is a
-JSON document, one buffer, and tables of numbers in it.
+A primitive of points has float32 centre, rotation (x y z w), sigmas (linear), opacity, harmonics of red, green, blue;
+COLOR_0 serves plain point readers. Values are in world; the node turns z up to glTF's y. The container is JSON and
+one buffer of tables.
 """
 
 import json
@@ -38,7 +37,7 @@ PROPERTIES = {
 
 
 def _write(path: Path, document: Mapping[str, Any], tables: Sequence[NDArray[Any]]) -> None:
-    """Write a document and its tables (N, 1 | 3 | 4) of float32, or of uint8 that stand for 0 to 1."""
+    """Write tables (N, 1 | 3 | 4) of float32, or of uint8 for 0 to 1."""
     views, accessors, binary = list[dict[str, Any]](), list[dict[str, Any]](), bytearray()
     for table in tables:
         is_float, content = table.dtype == np.float32, np.ascontiguousarray(table).tobytes()
@@ -65,7 +64,7 @@ def _write(path: Path, document: Mapping[str, Any], tables: Sequence[NDArray[Any
 
 
 def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
-    """The document and the buffer of a ``.glb`` file. Raises InputError for one not whole, or not version 2."""
+    """A ``.glb``'s document and buffer. Raises InputError if truncated, or not version 2."""
     content = read_bytes(path)
     if len(content) < 20 or struct.unpack_from("<I", content)[0] != MAGIC:
         raise InputError(f"{path}: no .glb file: expected it to start with 'glTF', got {content[:4]!r}")
@@ -90,7 +89,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, width: int) -> Float32:
-    """(N, width) float32 values of an accessor. Raises InputError for a table of another width or cut short."""
+    """(N, width) float32. Raises InputError for another width or missing data."""
     accessor, where = document["accessors"][index], f"{path}: accessor {index}"
     dtype = np.dtype(COMPONENTS[accessor["componentType"]])
     if accessor["type"] != TYPES[width] or "sparse" in accessor or "bufferView" not in accessor:
@@ -110,10 +109,9 @@ def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, w
 
 
 def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    """Write `gaussians`; `comments` go in the asset's extras. Same input, same bytes.
+    """Write `gaussians`; `comments` become the asset's extras. Same input, same bytes.
 
-    Labels are the attribute ``_LABEL``, where some Gaussian is not an object.
-    Raises InputError for a value that no Gaussian can have, naming its index.
+    ``_LABEL`` is written if some Gaussian is not an object. Raises InputError naming an invalid index.
     """
     check_gaussians("Gaussians to write", gaussians)
     tables: dict[str, NDArray[Any]] = {  # the first has its range beside it
@@ -140,9 +138,9 @@ def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
 
 
 def read_gltf(path: Path) -> tuple[GaussianSet, dict[str, str]]:
-    """The Gaussians of a ``.glb`` file in the axes of their own mesh (a node's transform is not applied), and extras.
+    """Read a ``.glb`` file in its mesh's axes (no node's transform), and its extras.
 
-    Raises InputError for a file that is not whole, does not have exactly one primitive of Gaussians, or packs them.
+    Raises InputError if truncated, packed, or without exactly one Gaussian primitive.
     """
     document, binary = read_glb(path)
     primitive = _primitive(path, document)
@@ -156,19 +154,18 @@ def read_gltf(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def coefficient_name(index: int) -> str:
-    """The attribute of coefficient `index` of the harmonics, counted through all degrees."""
+    """Attribute of coefficient `index`, counted through all degrees."""
     degree = int(np.sqrt(index))
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index - degree * degree}"
 
 
 def _point_colors(gaussians: GaussianSet) -> NDArray[np.uint8]:
-    """(N, 4) red, green, blue, opacity of 0 to 255: the colour that a plain point cloud shows."""
+    """(N, 4) red, green, blue, opacity, 0 to 255, for point clouds."""
     colors = np.clip(0.5 + SH_C0 * gaussians.harmonics[:, 0].astype(np.float64), 0.0, 1.0)
     return np.rint(255.0 * np.column_stack([colors, gaussians.opacities])).astype(np.uint8)
 
 
 def _primitive(path: Path, document: Mapping[str, Any]) -> dict[str, Any]:
-    """The one primitive that is Gaussians."""
     try:
         primitives = [primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"]]
         found = [primitive for primitive in primitives if EXTENSION in primitive.get("extensions", {})]

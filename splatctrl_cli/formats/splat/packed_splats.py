@@ -1,18 +1,15 @@
-"""Splats in packed bytes: ``.splat`` and ``.spz``.
+"""The packed splat formats ``.splat`` and ``.spz``, in the world's axes.
 
-``.splat`` files, as the WebGL viewers read them: 32 bytes per Gaussian, no header.
+``.splat``: 32 bytes per Gaussian, no header: float32 centre and sigmas; bytes of red, green, blue, opacity (255 is
+1); a quaternion w x y z as 128 q + 128. No view-dependent colour, labels or comments.
 
-Three float32 of the centre, three float32 of the sigmas, then bytes: red, green, blue, opacity (255 is 1), and a
-quaternion w x y z as 128 q + 128. Colour by side, labels and comments have no place in it; the axes are world's.
+``.spz`` (Niantic): writes version 3, reads 2 to 4. A gzip stream: a header of 16 bytes, then by attribute centres
+(24-bit fixed point), opacities, colours, log sigmas, rotations, harmonics above degree 0. Version 4 has a plain
+header of 32 bytes, a table of two uint64 per attribute (bytes packed and unpacked), and a zstd stream each; empty
+harmonics may be left out.
 
-``.spz`` files (Niantic's compressed Gaussians): version 3 is written, 2 to 4 are read.
-
-A gzip stream: a header of 16 bytes, then by attribute the centres (24-bit fixed point), opacities, colours, log
-sigmas and rotations in bytes, and the harmonics above degree 0. Version 4 has the same bytes: its header is plain, 32
-bytes long, and says where a table of two numbers (64 bits, bytes packed and unpacked) for each attribute begins; a
-zstd stream for each follows. That of no harmonics may be left out. The format names its axes right, up, back; centres
-and rotations are written in the axes of world as they are, so that they read back in world: a viewer that takes y for
-up shows a world whose z is up lying on its back.
+The format's axes are right, up, back. World axes are written unchanged, so that they read back; a y-up viewer shows a
+z-up world lying on its back.
 """
 
 import gzip
@@ -44,10 +41,10 @@ ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("
 
 
 def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    """Write `gaussians`, what of them the format can hold; `comments` are left out. Same input, same bytes.
+    """Write what `.splat` can represent of `gaussians`, without `comments`. Same input, same bytes.
 
-    Of the two quaternions of a rotation the one whose largest component is negative: -1 has a byte, +1 has none.
-    Raises InputError for a value that no Gaussian can have, naming its index.
+    A quaternion's largest component is made negative: -1 has a byte, +1 has none. Raises InputError naming an invalid
+    index.
     """
     check_gaussians("Gaussians to write", gaussians)
     rows = np.zeros(len(gaussians), dtype=ROW)
@@ -62,7 +59,7 @@ def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str])
 
 
 def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
-    """The Gaussians of a ``.splat`` file and no comments. Raises InputError for a file not whole, or no Gaussian."""
+    """Read a ``.splat``, without comments. Raises InputError if truncated or invalid."""
     content = read_bytes(path)
     if len(content) % ROW.itemsize:
         raise InputError(f"{path}: expected a multiple of 32 bytes, one row per splat, got {len(content)}")
@@ -83,15 +80,15 @@ def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def held_by_splat(gaussians: GaussianSet) -> GaussianSet:
-    """`gaussians` with colours of degree 0 alone, inside 0 to 1, and no labels: what a byte can be rounded from."""
+    """Limit to degree-0 colours in 0 to 1, without labels."""
     limit = 0.5 / SH_C0
     return replace(without_labels(gaussians), harmonics=np.clip(gaussians.harmonics[:, :1], -limit, limit))
 
 
 def splat_bound(gaussians: GaussianSet) -> Differences:
-    """Half a step of each byte: 1/510 of colour and opacity, 1/256 of each component of a quaternion.
+    """Half a step of each byte: 1/510 of colour and opacity, 1/256 of quaternions.
 
-    Four components of 1/256 move a unit quaternion by at most 2/256, which turns by twice that angle: 0.9 degrees.
+    Four components of 1/256 move a unit quaternion by at most 2/256, which turns by twice that: 0.9 degrees.
     """
     return Differences(center=0.0, sigma=0.0, rotation=0.9, color=0.5001 / 255, opacity=0.5001 / 255, harmonics=0.0)
 
@@ -116,9 +113,9 @@ SQRT_HALF = float(np.sqrt(0.5))  # no component but the largest exceeds it
 
 
 def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    """Write `gaussians`, what of them the format can hold; `comments` are left out. Same input, same bytes.
+    """Write what `.spz` can represent of `gaussians`, without `comments`. Same input, same bytes.
 
-    Raises InputError for a value that no Gaussian can have, naming its index.
+    Raises InputError naming an invalid index.
     """
     check_gaussians("Gaussians to write", gaussians)
     held, bits = held_by_spz(gaussians), _fraction_bits(gaussians.centers)
@@ -137,9 +134,9 @@ def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
 
 
 def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
-    """The Gaussians of an ``.spz`` file of version 2 to 4, in the file's axes, and no comments.
+    """Read an ``.spz`` file, in its axes, and no comments.
 
-    Raises InputError for a file that is not whole, of another version, or that holds what no Gaussian is.
+    Raises InputError if truncated, invalid, or not of version 2 to 4.
     """
     content = read_bytes(path)
     bits, (centers, opacities, colors, sigmas, quats, rest) = _columns(path, content)
@@ -160,7 +157,7 @@ def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
-    """`gaussians` inside the ranges of the format's bytes, without labels: what a byte can be rounded from."""
+    """Clip to the format's ranges, without labels."""
     harmonics = np.clip(gaussians.harmonics, *HARMONICS)
     harmonics[:, 0] = np.clip(gaussians.harmonics[:, 0], -127.5 / COLOR_SCALE, 127.5 / COLOR_SCALE)
     scales = np.clip(gaussians.scales, *np.exp(LOG_SIGMAS)).astype(np.float32)
@@ -168,10 +165,10 @@ def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
 
 
 def spz_bound(gaussians: GaussianSet) -> Differences:
-    """Half a step of each value, and a little for float32.
+    """Half a step of each value, with a margin for float32.
 
-    Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511, 1.2e-3 together; the fourth
-    follows and is at least 1/2, which at most doubles it; a rotation turns by twice that angle: 0.28 degrees.
+    Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511 are 1.2e-3 together. The fourth
+    follows and is at least 1/2, which at most doubles it; a rotation turns by twice that: 0.28 degrees.
     """
     return Differences(
         center=0.5001 * (2.0 ** -_fraction_bits(gaussians.centers)),
@@ -184,7 +181,7 @@ def spz_bound(gaussians: GaussianSet) -> Differences:
 
 
 def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
-    """The fraction bits, and the bytes of each attribute, a row per Gaussian, of a file of no more and no fewer."""
+    """Fraction bits and bytes (N, width) by attribute. Raises InputError for another length."""
     start = content[:4]
     if start == PLAIN:
         num, bits, widths = _parsed(path, content, (4,), len(content))
@@ -199,7 +196,7 @@ def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
 
 
 def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
-    """The number of Gaussians, the fraction bits and the bytes of each attribute; size: of the file."""
+    """Number of Gaussians, fraction bits, bytes per attribute; size: the file's."""
     if len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC:
         raise InputError(f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}")
     _, version, num, degree, bits, flags, _ = HEADER.unpack_from(head)
@@ -219,7 +216,7 @@ def _parsed(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tu
 
 
 def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], bytes]:
-    """What `_parsed` gives, and all attributes, of a gzip stream: no more is unpacked than its header says."""
+    """`_parsed` and the attributes, unpacking no more than announced."""
     try:
         with gzip.GzipFile(fileobj=BytesIO(content)) as stream:
             num, bits, widths = _parsed(path, stream.read(HEADER.size), (2, 3), len(content))
@@ -234,7 +231,6 @@ def _unzipped(path: Path, content: bytes) -> tuple[int, int, tuple[int, ...], by
 
 
 def _streams(path: Path, content: bytes, sizes: list[int]) -> list[bytes]:
-    """The attributes of version 4, of these sizes."""
     num_streams, place = content[HEADER.size - 1], int.from_bytes(content[HEADER.size : HEADER.size + 4], "little")
     start = place + 16 * num_streams
     if num_streams not in (len(sizes), 5 if sizes[5] == 0 else 6) or not PLAIN_HEADER <= place <= len(content) - 16:
@@ -257,7 +253,7 @@ def _streams(path: Path, content: bytes, sizes: list[int]) -> list[bytes]:
 
 
 def _fraction_bits(centers: Float32) -> int:
-    """The most fraction bits, up to 12, with which every coordinate fits 24 bits."""
+    """The most fraction bits, up to 12, that fit coordinates in 24 bits."""
     largest = float(np.abs(centers).max(initial=0.0))
     bits = FRACTION_BITS
     while largest * 2.0**bits > 2**23 - 1:
@@ -268,7 +264,10 @@ def _fraction_bits(centers: Float32) -> int:
 
 
 def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
-    """(N,) little-endian words: 2 bits say which of x y z w is largest, then 10 bits (sign, size) for each other."""
+    """Little-endian words (N,).
+
+    2 bits index the largest of x y z w, then 10 bits (sign, size) per other.
+    """
     quats = np.roll(quats_wxyz.astype(np.float64), -1, axis=1)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     largest = np.abs(quats).argmax(axis=1)
@@ -283,7 +282,7 @@ def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
 
 
 def _quaternions(table: UInt8) -> Float32:
-    """(N, 4) unit quaternions w x y z of three bytes (version 2) or of four (version 3)."""
+    """(N, 4) unit quaternions w x y z of 3 bytes (version 2) or 4."""
     if table.shape[1] == 3:
         xyz = table / 127.5 - 1.0
         quats = np.column_stack([xyz, np.sqrt(np.maximum(0.0, 1.0 - (xyz**2).sum(axis=1)))])

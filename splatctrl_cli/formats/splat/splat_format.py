@@ -1,4 +1,4 @@
-"""What a format of splat files declares: how it is written and read, how it holds values, and how exact it is."""
+"""A splat format's declaration: writing, reading, representable values, precision."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -19,7 +19,7 @@ Comments = dict[str, str]
 
 
 def logit(opacities: Float32) -> Float64:
-    """log(p / (1 - p)) of (N,) opacities in [0, 1]; exactly 0 and 1 get finite values whose `sigmoid` they are."""
+    """log(p / (1 - p)) of (N,) in [0, 1], finite at 0 and 1 (restored by `sigmoid`)."""
     inside = (opacities > 0) & (opacities < 1)
     p = np.where(inside, opacities, 0.5).astype(np.float64)
     return np.where(inside, np.log(p) - np.log1p(-p), np.where(opacities > 0.5, LOGIT_OF_ONE, LOGIT_OF_ZERO))
@@ -32,7 +32,7 @@ def sigmoid(logits: Float64) -> Float32:
 
 
 def sigma_of_log(where: str, name: str, logs: Float64) -> Float32:
-    """exp(x) as float32 [m]; raises InputError, naming the splat, where that is infinite or zero."""
+    """exp(x) as float32 [m]. Raises InputError naming an infinite or zero one."""
     values = np.exp(np.clip(logs, -700.0, 700.0))
     limits = np.finfo(np.float32)
     refuse(where, name, values, (values > limits.max) | (values < limits.tiny), "a radius that float32 holds [m]")
@@ -40,7 +40,7 @@ def sigma_of_log(where: str, name: str, logs: Float64) -> Float32:
 
 
 def unit_quaternions(where: str, quats: NDArray[np.floating]) -> Float32:
-    """(N, 4) quaternions scaled to length one, to the bit where they have it; InputError for one of no length."""
+    """Normalise (N, 4), bit-exact if already unit. Raises InputError for zero length."""
     wide = quats.astype(np.float64)
     lengths = np.linalg.norm(wide, axis=1, keepdims=True)
     refuse(where, "rotation", quats, np.asarray(~(lengths[:, 0] > 1e-12)), "a quaternion that is not zero")
@@ -48,7 +48,7 @@ def unit_quaternions(where: str, quats: NDArray[np.floating]) -> Float32:
 
 
 def refuse(where: str, name: str, values: NDArray[Any], is_bad: Bool, expected: str) -> None:
-    """Raise InputError that names the first splat where `is_bad` (N,)."""
+    """Raise InputError naming the first bad splat (N,)."""
     bad = np.flatnonzero(is_bad)
     if len(bad):
         value = values[bad[0]]
@@ -57,7 +57,7 @@ def refuse(where: str, name: str, values: NDArray[Any], is_bad: Bool, expected: 
 
 
 def check_finite(where: str, num: int, groups: Mapping[str, NDArray[Any]]) -> None:
-    """Raise InputError at the first value that is not finite, or an array without `num` rows."""
+    """Raise InputError at the first non-finite value, or for not `num` rows."""
     for name, values in groups.items():
         if len(values) != num:
             raise InputError(f"{where}: {name}: expected {num} values, got {len(values)}")
@@ -66,9 +66,9 @@ def check_finite(where: str, num: int, groups: Mapping[str, NDArray[Any]]) -> No
 
 @dataclass(frozen=True, kw_only=True)
 class Differences:
-    """Largest difference of any Gaussian, or the largest that a format may cause.
+    """Largest differences between Gaussians, or a format's bound on them.
 
-    center [m]; sigma, relative; rotation [deg]; color and opacity, of 0 to 1; harmonics, coefficients above degree 0.
+    center [m]; sigma, relative; rotation [deg]; color and opacity, of 0 to 1; harmonics above degree 0.
     """
 
     center: float
@@ -79,25 +79,23 @@ class Differences:
     harmonics: float
 
     def beyond(self, bound: "Differences") -> list[str]:
-        """The names of what exceeds `bound`, each with its value and the bound."""
+        """Names beyond `bound`, with both values."""
         limits = asdict(bound)
         pairs = ((name, value, limits[name]) for name, value in asdict(self).items())
         return [f"{name} {value:.3g} (at most {limit:.3g})" for name, value, limit in pairs if not value <= limit]
 
 
 def float32_bound(gaussians: GaussianSet) -> Differences:
-    """What a format of float32 values may cause: centres as they are, one rounding of everything else.
+    """A float32 format's bound: centres exact, one rounding of the rest.
 
-    A sigma's logarithm is at most 88 in size, so half a unit of its last place is 88 * 2^-24 = 5e-6 of the sigma.
+    A log sigma is at most 88 in size, so half a unit of its last place is 88 * 2^-24 = 5e-6 of sigma.
     """
     largest_color = float(np.abs(gaussians.harmonics[:, 0]).max(initial=1.0))
     return Differences(center=0.0, sigma=6e-6, rotation=1e-4, color=1e-6 * largest_color, opacity=1e-6, harmonics=0.0)
 
 
 def differences(a: GaussianSet, b: GaussianSet, centers: Float64 | None = None) -> Differences:
-    """The largest differences between two sets of the same Gaussians in the same order; centers: the more exact ones
-    of `a` (N, 3) [m].
-    """
+    """Largest differences in equal order; centers: exact ones of `a` (N, 3) [m]."""
     return Differences(
         center=_largest((a.centers.astype(np.float64) if centers is None else centers) - b.centers),
         sigma=_largest(b.scales / a.scales.astype(np.float64) - 1.0),
@@ -119,7 +117,7 @@ def _padded(harmonics: Float32) -> Float64:
 
 
 def _angles(a: Float32, b: Float32) -> Float64:
-    """Angle [deg] between rotations of unit quaternions; a chord keeps its digits where a cosine has none."""
+    """Angle [deg] by the chord, precise where a cosine is not."""
     one, two = a.astype(np.float64), b.astype(np.float64)
     chord = np.minimum(np.linalg.norm(one - two, axis=1), np.linalg.norm(one + two, axis=1))
     return np.asarray(np.degrees(4.0 * np.arcsin(np.minimum(chord / 2.0, 1.0))))
@@ -127,11 +125,11 @@ def _angles(a: Float32, b: Float32) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class SplatFormat:
-    """One kind of file, in the ``ENTRIES`` of its module: all that the program and its docs know of it.
+    """A splat file format, in its module's ``ENTRIES``, for the program and its docs.
 
-    `held` is what of a set it can hold, before rounding; `bound` is how far it may round; `check` raises UsageError
-    where its library is not installed. `docs` are its rows in docs/artefacts.md, cells between bars, an empty line
-    between rows: suffix, what it is, what it rounds to, what it does not hold.
+    `held`: the representable part of a set; `bound`: the largest rounding; `check` raises UsageError without its
+    library. `docs`: rows in docs/artefacts.md, cells between bars, an empty line between rows: suffix, what it is,
+    what it rounds to, what it does not hold.
     """
 
     name: str
@@ -146,7 +144,7 @@ class SplatFormat:
 
     @property
     def is_rounded(self) -> bool:
-        """Whether it rounds to less than float32."""
+        """True if coarser than float32."""
         return self.bound is not float32_bound
 
 

@@ -1,9 +1,9 @@
-"""Splats in files: isotropic ones as 3D-GS PLY, as Gaussians and back; any format by suffix.
+"""Splat files: 3D-GS PLY, conversion from and to Gaussians, any format by suffix.
 
-Layout: the reference implementation's names and order without ``f_rest_*`` (degree-0 colour): ``x y z nx ny nz
-f_dc_0..2 opacity scale_0..2 rot_0..3``, then ``label`` (uchar) and ``density`` (float). The normals are zeros:
-readers that go by the header skip them, readers that go by the reference's order need them. ``scale_*`` are three
-equal log(radius), ``rot`` is 1 0 0 0, ``opacity`` is a logit and ``f_dc`` is ``(colour - 0.5) / C0``.
+The PLY has the reference implementation's order without ``f_rest_*`` (degree-0 colour): ``x y z nx ny nz f_dc_0..2
+opacity scale_0..2 rot_0..3``, then ``label`` (uchar) and ``density`` (float). Normals are zeros, for readers that
+rely on the order. ``scale_*`` are three equal log(radius), ``rot`` is 1 0 0 0, ``opacity`` a logit, ``f_dc``
+``(colour - 0.5) / C0``.
 """
 
 from collections.abc import Mapping
@@ -56,7 +56,7 @@ HEADER_COMMENTS = {
 
 
 def as_gaussians(splats: SplatSet) -> GaussianSet:
-    """`splats` as Gaussians of one sigma and one colour; the density has no place there."""
+    """Convert to Gaussians, without density."""
     coefficients = (splats.colors.astype(np.float64) - 0.5) / SH_C0
     return GaussianSet(
         centers=splats.centers,
@@ -69,7 +69,7 @@ def as_gaussians(splats: SplatSet) -> GaussianSet:
 
 
 def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
-    """Gaussians that are round, as splats. Raises InputError with how many are not, or change colour by side."""
+    """Convert round Gaussians. Raises InputError counting stretched and view-dependent ones."""
     num_stretched = int(np.count_nonzero(_is_stretched(gaussians)))
     num_coloured = int(np.count_nonzero(gaussians.harmonics[:, 1:].any(axis=(1, 2))))
     if num_stretched or num_coloured:
@@ -82,9 +82,9 @@ def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
 
 
 def nearest_splats(gaussians: GaussianSet) -> SplatSet:
-    """Splats of the Gaussians' volume (radius: geometric mean of sigmas), opacity, and mean colour over all sides.
+    """Splats of the Gaussians' volume (geometric mean of sigmas), opacity and mean colour.
 
-    What is lost: orientation, flatness (a flat Gaussian becomes thicker and narrower), colour by side.
+    Loses orientation, flatness (flat Gaussians become thicker and narrower) and view-dependent colour.
     """
     return _round_splats(
         gaussians, np.exp(np.log(gaussians.scales.astype(np.float64)).mean(axis=1)).astype(np.float32)
@@ -108,10 +108,10 @@ def _is_stretched(gaussians: GaussianSet) -> Bool:
 
 
 def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None:
-    """Write `splats`; frame, units, what the scales mean and `comments` go in the header. Same input, same bytes.
+    """Write `splats`, with frame, units and `comments` in the header. Same input, same bytes.
 
-    Opacities of exactly 0 and 1 are written as finite logits that read back as exactly 0 and 1.
-    Raises InputError for a value the format cannot hold, naming its index; UsageError for a comment of several lines.
+    Opacities 0 and 1 read back exactly. Raises InputError naming an invalid index, UsageError for a comment of
+    several lines.
     """
     check_splats("splats to write", splats)
     rows = rows_of(as_gaussians(splats), DTYPE)
@@ -120,19 +120,19 @@ def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None
 
 
 def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
-    """The splat set of a 3D-GS PLY file (binary or ASCII, properties in any order) and its ``key: value`` comments.
+    """Read a 3D-GS PLY (binary or ASCII, any property order) and its ``key: value`` comments.
 
-    A comment without a colon is a key with an empty value. Other properties (normals, higher harmonics, rotation) are
-    ignored; a missing label is 0 (object), a missing density 0 (not computed).
-    Raises InputError for a file that is not whole, lacks a property, is anisotropic or holds no valid splat.
+    Ignores other properties (normals, higher harmonics, rotation); a missing label is 0 (object), a missing density 0
+    (not computed). Raises InputError if truncated, anisotropic, invalid or without a property.
     """
     ply = read_table(path, "vertex", REQUIRED)
     return splats_of(ply), ply.pairs()
 
 
 def read_world_splats(path: Path) -> SplatSet:
-    """The splats of a PLY file whose distances mean metres in the world. Raises as `read_ply`, and InputError for a
-    file whose comments name other units or another frame; one that names none is taken at its word.
+    """Read a PLY in metres and world; comments may omit both.
+
+    Raises as `read_ply` and `check_world`.
     """
     splats, comments = read_ply(path)
     check_world(path, comments)
@@ -140,9 +140,7 @@ def read_world_splats(path: Path) -> SplatSet:
 
 
 def check_world(path: Path, comments: Mapping[str, str]) -> None:
-    """Raise InputError for comments that name other units than metres or another frame than the world, or that tell
-    of splats that have no distances: those of a shell.
-    """
+    """Raise InputError for comments of another unit or frame, or a shell."""
     check_no_shell(path, comments)
     for key, known in (("units", METRES), ("frame", ("world",))):
         said = comments.get(key)
@@ -154,7 +152,7 @@ def check_world(path: Path, comments: Mapping[str, str]) -> None:
 
 
 def check_no_shell(path: Path, comments: Mapping[str, str]) -> None:
-    """Raise InputError where the comments tell that the splats are rendered only."""
+    """Raise InputError for a shell, which is only rendered."""
     if SHELL.keys() & comments.keys():
         raise InputError(
             f"{path}: the shell beyond the robot's reach, which is rendered only and has no distances",
@@ -163,7 +161,7 @@ def check_no_shell(path: Path, comments: Mapping[str, str]) -> None:
 
 
 def read_shell(path: Path) -> SplatSet:
-    """The splats of a shell. Raises as `read_ply`, and InputError for splats that are none."""
+    """Read a shell. Raises as `read_ply`, and InputError for other splats."""
     splats, comments = read_ply(path)
     if not SHELL.keys() <= comments.keys():
         raise InputError(f"{path}: expected a shell, got other splats", remedy="reconstruct the scene again")
@@ -171,7 +169,7 @@ def read_shell(path: Path) -> SplatSet:
 
 
 def splats_of(ply: PlyFile) -> SplatSet:
-    """The splats that a table of a PLY file holds. Raises InputError as `read_ply` does."""
+    """A PLY table's splats. Raises as `read_ply`."""
     path = ply.path
     if num := num_stretched(ply):
         raise InputError(
@@ -193,14 +191,14 @@ def splats_of(ply: PlyFile) -> SplatSet:
 
 
 def num_stretched(ply: PlyFile) -> int:
-    """How many rows of a table have scales that differ."""
+    """Count rows with unequal scales."""
     scales = log_sigmas(ply)
     spread = scales.max(axis=1, initial=-np.inf) - scales.min(axis=1, initial=np.inf)
     return int(np.count_nonzero(spread > MAX_SCALE_SPREAD))
 
 
 def check_splats(where: str, splats: SplatSet) -> None:
-    """Raise InputError at the first splat that has no place in the world: NaN, no radius, opacity outside [0, 1]."""
+    """Raise InputError at the first splat not finite, without radius, or opacity outside [0, 1]."""
     groups = {
         "center": splats.centers,
         "radius": splats.radii,
@@ -217,7 +215,7 @@ FORMATS: Mapping[str, SplatFormat] = {kind.suffix: kind for kind in entries_of(_
 
 
 def format_of(path: Path) -> SplatFormat:
-    """The format that the suffix of `path` names, PLY without one. Raises UsageError for an unknown one."""
+    """The suffix's format, PLY without one. Raises UsageError if unknown."""
     found = FORMATS.get(path.suffix.lower() or ".ply")
     if found is None:
         raise UsageError(f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}")
@@ -225,9 +223,9 @@ def format_of(path: Path) -> SplatFormat:
 
 
 def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
-    """What a file of splats holds, and its comments: a SplatSet where all are round and of one colour by side.
+    """Read any splat file and its comments; a SplatSet if all are round without view-dependent colour.
 
-    Raises InputError for a file that is missing, not whole, of an unknown kind, or holds what is no splat.
+    Raises InputError if missing, truncated, unknown or invalid.
     """
     kind = _known_format(path)
     if kind is not FORMATS[".ply"]:
@@ -239,10 +237,9 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
 
 
 def read_source(path: Path) -> tuple[SplatSet | GaussianSet, Comments, Float64]:
-    """As `read_splats`, and the centres (N, 3) float64 [m] in the file's precision.
+    """Read as `read_splats`, with the centres (N, 3) float64 [m] in the file's precision.
 
-    Where float32 would move the centres, an origin is taken off, which the comment `ORIGIN` names. Raises InputError
-    as `read_splats`.
+    If float32 would move them, an origin is subtracted, named by the comment `ORIGIN`.
     """
     if _known_format(path) is not FORMATS[".ply"]:
         splats, comments = read_splats(path)
@@ -276,9 +273,9 @@ def _splats_or_gaussians(ply: PlyFile) -> SplatSet | GaussianSet:
 
 
 def read_spheres(path: Path) -> SplatSet:
-    """The splats of a file of any format as spheres in the world, which have distances; harmonics above the constant
-    one are only colour and are left out. Raises InputError as `read_splats`, and for splats that are not
-    round, in another unit or another frame.
+    """Read any splat file as spheres in the world, without harmonics above the constant one.
+
+    Raises InputError as `read_splats`, and for splats not round, or in another unit or frame.
     """
     if (path.suffix.lower() or ".ply") == ".ply":
         return read_world_splats(path)
@@ -290,7 +287,7 @@ def read_spheres(path: Path) -> SplatSet:
 
 
 def describe_splats(path: Path, _head: bytes) -> Summary:
-    """Number, shape, box and ranges of the splats of a file. Raises InputError for a file of another kind."""
+    """Summarise a splat file. Raises InputError for another kind."""
     found, comments = read_splats(path)
     gaussians = as_gaussians(found) if isinstance(found, SplatSet) else found
     facts: dict[str, object] = {

@@ -1,7 +1,7 @@
-"""Gaussians as an OpenUSD particle field (UsdVol ParticleField3DGaussianSplat, OpenUSD 26.3 and later), in world.
+"""Gaussians as OpenUSD particle fields (UsdVol ParticleField3DGaussianSplat, OpenUSD 26.3 and later), in world.
 
-Sigmas and opacities are linear there; the harmonics' coefficients lie by Gaussian, then by coefficient. The stage
-says that z is up and that a unit is a metre. Needs the library usd-core, which is an extra of its own.
+Sigmas and opacities are linear; harmonics go by Gaussian, then by coefficient. z is up; units are metres. Needs
+usd-core, a separate extra.
 """
 
 import errno
@@ -27,10 +27,10 @@ NAME = "field"  # of the file while the library has it: it goes by the suffix
 
 
 def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *, suffix: str) -> None:
-    """Write `gaussians` as `suffix`, ``.usda`` (text) or ``.usdc`` (binary); `comments` become custom data.
+    """Write `gaussians` as ``.usda`` (text) or ``.usdc`` (binary); `comments` become custom data.
 
-    Labels are the primvar ``label``, where some Gaussian is not an object.
-    Raises InputError for a value that no Gaussian can have, naming its index; UsageError without the library.
+    Primvar ``label`` is written if some Gaussian is not an object. Raises InputError naming an invalid index;
+    UsageError without the library.
     """
     check_gaussians("Gaussians to write", gaussians)
     usd, geometry, volume, arrays, kinds = _library()
@@ -63,10 +63,10 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
 
 
 def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
-    """The Gaussians of a USD file's one particle field, in its own axes (transforms are not applied), and its data.
+    """Read a USD file's only particle field, in its own axes, and its data.
 
-    Raises InputError for a file that cannot be opened or does not have exactly one such field; UsageError without
-    the library.
+    Transforms are not applied. Raises InputError if unreadable or without exactly one field; UsageError without the
+    library.
     """
     usd, geometry, *_ = _library()
     if not path.is_file():
@@ -88,7 +88,6 @@ def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
 
 
 def _library() -> tuple[Any, Any, Any, Any, Any]:
-    """Usd, UsdGeom, UsdVol, Vt and the types. Raises UsageError where they are missing or older than the schema."""
     try:
         from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
     except ImportError:
@@ -104,7 +103,7 @@ def _library() -> tuple[Any, Any, Any, Any, Any]:
 
 
 def _extent(gaussians: GaussianSet) -> Float32:
-    """(2, 3) corners of a box that holds three sigmas of every Gaussian, however turned."""
+    """Corners (2, 3) around three sigmas of every Gaussian, at any rotation."""
     reach = 3.0 * gaussians.scales.max(axis=1, keepdims=True)
     lower, upper = (gaussians.centers - reach).min(axis=0), (gaussians.centers + reach).max(axis=0)
     return np.stack([lower, upper]).astype(np.float32)
@@ -132,7 +131,7 @@ def _gaussians(path: Path, prim: Any, geometry: Any) -> GaussianSet:
 
 
 def _array(path: Path, prim: Any, name: str, width: int) -> Float32:
-    """(N, width) float32 values of an attribute, or of its half-precision twin, whose name ends in h."""
+    """Float32 (N, width) of an attribute or its half-precision twin, named with an h."""
     for candidate in (name, f"{name}h"):
         values = prim.GetAttribute(candidate).Get()
         if values is not None and len(values):

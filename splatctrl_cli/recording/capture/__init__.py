@@ -1,1 +1,1 @@
-"""Our own recordings on disk: written, read, packed, resumed."""
+"""Our own recordings on disk."""

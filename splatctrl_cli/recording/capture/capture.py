@@ -1,4 +1,4 @@
-"""``X.capture/``: a recording as a plain folder of images, poses and joints (docs/capture.md)."""
+"""``X.capture/``: a plain folder of images, poses and joints (docs/capture.md)."""
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,10 +39,9 @@ _NOT_FOR_CAPTURES = (
 
 
 class CaptureSource(Recording):
-    """Records of a capture folder; a file whose checksum differs is counted as damage and left out.
+    """Records of a capture folder; files with a wrong checksum are skipped and counted as damage.
 
-    joints: a robot's, to be brought together from the topics that the capture kept, as from those of the log itself;
-    without them, or in a capture that kept none, the states are those of joints.npz.
+    joints: a robot's, merged from the kept topics as from the log; without either, the states are joints.npz's.
     """
 
     def __init__(self, path: Path, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
@@ -79,17 +78,16 @@ class CaptureSource(Recording):
 
     @property
     def loss(self) -> LossReport:
-        """What `ingest` could not take, and what has been damaged since."""
+        """The loss of `ingest`, and later damage."""
         loss = self._loss
         damaged = max(self._damaged, self._damaged_before, key=len)
         return replace(loss, damaged=loss.damaged + len(damaged), notes=[*loss.notes, *damaged])
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Of every row of frames.csv."""
         return ((int(row["stamp_ns"]), row["camera"], _pose(row)) for row in self._rows)
 
     def digests(self) -> dict[str, str]:
-        """sha256 of SHA256SUMS, which covers every file, and what was applied to it."""
+        """sha256 of SHA256SUMS, which covers every file, and the applied changes."""
         return {f"{self.name}/SHA256SUMS": sha256(self._path / "SHA256SUMS"), **self._applied}
 
     def _frames(self) -> Iterator[StoredFrame]:
@@ -97,7 +95,7 @@ class CaptureSource(Recording):
         yield from filter(None, map(self._stored_frame, self._rows))
 
     def _stored_frame(self, row: Mapping[str, str]) -> StoredFrame | None:
-        """The frame of a row; None, and counted, where an image is not as it was written."""
+        """A row's frame; None, and counted, if an image was changed."""
         color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
         human_bytes = self._read(row["human"]) if row.get("human") else None
         camera = self._cameras[row["camera"]]
@@ -154,7 +152,6 @@ class CaptureSource(Recording):
         return data
 
     def _checked(self, name: str) -> Path:
-        """The path of a file that is as it was written. Raises InputError for another."""
         file = self._path / name
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise InputError(f"{file}: lies outside the capture", remedy=AGAIN)
@@ -164,7 +161,7 @@ class CaptureSource(Recording):
 
 
 def robot_description_of(path: Path) -> list[RobotDescription]:
-    """The robot that a capture's log described, none where it did not. Raises InputError for a file that changed."""
+    """A capture's URDF, if any. Raises InputError if changed."""
     file = path / ROBOT
     if not file.is_file():
         return []
@@ -189,7 +186,6 @@ def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | N
 
 
 def _read_joints(path: Path) -> StateColumns:
-    """The states of a capture folder's joints.npz, read a block at a time. Raises InputError."""
     file = path / "joints.npz"
     try:
         content = NpzFile(file)

@@ -1,6 +1,4 @@
-"""What a capture says of itself: capture.json, by which the rest is read, frames.csv and SHA256SUMS, a row at a time:
-some fifty bytes of memory a file.
-"""
+"""A capture's index: capture.json; frames.csv and SHA256SUMS at fifty bytes a file."""
 
 import csv
 import hashlib
@@ -24,7 +22,7 @@ INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
 
 
 def check_header(file: Path, header: Mapping[str, Any]) -> None:
-    """Raise InputError naming the first entry that is missing or of another kind."""
+    """Raise InputError naming the first missing or wrong entry."""
     for name, is_right, expected in _ENTRIES:
         if name not in header:
             raise InputError(f"{file}: {name} is missing", remedy=AGAIN)
@@ -81,12 +79,12 @@ _ENTRIES: tuple[tuple[str, Callable[[object], bool], str], ...] = (
 
 
 def is_capture(path: Path) -> bool:
-    """Whether a folder holds a capture."""
+    """True for a capture folder."""
     return (path / "capture.json").is_file()
 
 
 def read_capture_header(path: Path) -> dict[str, Any]:
-    """capture.json. Raises InputError where it is not one of ours, or of a newer kind."""
+    """Read capture.json. Raises InputError if not ours, or of another version."""
     file = path / "capture.json"
     try:
         header = json.loads(file.read_text(encoding="utf-8"))
@@ -104,7 +102,6 @@ def read_capture_header(path: Path) -> dict[str, Any]:
 
 
 def _check_index(path: Path) -> None:
-    """Raises InputError where an index file is not as it was written: nothing in it can be trusted then."""
     sums = FileSums(path)
     for name in INDEX_FILES:
         if not (path / name).is_file():
@@ -123,10 +120,10 @@ _UNREADABLE = (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError)
 
 
 class FrameRows:
-    """Rows of frames.csv of some cameras, in its order, read each time that they are asked for."""
+    """Some cameras' rows of frames.csv, in order, read again at each iteration."""
 
     def __init__(self, file: Path, cameras: Collection[str]) -> None:
-        """Raises InputError for a row that cannot be read, or that names a file outside the capture."""
+        """Raises InputError for an invalid row, or a file outside the capture."""
         self._file, self._cameras = file, cameras
         try:
             self._num = sum(1 for _ in self._read())
@@ -134,7 +131,7 @@ class FrameRows:
             raise InputError(f"{file}: cannot be read: {error}", remedy=AGAIN) from None
 
     def __iter__(self) -> Iterator[Mapping[str, str]]:
-        """Raises InputError where the file is no longer what it was."""
+        """Raises InputError if the file has changed."""
         num, changed = 0, InputError(f"{self._file}: changed while it was read", remedy="try again")
         try:
             for row in self._read():
@@ -159,7 +156,6 @@ class FrameRows:
 
 
 def _checked(row: Mapping[str, str]) -> Mapping[str, str]:
-    """The row itself. Raises ValueError for what is no frame."""
     int(row["stamp_ns"])
     for key in COLUMNS[4:11]:
         float(row[key])
@@ -171,10 +167,10 @@ def _checked(row: Mapping[str, str]) -> Mapping[str, str]:
 
 
 class FileSums:
-    """SHA256SUMS: the checksum that it says of a file, by name."""
+    """SHA256SUMS: checksums by file name."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises InputError where there is none."""
+        """Raises InputError without the file."""
         file = folder / SUMS
         if not file.is_file():
             raise InputError(f"{file}: missing", remedy=f"the capture was not finished; {AGAIN}")
@@ -193,7 +189,7 @@ class FileSums:
         self._sums = np.frombuffer(sums, dtype=np.uint8).reshape(-1, 32)[order]
 
     def get(self, name: str) -> str | None:
-        """The sha256, hexadecimal, that the last line of a name says; None where there is none."""
+        """Hexadecimal sha256 of a name's last line, or None."""
         at = int(np.searchsorted(self._keys, np.uint64(_key(name.encode())), side="right")) - 1
         if at < 0 or int(self._keys[at]) != _key(name.encode()):
             return None
@@ -201,5 +197,5 @@ class FileSums:
 
 
 def _key(name: bytes) -> int:
-    """64 bits of a name; two that share them would make a good file look damaged."""
+    """64 bits; a collision would make a good file look damaged."""
     return int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little")

@@ -1,5 +1,6 @@
-"""Writes a capture folder (docs/capture.md) frame by frame, in bounded memory; what was written so far is in a
-journal, a line a frame, so that a killed run goes on.
+"""A writer of capture folders (docs/capture.md) by frame, in bounded memory.
+
+A journal of written frames lets a killed run continue.
 """
 
 import csv
@@ -40,7 +41,7 @@ JOURNAL = "ingest.jsonl"  # in the folder while it is partial
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """A frame that is on disk: its row of frames.csv, (sha256, name) of its files, its row of provenance.csv."""
+    """A written frame: frames.csv row, (sha256, name) of files, provenance.csv row."""
 
     row: Mapping[str, str]
     sums: Sequence[tuple[str, str]]
@@ -48,10 +49,10 @@ class Entry:
 
 
 class Journal:
-    """The journal of a partial folder; entries of an earlier run come back one by one, then new ones are added."""
+    """A partial folder's journal: an earlier run's entries, then new ones."""
 
     def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
-        """identity: what decides the bytes; kept for whoever goes on."""
+        """identity: the facts that decide the bytes, for a resumed run."""
         self._path = folder / JOURNAL
         self.num_entries = 0
         folder.mkdir(parents=True, exist_ok=True)
@@ -69,7 +70,7 @@ class Journal:
         self._stream.close()
 
     def kept(self) -> Entry | None:
-        """The next frame of the earlier run; None after the last."""
+        """The earlier run's next frame, or None."""
         found = next(self._kept, None)
         if found is None:
             return None
@@ -77,24 +78,23 @@ class Journal:
         return Entry(**found)
 
     def add(self, entry: Entry) -> None:
-        """A frame whose files are written."""
+        """Add a written frame."""
         self.num_entries += 1
         self._stream.write(json.dumps(vars(entry)) + "\n")
         self._stream.flush()
 
     def entries(self) -> Iterator[Entry]:
-        """All so far, in their order."""
+        """All entries in order."""
         lines = _lines(self._path)
         next(lines, None)
         yield from (Entry(**line) for line in lines)
 
     def remove(self) -> None:
-        """Once everything is written."""
+        """Delete the finished journal."""
         self._stream.close()
         self._path.unlink()
 
     def _cut(self) -> None:
-        """Leave out a last line that was not finished."""
         with self._path.open("rb") as stream:
             size = sum(len(line) for line in stream if line.endswith(b"\n"))
         with self._path.open("r+b") as stream:
@@ -102,14 +102,14 @@ class Journal:
 
 
 def read_identity(folder: Path) -> Mapping[str, Any] | None:
-    """What decided the bytes of the run that was interrupted; None where there is none to go on with."""
+    """An interrupted run's identity, or None."""
     path = folder / JOURNAL
     first = next(_lines(path), None) if path.is_file() else None
     return None if first is None else first.get("identity")
 
 
 def check_not_partial(folder: Path) -> None:
-    """Raise InputError for what an interrupted run left."""
+    """Raise InputError for an interrupted capture."""
     if (folder / JOURNAL).is_file():
         raise InputError(
             f"{folder}: an ingest that was interrupted", remedy="continue it with the same command and --resume"
@@ -117,7 +117,7 @@ def check_not_partial(folder: Path) -> None:
 
 
 def check_same_frame(folder: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Raise UsageError where a frame that was written is not the one that the source gives now."""
+    """Raise UsageError if a written frame differs from the source's."""
     differing = [name for name in now if before.get(name) != now[name]]
     if differing:
         name = differing[0]
@@ -128,7 +128,6 @@ def check_same_frame(folder: Path, before: Mapping[str, str], now: Mapping[str, 
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Of a file as long as it is read."""
     with path.open(encoding="utf-8") as stream:
         for line in stream:
             if line.endswith("\n"):
@@ -143,7 +142,7 @@ PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_F
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureSummary:
-    """What was written; num_resumed: frames of an earlier run."""
+    """The written counts; num_resumed: frames of an earlier run."""
 
     num_frames: dict[str, int]
     num_joint_states: int
@@ -160,13 +159,11 @@ def write_capture(
     progress: Callable[[int], None] | None = None,
     identity: Mapping[str, Any] | None = None,
 ) -> CaptureSummary:
-    """Write all of `source` into `folder`; the same input gives the same bytes.
+    """Write all of `source` into `folder`, empty or of an interrupted run. Same input, same bytes.
 
-    The folder is empty, or what an interrupted run left: its frames are not written again. JPEG and PNG colour is
-    kept byte for byte where its pixels are the frame's; depth becomes 16-bit PNG in the unit it was recorded in, or
-    .npy [m] where no unit holds it. topics: the joint states as they were recorded, beside those of `source`, which
-    are of one topic. robot: the URDF that the log itself brings, "" for none. Raises InputError when the source
-    yields no frame, UsageError where the frames that are there are not the source's.
+    JPEG and PNG colour with the frame's pixels is kept byte for byte. Depth becomes 16-bit PNG in its recorded unit,
+    or .npy [m] if none fits. topics: all joint states as recorded, where `source` has one topic's. robot: the log's
+    URDF, or "". Raises InputError without a frame, UsageError if existing frames differ.
     """
     states = StateCollector(len(source.joint_names))
     cameras: dict[str, dict[str, Any]] = {}
@@ -215,9 +212,6 @@ def write_capture(
 def _write_index(
     folder: Path, header: dict[str, Any], journal: Journal, topics: JointTopics | None, robot: str
 ) -> None:
-    """frames.csv, provenance.csv, joint topics, the robot's URDF, capture.json and SHA256SUMS, which names everything
-    but itself.
-    """
     names = ["joints.npz", "frames.csv"]
     if robot:
         (folder / ROBOT).write_text(robot, encoding="utf-8", newline="")
@@ -237,14 +231,12 @@ def _write_index(
 
 
 def _is_of_lens(name: str) -> bool:
-    """Whether a file is shared by the frames of a lens: it does not come in their order."""
+    """True if a lens's frames share it, out of order."""
     return name.startswith("valid/")
 
 
 def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None:
-    """A line for every file, by name: those of a folder of images in the order of the journal, which is read again
-    for each folder, and `others`, few files with their sha256.
-    """
+    """Write sorted lines; the journal is read once per image folder to bound memory."""
     written = (name for entry in journal.entries() for _, name in entry.sums if not _is_of_lens(name))
     folders = {f"{name.rpartition('/')[0]}/" for name in written}
     with path.open("w", encoding="utf-8", newline="") as stream:
@@ -262,7 +254,6 @@ def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str,
 
 
 def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
-    """The frame's row of frames.csv, but for the suffixes of its files; its camera is counted."""
     if stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera):
         raise InputError(
             f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="rename the camera"
@@ -287,7 +278,6 @@ def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, s
 
 
 def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera: Mapping[str, Any]) -> Entry:
-    """Write the images of a frame whose row is without their names."""
     stem, unit = f"{camera['num_frames'] - 1:06d}", float(camera["depth_scale"])
     color = stored.color_file or encoded(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
     color_name = f"color/{stored.camera}/{stem}.{'png' if is_png(color) else 'jpg'}"
@@ -314,7 +304,6 @@ def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera:
 
 
 def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
-    """Where the images of a frame were recorded; a byte that is not known stays empty."""
     if not stored.places:
         return {}
     found = {"color": color, "depth": depth}
@@ -325,7 +314,7 @@ def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
 
 
 def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
-    """Suffix and bytes of the depth image: the recorded PNG where it counts in the camera's unit."""
+    """Suffix and bytes, of the recorded PNG if in the unit."""
     if stored.depth_file is not None and stored.depth_unit == unit:
         return "png", stored.depth_file
     counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)
@@ -333,7 +322,7 @@ def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
 
 
 def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:
-    """Depth as uint16 counts of `unit`; None where they would not give the depth back."""
+    """uint16 counts of `unit`; None if they would not restore depth."""
     if depth.max(initial=0.0) / unit > 65534.5:
         return None
     counts = np.round(depth / np.float32(unit)).astype(np.uint16)
@@ -342,7 +331,7 @@ def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, n
 
 
 def encoded(pixels: np.ndarray[Any, Any]) -> bytes:
-    """The PNG file of an image."""
+    """Encode an image as PNG."""
     is_written, data = cv2.imencode(".png", pixels, PNG)
     if not is_written:
         raise WriteError(f"an image of shape {pixels.shape} could not be encoded as PNG")
@@ -356,7 +345,6 @@ def _npy(depth: Float32) -> bytes:
 
 
 def _write_joints(path: Path, states: StateColumns) -> None:
-    """joints.npz as numpy.savez would write it, a block at a time."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         with archive.open("stamp_ns.npy", "w", force_zip64=True) as stream:
             npy.write_array(stream, states.stamp_ns, allow_pickle=False)

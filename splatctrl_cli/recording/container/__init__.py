@@ -1,1 +1,1 @@
-"""The messages of a log file, whatever the container (MCAP, ROS 1 bag, sqlite3) and whatever is damaged."""
+"""The messages of damaged or whole logs: MCAP, ROS 1 bag, sqlite3."""

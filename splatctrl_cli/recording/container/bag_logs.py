@@ -1,12 +1,10 @@
-"""The messages of ROS bags: ROS 1, with or without index, and ROS 2 sqlite3; damage is left out and counted.
+"""The messages of ROS bags: ROS 1, and ROS 2 sqlite3; damage is skipped and counted.
 
-A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is a sequence of records, each a header of named fields and a
-body, read from front to back in bounded memory. Its index stands at the end and is written last, so a bag that was
-cut, or is still being written, has none: nothing here needs it.
+A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body, read in order in bounded
+memory. Its index is not used: a cut or growing bag has none.
 
-rosbags' reader of ROS 2 (rosbags/rosbag2/storage_sqlite3.py) counts all messages when it opens a file, and so refuses
-one with a single bad page. Tables as rosbag2_storage_sqlite3 creates them: topics, messages, since Iron
-message_definitions.
+rosbags (rosbags/rosbag2/storage_sqlite3.py) counts messages first, so one bad page makes it refuse. Tables of
+rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions.
 """
 
 import shutil
@@ -38,7 +36,7 @@ Fields = dict[str, bytes]
 
 
 class BagRecord(NamedTuple):
-    """One record: its fields and body; the body is what the file still holds of it where it is cut."""
+    """A record; a cut one has the rest of its body."""
 
     offset: int
     kind: int
@@ -48,14 +46,14 @@ class BagRecord(NamedTuple):
 
 
 class BagFile:
-    """Walks over the records of one file."""
+    """A reader of one file's records."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.size = path.stat().st_size
 
     def records(self, damage: Damage) -> Iterator[BagRecord]:
-        """Yield chunks, connections, messages and the bag's header in order; what is lost goes to `damage`."""
+        """Yield all but index data in order; losses go to `damage`."""
         with self.path.open("rb") as stream:
             if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
                 damage.add(f"{self.path.name}: is not a bag of format 2.0")
@@ -76,7 +74,7 @@ class BagFile:
                 stream.seek(place)
 
     def connections(self) -> list[BagRecord]:
-        """The connections that the index at the end names; none where there is no index."""
+        """The index's connections, if any."""
         with self.path.open("rb") as stream:
             stream.readline(64)
             first = self._record(stream, stream.tell())
@@ -90,7 +88,7 @@ class BagFile:
             return found
 
     def _record(self, stream: BinaryIO, offset: int) -> BagRecord | None:
-        """The record at `offset`, None where there is none; the stream is left behind it."""
+        """Read a record or None; the stream is left after it."""
         head = self._head(stream)
         if head is None:
             return None
@@ -103,7 +101,7 @@ class BagFile:
         return BagRecord(offset, kind, fields, body, is_cut)
 
     def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
-        """Kind, fields and length of the body of the record that begins here; the stream is left at the body."""
+        """Kind, fields and body length; the stream is left at the body."""
         length = self._length(stream)
         if length is None or length > min(1 << 20, self.size - stream.tell()):  # those of connections hold a name
             return None
@@ -113,7 +111,7 @@ class BagFile:
         return None if fields is None or kind not in _KINDS or length is None else (kind, fields, length)
 
     def _next_chunk(self, stream: BinaryIO, offset: int) -> int | None:
-        """Where behind `offset` a whole chunk begins, by the fields of its header."""
+        """Find the next whole chunk by its header."""
         stream.seek(offset + 1)
         kept = b""
         while block := stream.read(PIECE):
@@ -142,7 +140,7 @@ class BagFile:
 
 
 def fields_of(header: bytes) -> Fields | None:
-    """The named fields of a record's header; None where its lengths do not fit."""
+    """A header's named fields; None if its lengths do not fit."""
     found: Fields = {}
     at = 0
     while at < len(header):
@@ -158,15 +156,15 @@ def fields_of(header: bytes) -> Fields | None:
 
 
 def number(fields: Fields, name: str) -> int:
-    """A field of four or eight bytes as a number; -1 where it is missing."""
+    """A field of 4 or 8 bytes as a number; -1 if missing."""
     value = fields.get(name, b"")
     return int.from_bytes(value, "little") if len(value) in {4, 8} else -1
 
 
 def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
-    """Yield kind, fields and body of the records of an unpacked chunk, up to the first that does not fit.
+    """Yield kind, fields and body of an unpacked chunk's records.
 
-    Raises ValueError where bytes are left that are not a record.
+    Raises ValueError at bytes that are not a record.
     """
     at = 0
     while at < len(content):
@@ -186,10 +184,9 @@ def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
 
 
 class Bag1Log:
-    """One ROS 1 bag.
+    """One ROS 1 bag, read without its index. Raises InputError without any record.
 
-    rosbags' reader (rosbags/rosbag1/reader.py) goes by the index: it refuses a bag without one, and ends at the
-    first damaged chunk. Raises InputError where there is no record at all.
+    rosbags (rosbags/rosbag1/reader.py) refuses a bag without index, and ends at the first damaged chunk.
     """
 
     container = "ROS 1 bag"
@@ -205,11 +202,10 @@ class Bag1Log:
             self._connect(record.fields, record.body, Damage())
 
     def topics(self) -> tuple[Topic, ...]:
-        """The connections of the index, and those met while reading."""
         return tuple(self._topics.values())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield messages in file order; a chunk that does not unpack is left out, a cut one read to its cut."""
+        """Yield in file order; skips bad chunks, reads a cut one to its cut."""
         budget, num_indexed, num_chunks = Budget(self._file.size), 0, None
         for record in self._file.records(damage):
             if record.kind == BAG_HEADER:
@@ -274,10 +270,9 @@ _FILE_FORMAT = slice(18, 20)  # of its header (sqlite.org/fileformat2.html)
 
 
 class Db3Log:
-    """One .db3 file, with what its journal ("-wal") holds where its recorder was stopped before it closed the bag.
+    """One .db3 file, with the journal ("-wal") of a recorder that did not close it.
 
-    SQLite writes while it reads a journal: file and journal are copied first. Raises InputError where its tables are
-    not those of a bag, or cannot be read at all.
+    SQLite writes while it reads a journal, so both are copied first. Raises InputError for other tables.
     """
 
     container = "ROS 2 bag (sqlite3)"
@@ -302,7 +297,7 @@ class Db3Log:
             raise InputError(f"{path}: not a readable {self.container}: {error}", remedy=remedy) from None
 
     def _merge(self) -> None:
-        """Bring the journal into a copy of the file. Raises InputError where there is no room for one."""
+        """Merge the journal into a copy. Raises InputError without room for it."""
         folder = Path(tempfile.mkdtemp(prefix="splatctrl-", dir=scratch_folder()))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         try:
@@ -320,11 +315,10 @@ class Db3Log:
             self._database = self.path  # what is whole of it is read without its journal
 
     def topics(self) -> tuple[Topic, ...]:
-        """The topics table."""
         return tuple(self._topics.values())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield messages in the order they were written; rows on damaged pages are passed over and counted."""
+        """Yield in written order; rows on damaged pages are skipped and counted."""
         if self._num_pages > 0:
             damage.remark(
                 f"{self.path.name}: was not closed; {self._num_pages} pages of {self._journal.name} were read"
@@ -367,7 +361,6 @@ class Db3Log:
 
 
 def _topics(database: sqlite3.Connection) -> dict[object, Topic]:
-    """The topics by their number. Raises ValueError where a table is missing."""
     found = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if not {"topics", "messages"} <= found:
         raise ValueError("no tables named topics and messages")

@@ -1,4 +1,4 @@
-"""Recordings of other tools that are not read here: how each is known, and how it is exported to what is read."""
+"""Recordings of unsupported tools: their marks, and how to export them."""
 
 import zipfile
 from dataclasses import dataclass
@@ -15,8 +15,9 @@ _ENDS = 1 << 20  # bytes at either end of a file that are searched for its marks
 
 @dataclass(frozen=True, kw_only=True)
 class Foreign:
-    """A format that is not read: what it is, what to do, and what tells it: endings of names, first bytes with a mark
-    near the file's ends, or an entry of a zip file or folder.
+    """An unsupported format: what it is, the remedy, and its marks.
+
+    Marks: name endings, first bytes with a mark near either end, or an entry of a zip file or folder.
     """
 
     what: str
@@ -68,9 +69,9 @@ FOREIGN = (
 
 
 def refuse_foreign(path: Path) -> None:
-    """Raise InputError where a file or folder is of a known format that is not read: its name, and how to export it.
+    """Raise InputError for a known unsupported format, with its name and export.
 
-    Some are containers that are read (a .svo2 is an MCAP, an Azure Kinect's .mkv a video), but not what is in them.
+    Some are supported containers with other contents (a .svo2 is an MCAP, an Azure Kinect's .mkv a video).
     """
     ends, names = (b"", []) if path.is_dir() else (_ends(path), _entries(path))
     for kind in FOREIGN:
@@ -89,7 +90,6 @@ def _ends(path: Path) -> bytes:
 
 
 def _entries(path: Path) -> list[str]:
-    """The names in a zip file; none of any other."""
     try:
         with zipfile.ZipFile(path) as archive:
             return archive.namelist()

@@ -1,9 +1,9 @@
-"""Foxglove's schemas as the ROS messages that they stand for, from JSON, their ROS twins, or protobuf, which is read
-by the FileDescriptorSet that a log carries, without generated code. And the RealSense SDK's texts: its .db3 holds
-intrinsics, extrinsics and depth units as std_msgs/String (librealsense, src/media/ros2/ros2_writer.cpp).
+"""Foxglove's schemas, and the RealSense SDK's texts, as the ROS messages they stand for.
 
-Fields are those of docs.foxglove.dev ("Schemas"): in JSON times are {sec, nsec} and bytes base64, in protobuf times
-are google.protobuf.Timestamp.
+Foxglove's are JSON, ROS twins, or protobuf, read by the log's FileDescriptorSet without generated code. Fields:
+docs.foxglove.dev ("Schemas"); JSON times are {sec, nsec} and bytes base64, protobuf times google.protobuf.Timestamp.
+The SDK's .db3 has intrinsics, extrinsics and depth units as std_msgs/String (librealsense,
+src/media/ros2/ros2_writer.cpp).
 """
 
 import base64
@@ -27,7 +27,7 @@ from splatctrl_cli.recording.container.raw_log import Topic
 
 
 class MessageTypes:
-    """The message types of one FileDescriptorSet. Raises ValueError where the bytes are none."""
+    """A FileDescriptorSet's types. Raises ValueError for other bytes."""
 
     def __init__(self, descriptor_set: bytes) -> None:
         files = DescriptorDatabase()  # asked by the pool, so that a file may come before those that it imports
@@ -39,10 +39,7 @@ class MessageTypes:
         self._pool = DescriptorPool(files)
 
     def read(self, type_name: str, data: bytes) -> Any:
-        """A message with the fields of its type, those not written at their defaults.
-
-        Raises ValueError where it does not decode.
-        """
+        """Decode a message; unwritten fields have defaults. Raises ValueError."""
         try:
             return GetMessageClass(self._pool.FindMessageTypeByName(type_name)).FromString(data)
         except KeyError:
@@ -85,13 +82,13 @@ _PREFIXES = ("foxglove.", "foxglove_msgs/msg/", "foxglove_msgs/")
 
 
 def stands_for(schema: str) -> str:
-    """The ROS type of a Foxglove schema, "" for any other type."""
+    """The ROS type of a Foxglove schema, "" for others."""
     prefix = next((prefix for prefix in _PREFIXES if schema.startswith(prefix)), None)
     return "" if prefix is None else _STANDS_FOR.get(schema.removeprefix(prefix), "")
 
 
 def standing_in(topic: Topic) -> Topic:
-    """A topic of ROS messages, with the type that they stand for where they are foxglove_msgs or the SDK's texts."""
+    """The topic with its ROS type, if of foxglove_msgs or SDK texts."""
     texts = _TEXTS if topic.type_name == TEXT else {}
     said = next((kind for pattern, kind in texts.items() if re.fullmatch(pattern, topic.name)), "")
     ros_type = said or stands_for(topic.type_name)
@@ -99,9 +96,9 @@ def standing_in(topic: Topic) -> Topic:
 
 
 def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> Any:
-    """The ROS message that `data` stand for; definition: the FileDescriptorSet of protobuf, a byte a character.
+    """Decode to a ROS message; definition: protobuf's FileDescriptorSet, a byte a character.
 
-    Raises ValueError, KeyError, TypeError or AttributeError where they do not decode.
+    Raises ValueError, KeyError, TypeError or AttributeError.
     """
     if encoding == "json":
         return as_ros(schema, _object(json.loads(data)))
@@ -109,7 +106,7 @@ def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> A
 
 
 def as_ros(schema: str, message: Any) -> Any:
-    """A decoded Foxglove message as the ROS message that it stands for."""
+    """Convert a Foxglove message to its ROS message."""
     return _READERS[schema.replace("/", ".").rpartition(".")[2]](message)
 
 
@@ -119,14 +116,13 @@ def _types(definition: str) -> MessageTypes:
 
 
 def _object(value: Any) -> Any:
-    """JSON objects as objects with fields."""
     if isinstance(value, dict):
         return SimpleNamespace(**{key: _object(item) for key, item in value.items()})
     return [_object(item) for item in value] if isinstance(value, list) else value
 
 
 def _header(message: Any, frame_id: str | None = None) -> Any:
-    """frame_id: of a message that has no field of that name."""
+    """A header; frame_id: for messages without that field."""
     frame_id = str(getattr(message, "frame_id", "")) if frame_id is None else frame_id
     time = getattr(message, "timestamp", None)
     seconds = _either(time, "sec", "seconds")
@@ -135,7 +131,7 @@ def _header(message: Any, frame_id: str | None = None) -> Any:
 
 
 def _either(message: Any, *names: str) -> Any:
-    """The first of some fields that a message has; 0 where it has none, as JSON writers leave zeros out."""
+    """The first present field; 0 if none, as JSON omits zeros."""
     return next((getattr(message, name) for name in names if hasattr(message, name)), 0)
 
 
@@ -174,7 +170,6 @@ def _calibration(message: Any) -> Any:
 
 
 def _numbers(values: Any, count: int) -> Any:
-    """As an array; `count` zeros where nothing is written."""
     array = np.asarray([] if isinstance(values, int) else values, dtype=np.float64)
     return array if array.size else np.zeros(count)
 
@@ -192,7 +187,7 @@ def _transform(message: Any) -> Any:
 
 
 def _joint_states(message: Any) -> Any:
-    """Without velocities: one that is not set cannot be told from zero."""
+    """Joint states without velocities: an unset one looks like zero."""
     return SimpleNamespace(
         header=_header(message),
         name=[str(joint.name) for joint in message.joints],
@@ -202,7 +197,7 @@ def _joint_states(message: Any) -> Any:
 
 
 def _sdk_text(message: Any) -> Any:
-    """Raises KeyError or ValueError where a text of the SDK lacks a field."""
+    """Parse an SDK text. Raises KeyError or ValueError for a missing field."""
     said = dict(part.split("=", 1) for part in message.data.split(";") if "=" in part)
     values = {key: np.array(text.split(","), np.float64) for key, text in said.items() if key in _TEXT_FIELDS}
     if "fx" in said:

@@ -1,7 +1,6 @@
-"""A log of Foxglove's schemas in protobuf (docs.foxglove.dev, "Schemas"): clouds, voxels, transforms, meshes, lines
-of text; and numbers to plot, in JSON.
+"""A writer of logs in Foxglove's protobuf schemas (docs.foxglove.dev, "Schemas"), with plots in JSON.
 
-Needs foxglove-schemas-protobuf and mcap-protobuf-support, an extra of their own.
+Needs foxglove-schemas-protobuf and mcap-protobuf-support, a separate extra.
 """
 
 import json
@@ -28,10 +27,7 @@ REMEDY = "pip install 'splatctrl-cli[mcap]'"
 
 @contextmanager
 def foxglove_log(path: Path) -> Iterator["FoxgloveLog"]:
-    """A log open for writing at `path`; complete and closed after the block.
-
-    Raises UsageError where its libraries are not installed.
-    """
+    """Open a log, complete and closed after the block. Raises UsageError without libraries."""
     try:
         register = import_module("mcap_protobuf.schema").register_schema
         import_module(f"{SCHEMAS}.PointCloud_pb2")
@@ -45,7 +41,7 @@ def foxglove_log(path: Path) -> Iterator["FoxgloveLog"]:
 
 
 class FoxgloveLog:
-    """Adds messages to an open MCAP; they must come in time order. Everything lies in the frame `WORLD`."""
+    """Messages for an open MCAP, in time order, in `WORLD`."""
 
     def __init__(self, writer: Writer, register: Any) -> None:
         self._writer = writer
@@ -55,11 +51,11 @@ class FoxgloveLog:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """How many messages each topic has."""
+        """Messages by topic."""
         return self._counts
 
     def add_cloud(self, topic: str, stamp_ns: int, columns: Mapping[str, NDArray[Any]]) -> None:
-        """A PointCloud: a value (N,) of float32 or uint8 for each name, among them x, y, z [m]."""
+        """Add a PointCloud: float32 or uint8 (N,), among them x, y, z [m]."""
         kind = np.dtype([(name, column.dtype) for name, column in columns.items()])
         packed = np.zeros(len(columns["x"]), kind)
         for name, column in columns.items():
@@ -72,7 +68,7 @@ class FoxgloveLog:
     def add_voxels(
         self, topic: str, stamp_ns: int, name: str, values: NDArray[Any], origin: Float64, voxel: float
     ) -> None:
-        """A VoxelGrid of values (X, Y, Z), uint8 or float32; voxel (0, 0, 0) is centred at `origin` (3,) [m]."""
+        """Add (X, Y, Z), uint8 or float32; voxel (0, 0, 0) is centred at `origin` (3,) [m]."""
         columns, rows, _ = values.shape
         size = values.dtype.itemsize
         message = _new(
@@ -93,7 +89,7 @@ class FoxgloveLog:
         self._add(topic, stamp_ns, message)
 
     def add_transforms(self, topic: str, stamp_ns: int, poses: Mapping[str, Float64]) -> None:
-        """FrameTransforms: T_world_frame (4, 4) by frame."""
+        """Add T_world_frame (4, 4) by frame."""
         message = _new("FrameTransforms")
         for frame, T in poses.items():
             each = message.transforms.add(parent_frame_id=WORLD, child_frame_id=frame)
@@ -107,7 +103,7 @@ class FoxgloveLog:
     def add_mesh(
         self, topic: str, stamp_ns: int, frame: str, vertices: NDArray[np.floating], faces: NDArray[np.integer]
     ) -> None:
-        """A SceneUpdate: triangles, vertices (V, 3) [m] and faces (F, 3), that move with a frame."""
+        """Add a SceneUpdate: (V, 3) [m] and (F, 3) that move with a frame."""
         message = _new("SceneUpdate")
         entity = message.entities.add(id=frame, frame_id=frame, frame_locked=True)
         entity.timestamp.FromNanoseconds(stamp_ns)
@@ -120,11 +116,11 @@ class FoxgloveLog:
         self._add(topic, stamp_ns, message)
 
     def add_line(self, topic: str, stamp_ns: int, level: str, text: str) -> None:
-        """A Log of one of `LEVELS`."""
+        """Add a Log of one of `LEVELS`."""
         self._add(topic, stamp_ns, _new("Log", level=LEVELS.index(level), message=text, name="splatctrl"))
 
     def add_numbers(self, topic: str, stamp_ns: int, values: Mapping[str, float | None]) -> None:
-        """An object of numbers, in JSON."""
+        """Add numbers as a JSON object."""
         if topic not in self._channels:
             schema = {"type": "object", "properties": {name: {"type": ["number", "null"]} for name in values}}
             made = self._writer.register_schema(f"splatctrl{topic}", "jsonschema", json.dumps(schema).encode())
@@ -152,7 +148,6 @@ def _new(schema: str, **values: Any) -> Any:
 
 
 def _fields(kind: np.dtype[Any]) -> Sequence[Any]:
-    """A PackedElementField for each of a structure."""
     field = import_module(f"{SCHEMAS}.PackedElementField_pb2").PackedElementField
     assert kind.names is not None and kind.fields is not None
     return [

@@ -1,5 +1,6 @@
-"""Opens a recorded log by its content: one file, the folder of a ROS 2 bag, compressed with zstd by file or by
-message or not, or several logs of one session.
+"""Recorded logs opened by content: files, ROS 2 bag folders, logs of one session.
+
+Files or messages may be compressed with zstd.
 """
 
 import heapq
@@ -36,7 +37,7 @@ _MOST_RATIO = 100  # of an unpacked file, on disk, to the compressed one
 
 
 def unpack(path: Path, target: Path) -> str:
-    """Write what a .zstd file holds, as far as it unpacks; what stopped it, empty where nothing."""
+    """Unpack a .zstd as far as possible; return the fault, or ""."""
     left = FREE_BYTES + _MOST_RATIO * path.stat().st_size
     decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
     with path.open("rb") as source, target.open("wb") as written:
@@ -55,13 +56,13 @@ def unpack(path: Path, target: Path) -> str:
 
 
 class UnpackedMessagesLog(JoinedLog):
-    """A log whose messages are zstd frames."""
+    """A log of zstd messages."""
 
     def __init__(self, log: RawLog) -> None:
         super().__init__(log.path, (log,), log.container)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the messages unpacked; one that does not unpack is counted."""
+        """Yield unpacked messages; failures are counted."""
         budget = Budget(sum(file.stat().st_size for file in self.files))
         for message in super().messages(damage, names):
             try:
@@ -85,7 +86,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 
 @dataclass(frozen=True, kw_only=True)
 class Container:
-    """A kind of file with messages: its usual suffix, its first bytes, and how a file of it is opened."""
+    """A log format: suffix, first bytes, opener."""
 
     suffix: str
     magic: bytes
@@ -101,17 +102,16 @@ SUFFIXES = tuple(kind.suffix for kind in CONTAINERS)
 
 
 class SessionLog(JoinedLog):
-    """Logs that were recorded at the same time, as cameras in one and joints in another: by the time of logging."""
+    """Logs recorded at once, such as cameras and joints, by log time."""
 
     def __init__(self, parts: tuple[RawLog, ...]) -> None:
         path = parts[0].path.with_name("+".join(part.path.name for part in parts))
         super().__init__(path, parts, " + ".join(dict.fromkeys(part.container for part in parts)))
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of all parts by time of logging.
+        """Yield the messages of all parts by log time.
 
-        Where two parts share a topic, leaving others out would change the order in which its messages meet; it must
-        be the same in every pass, so all are read then.
+        If parts share a topic, all are read: skipping would reorder its messages between passes.
         """
         pushed = None if names is None or self._share(names) else names
         parts = (part.messages(damage, pushed) for part in self._parts)
@@ -130,9 +130,9 @@ class SessionLog(JoinedLog):
 
 
 def open_raw_log(path: Path) -> RawLog:
-    """The log at `path`: .mcap, .bag, .db3 or a ROS 2 bag folder; messages that are zstd frames are unpacked.
+    """Open .mcap, .bag, .db3 or a ROS 2 bag folder, with zstd messages unpacked.
 
-    Raises InputError where it is none of these, or cannot be read at all.
+    Raises InputError for others.
     """
     if path.is_dir():
         return _open_folder(path)
@@ -159,7 +159,7 @@ def open_raw_log(path: Path) -> RawLog:
 
 
 def is_bag_folder(path: Path) -> bool:
-    """Whether a folder looks like a ROS 2 bag."""
+    """True for a likely ROS 2 bag."""
     return bool(_storage_files(path)) or (path / "metadata.yaml").is_file()
 
 
@@ -183,7 +183,7 @@ def _open_folder(path: Path) -> RawLog:
 
 
 def told_formats(path: Path) -> set[str]:
-    """The serialization formats that a bag folder's metadata.yaml names; none for anything else."""
+    """Serialization formats in a bag folder's metadata.yaml."""
     if not path.is_dir():
         return set()
     try:
@@ -194,7 +194,7 @@ def told_formats(path: Path) -> set[str]:
 
 
 def _open_compressed(path: Path) -> RawLog:
-    """The log in a .zstd file, unpacked into a temporary folder that goes when the log does."""
+    """Unpack into a temporary folder that lives as long as the log."""
     folder = Path(tempfile.mkdtemp(prefix="splatctrl-"))
     file = folder / path.stem
     with ExitStack() as stack:
@@ -217,7 +217,7 @@ def _open_compressed(path: Path) -> RawLog:
 
 
 def _ordered_files(path: Path, told: dict[str, Any]) -> list[Path]:
-    """The storage files in recording order: as metadata.yaml lists them, else by the numbers in their names."""
+    """Files in recording order: metadata.yaml's, else by numbers in names."""
     names = told.get("relative_file_paths")
     if names:
         return [path / Path(name).name for name in dict.fromkeys(names)]
@@ -229,7 +229,7 @@ def _storage_files(path: Path) -> list[Path]:
 
 
 def _metadata(path: Path) -> tuple[dict[str, Any], str]:
-    """What metadata.yaml says, and what is wrong with it; a bag can be read without."""
+    """Metadata and its fault; a bag can be read without."""
     file = path / "metadata.yaml"
     if not file.is_file():
         return {}, ""

@@ -1,7 +1,6 @@
-"""The records of an MCAP file from front to back, whatever is wrong with it, in bounded memory.
+"""The records of an MCAP file from front to back, despite damage, in bounded memory.
 
-Nothing is believed that the file's length does not bear out. A record that cannot be where it stands is skipped: to
-the next place that the summary names, else to the next compressed chunk whose lengths agree with each other.
+An impossible record is skipped, to the summary's next place or the next compressed chunk with consistent lengths.
 """
 
 import bisect
@@ -35,7 +34,7 @@ _FOOTER_SIZE = HEAD.size + 20
 
 
 class Part(NamedTuple):
-    """One record of the file; of an attachment and of a record without a meaning, the content is left out."""
+    """A record; attachments and unknown ones have no content."""
 
     offset: int
     opcode: int
@@ -44,16 +43,16 @@ class Part(NamedTuple):
 
 
 class McapFile:
-    """Walks over the records of one file."""
+    """A reader of one file's records."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.size = path.stat().st_size
 
     def parts(self, damage: Damage, *, is_known: bool = False) -> Iterator[Part]:
-        """Yield the records in order; what is lost or wrong goes to `damage`, checksums of the file included.
+        """Yield records in order; losses and faults go to `damage`, checksums included.
 
-        is_known: leave out these checksums, as they were compared before.
+        is_known: skip checksums that were compared before.
         """
         places = [index.chunk_start_offset for index in self.chunk_indexes()]  # where records are known to begin
         places += [part.offset for part in self.summary()[:1]]
@@ -62,7 +61,7 @@ class McapFile:
             yield from walk.parts()
 
     def summary(self) -> list[Part]:
-        """The records of the summary section; empty where there is none that can be read."""
+        """The summary section's records, if readable."""
         with self.path.open("rb") as stream:
             footer = _footer(stream, self.size)
             if footer is None or not len(MAGIC) <= footer.summary_start < self.size:
@@ -79,7 +78,7 @@ class McapFile:
         return found
 
     def chunk_indexes(self) -> list[ChunkIndex]:
-        """The chunks that the summary names, in the order of the file."""
+        """The summary's chunks in file order."""
         found = []
         for part in self.summary():
             try:
@@ -91,7 +90,7 @@ class McapFile:
         return sorted(found, key=lambda index: index.chunk_start_offset)
 
     def chunk_at(self, index: ChunkIndex) -> bytes:
-        """The content of a chunk's record; what is left of it where the file is shorter."""
+        """A chunk record's content, or the rest of it."""
         with self.path.open("rb") as stream:
             stream.seek(min(index.chunk_start_offset, self.size))
             opcode, length = HEAD.unpack((stream.read(HEAD.size) + bytes(HEAD.size))[: HEAD.size])
@@ -99,8 +98,6 @@ class McapFile:
 
 
 class _Walk:
-    """One pass over a file."""
-
     def __init__(
         self, stream: BinaryIO, name: str, size: int, damage: Damage, places: list[int], *, has_crc: bool
     ) -> None:
@@ -109,7 +106,7 @@ class _Walk:
         self._crc: int | None = 0 if has_crc else None  # of the data section so far; None once a part was skipped
 
     def parts(self) -> Iterator[Part]:
-        """Yield the records up to the footer, or to what is left of the last one."""
+        """Yield records up to the footer, or the last one's rest."""
         if self._take(len(MAGIC)) != MAGIC:
             self._add("does not begin like an MCAP")
             return
@@ -142,7 +139,7 @@ class _Walk:
                 return
 
     def _part(self, offset: int, opcode: int, length: int, head: bytes) -> Part:
-        """The record at `offset`; its content stays out where it is too large or means nothing to us."""
+        """Read a record, without content if too large or unknown."""
         self._count(head)
         if opcode == ATTACHMENT:
             self._check_attachment(offset, length)
@@ -155,7 +152,7 @@ class _Walk:
         return Part(offset, opcode, b"", opcode <= DATA_END)
 
     def _beyond(self, offset: int, opcode: int) -> Part | None:
-        """Go to where reading can go on, or return what the file still holds of its last record."""
+        """Go to the next readable place, or return the last record's rest."""
         start = self._next_place(offset)
         if start is not None:
             self._add(f"bytes {offset} to {start} are damaged and were left out")
@@ -186,7 +183,7 @@ class _Walk:
         return None
 
     def _chunks_in(self, block: bytes, base: int) -> Iterator[int]:
-        """Places in `block` (of the file from `base`) where a chunk begins whose lengths agree."""
+        """Chunks in `block` (at `base`) with consistent lengths."""
         for name in _COMPRESSIONS:
             at = block.find(name)
             while at >= 0:
@@ -200,7 +197,6 @@ class _Walk:
                 at = block.find(name, at + 1)
 
     def _check_data(self, opcode: int, length: int) -> None:
-        """Compare the checksum of the data section with what its last record says."""
         if opcode != DATA_END or length > PIECE:
             return
         here = self._stream.tell()
@@ -253,7 +249,7 @@ class _Walk:
             self._add("checksum of the summary differs")
 
     def _pass_over(self, length: int, crc: int = 0) -> int:
-        """Read over `length` bytes; their checksum, going on from `crc`."""
+        """Skip bytes; return their checksum, from `crc` on."""
         while length > 0 and (piece := self._take(min(length, PIECE))):
             crc = zlib.crc32(piece, crc)
             length -= len(piece)
@@ -273,7 +269,7 @@ class _Walk:
 
 
 def _footer(stream: BinaryIO, size: int) -> Footer | None:
-    """The footer right before the closing mark (bytes that a later version adds to it would hide it)."""
+    """The footer before the closing mark; later additions would hide it."""
     if size < 2 * len(MAGIC) + _FOOTER_SIZE:
         return None
     stream.seek(size - len(MAGIC) - _FOOTER_SIZE)
@@ -287,7 +283,6 @@ def _footer(stream: BinaryIO, size: int) -> Footer | None:
 
 
 def _attachment_length(head: bytes) -> int | None:
-    """Bytes of an attachment's record before its checksum; None where its head does not say."""
     at = 16
     for _ in range(2):
         if at + 4 > len(head):

@@ -1,8 +1,7 @@
-"""The messages of an MCAP file, by its own records; what is damaged is left out and counted. And what a file holds
-without reading it: from the heads of its records, where no summary says so.
+"""An MCAP file's messages by its own records, and its index without a full read.
 
-The `mcap` package's readers allocate what a record announces, and its indexed reader needs an intact summary: it
-raises on valid files without one and yields nothing from a truncated file.
+Damage is skipped and counted. The `mcap` package allocates what records announce; its indexed reader raises on valid
+files without summary, and yields nothing from truncated ones.
 """
 
 import struct
@@ -41,7 +40,7 @@ MOST_HEADS = 100_000  # records that are visited: a second or so
 
 @dataclass(frozen=True, kw_only=True)
 class LogIndex:
-    """Messages by channel, log times [ns], chunks in file order; notes say what it does not cover."""
+    """Messages by channel, log times [ns], chunks in file order; notes: gaps."""
 
     counts: dict[int, int]
     first_ns: int
@@ -51,7 +50,7 @@ class LogIndex:
 
 
 def index_by_heads(file: McapFile) -> LogIndex:
-    """The chunks and messages of a file without a summary, up to the first damaged place or MOST_HEADS records."""
+    """Index without a summary, up to damage or MOST_HEADS records."""
     counts: dict[int, int] = {}
     chunks: list[ChunkIndex] = []
     stamps: list[int] = []
@@ -127,11 +126,10 @@ class McapLog:
                 self._declare(part.opcode, part.content, Damage())
 
     def topics(self) -> tuple[Topic, ...]:
-        """The channels of the summary section, and those met while reading."""
         return tuple(self._channels.values())
 
     def index(self) -> LogIndex:
-        """What the file says of itself: by its summary, else by the heads of its records."""
+        """The index by summary, else by the heads of records."""
         found = self._statistics
         if found is not None:
             chunks = tuple(self._file.chunk_indexes())
@@ -146,13 +144,13 @@ class McapLog:
         return index_by_heads(self._file)
 
     def topic_of(self, channel: int) -> Topic | None:
-        """The topic of a channel, if it has been declared so far."""
+        """A declared channel's topic, or None."""
         return self._channels.get(channel)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield messages in file order; what is damaged is left out, a cut chunk read as far as it goes.
+        """Yield messages in file order; skips damage, reads a cut chunk to its cut.
 
-        Checksums are compared until one pass, to the end, has found all of them right.
+        Checksums are compared until one full pass finds them right.
         """
         self._budget = Budget(self._file.size)
         state, count = self._forget_changed(), damage.count
@@ -170,14 +168,13 @@ class McapLog:
     def messages_of(
         self, chunks: Collection[ChunkIndex], damage: Damage, names: Collection[str] | None = None
     ) -> Iterator[RawMessage]:
-        """Yield the messages of these chunks only, wherever in the file they lie."""
+        """Yield these chunks' messages, anywhere in the file."""
         self._forget_changed()
         for index in chunks:
             content = self._file.chunk_at(index)
             yield from self._chunk_messages(content, index.chunk_start_offset, damage, names, is_cut=False)
 
     def _forget_changed(self) -> tuple[int, int]:
-        """The state of the file; its checksums count as unknown where it is another than when they were compared."""
         stat = self.path.stat()
         state = stat.st_size, stat.st_mtime_ns
         self._whole = self._whole if state == self._whole else None
@@ -203,7 +200,7 @@ class McapLog:
                 self._declare(opcode, records[start:at], damage)
 
     def _records_in(self, content: bytes, offset: int, damage: Damage, *, is_cut: bool) -> bytes:
-        """The records of a chunk, or of its start where the file ends in it; none where it is damaged."""
+        """A chunk's records, its start if cut, empty if damaged."""
         try:
             chunk = parse_record(CHUNK, content)
             assert isinstance(chunk, Chunk)
@@ -222,7 +219,6 @@ class McapLog:
     def _message(
         self, records: bytes, start: int, end: int, offset: int, damage: Damage, names: Collection[str] | None
     ) -> RawMessage | None:
-        """The message in these bytes of `records`, found at `offset`; None where it is not wanted or no message."""
         if end - start < _MESSAGE.size:
             damage.add(f"{self.path.name}: a message record of {end - start} bytes")
             return None
@@ -242,7 +238,6 @@ class McapLog:
         )
 
     def _declare(self, opcode: int, content: bytes, damage: Damage) -> None:
-        """Take a schema, a channel or the statistics."""
         try:
             record = parse_record(opcode, content)
         except BadRecordError as error:
@@ -273,6 +268,6 @@ def _topic(channel: Channel, schema: Schema | None) -> Topic:
 
 
 def ros_type_name(name: str) -> str:
-    """``package/msg/Type`` of ROS 1's ``package/Type``; other names as they are."""
+    """``package/msg/Type`` for ROS 1's ``package/Type``; other names unchanged."""
     package, slash, kind = name.partition("/")
     return f"{package}/msg/{kind}" if slash and "/" not in kind else name

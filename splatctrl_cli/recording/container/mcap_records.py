@@ -1,7 +1,6 @@
-"""The records of an MCAP file whose fields are read, each parsed from its bytes and from no more than them.
+"""The MCAP records whose fields are read, each within its own bytes.
 
-The `mcap` package reads the fields (mcap.dev/spec); a length that the bytes do not bear out is refused here. Bytes
-after the last field are allowed, as the specification demands of a reader.
+The `mcap` package reads them (mcap.dev/spec). Bytes after the last field are allowed, as specified.
 """
 
 import struct
@@ -21,14 +20,12 @@ HEAD = struct.Struct("<BQ")  # opcode and length of what follows
 
 
 class BadRecordError(ValueError):
-    """A record whose bytes do not hold its fields."""
+    """A record too short for its fields."""
 
 
 class _Fields(ReadDataStream):  # type: ignore[misc]
-    """Reads the fields of a record one after the other, within its bytes."""
-
     def read(self, length: int) -> bytes:
-        """The next `length` bytes. Raises EndOfFile where the record ends before (the package returns fewer)."""
+        """Read exactly `length` bytes. Raises EndOfFile, where the package returns fewer."""
         found: bytes = super().read(length)
         if len(found) < length:
             raise EndOfFile
@@ -38,12 +35,12 @@ class _Fields(ReadDataStream):  # type: ignore[misc]
         return self.read(self.read4()).decode("utf-8", "replace")
 
     def rest(self) -> bytes:
-        """The bytes that are left."""
+        """The remaining bytes."""
         return bytes(self._stream.read())
 
 
 class Chunk(NamedTuple):
-    """A batch of records, as stored; perhaps fewer bytes than `compressed_size` where the file is cut."""
+    """Stored records; shorter than `compressed_size` if cut."""
 
     message_start_time: int
     message_end_time: int
@@ -55,7 +52,6 @@ class Chunk(NamedTuple):
 
     @classmethod
     def read(cls, fields: _Fields) -> "Chunk":
-        """Parse a chunk whose last bytes may be missing."""
         numbers = (fields.read8(), fields.read8(), fields.read8(), fields.read4())
         compression, size = fields.read_prefixed_string(), fields.read8()
         return cls(*numbers, compression, size, fields.rest()[:size])
@@ -73,7 +69,7 @@ _KINDS: dict[int, Any] = {  # by opcode
 
 
 def parse_record(opcode: int, content: bytes) -> object:
-    """The record of these bytes, None for an opcode that is not among `_KINDS`. Raises BadRecordError."""
+    """A record, None if not in `_KINDS`. Raises BadRecordError."""
     if opcode not in _KINDS:
         return None
     try:

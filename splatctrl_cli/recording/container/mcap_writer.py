@@ -1,8 +1,8 @@
-"""Writes a recorded log as one ROS 2 MCAP of standard messages (CDR, zstd chunks, CRCs on).
+"""A writer of ROS 2 MCAP logs of standard messages (CDR, zstd chunks, CRCs on).
 
-Topics: /CAM/color/image_raw/compressed (JPEG), /CAM/color/camera_info, /CAM/depth/image_raw (16UC1 millimetres,
-REP 118, 0 = none, registered to colour), /CAM/people/mask (mono8, 255 = a person; only of frames with a mask),
-/joint_states, /tf and /tf_static. The bytes hold no wall-clock time.
+Topics: /CAM/color/image_raw/compressed (JPEG), /CAM/color/camera_info, /CAM/depth/image_raw (16UC1 millimetres, REP
+118, 0 = none, registered to colour), /CAM/people/mask (mono8, 255 = a person; only with a mask), /joint_states, /tf,
+/tf_static. No wall-clock time in the bytes.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,7 +30,7 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 
 @contextmanager
 def mcap_log(path: Path) -> Iterator["McapLog"]:
-    """A log open for writing at `path`; complete and closed after the block."""
+    """Open a log, complete and closed after the block."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=4 << 20, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="splatctrl")
@@ -39,7 +39,7 @@ def mcap_log(path: Path) -> Iterator["McapLog"]:
 
 
 class McapLog:
-    """Adds records to an open MCAP; messages must come in time order."""
+    """Records for an open MCAP, in time order."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
@@ -49,7 +49,7 @@ class McapLog:
         self._sequence: dict[str, int] = {}
 
     def add_joint_state(self, state: JointState, joint_names: Sequence[str]) -> None:
-        """One /joint_states message; effort is left empty."""
+        """Add a /joint_states message, effort empty."""
         message = self._new(
             "sensor_msgs/msg/JointState",
             header=self._header(state.stamp_ns, ""),
@@ -61,7 +61,7 @@ class McapLog:
         self._add("/joint_states", message, state.stamp_ns)
 
     def add_transforms(self, stamp_ns: int, transforms: Sequence[Transform], *, is_static: bool) -> None:
-        """One /tf or /tf_static message."""
+        """Add /tf or /tf_static."""
         stamped = [
             self._new(
                 "geometry_msgs/msg/TransformStamped",
@@ -75,7 +75,7 @@ class McapLog:
         self._add("/tf_static" if is_static else "/tf", message, stamp_ns)
 
     def add_frame(self, frame: RgbdFrame) -> None:
-        """Colour as JPEG, its CameraInfo, the depth and a mask if any, all of one stamp and one optical frame."""
+        """Add JPEG colour, CameraInfo, depth and any mask, in one optical frame."""
         header = self._header(frame.stamp_ns, f"{frame.camera}_optical_frame")
         jpeg = cv2.imencode(".jpg", frame.color[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
         color = self._new("sensor_msgs/msg/CompressedImage", header=header, format="jpeg", data=jpeg.reshape(-1))

@@ -1,4 +1,4 @@
-"""Recorded messages as bytes, in the order of the file, whatever the container; damage is counted, not raised."""
+"""Recorded messages as bytes, in file order; damage is counted, not raised."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
@@ -11,12 +11,11 @@ MAX_NOTES = 100  # a long log can be damaged in a million places
 
 @dataclass(frozen=True, kw_only=True)
 class Topic:
-    """One channel of a log.
+    """A channel of a log.
 
-    type_name is ``package/msg/Type`` for ROS messages; encoding is ``cdr``, ``ros1`` or what the file says (json,
-    protobuf, ...); definition is the type's text as the file holds it ("" = none), in definition_format
-    ``msg``, ``idl`` or ``protobuf`` (a FileDescriptorSet, a byte a character). schema is the type's own name where
-    type_name is that of the ROS message that it stands for (Foxglove's schemas), else "".
+    type_name: ``package/msg/Type`` for ROS. encoding: ``cdr``, ``ros1`` or the file's (json, protobuf, ...).
+    definition: the type's text or "", as definition_format ``msg``, ``idl`` or ``protobuf`` (a FileDescriptorSet, a
+    byte a character). schema: the original type if type_name stands for it in ROS (Foxglove), else "".
     """
 
     name: str
@@ -29,10 +28,9 @@ class Topic:
 
 @dataclass(frozen=True, kw_only=True)
 class RawMessage:
-    """One message: its topic, the time it was logged [ns] and its bytes, the same for every container.
+    """A message: topic, log time [ns] and bytes, the same for every container.
 
-    file and offset say where it was read: the byte at which its record, or that of its chunk, begins; -1 where the
-    container has no such place.
+    file, offset: the byte where its record, or its chunk's, begins; -1 if unknown.
     """
 
     topic: Topic
@@ -44,8 +42,9 @@ class RawMessage:
 
 @dataclass(kw_only=True)
 class Damage:
-    """What one pass over a log could not read; remarks: how often something was met that is no damage, as messages of
-    a form that is not read.
+    """A record of what a pass over a log could not read.
+
+    remarks: counts of what is no damage, such as unsupported forms.
     """
 
     count: int = 0
@@ -54,7 +53,7 @@ class Damage:
     _num_unsaid: int = 0
 
     def add(self, note: str, num: int = 1) -> None:
-        """Count damaged parts and say which; behind MAX_NOTES notes, a last one says how many more."""
+        """Count and note damage; after MAX_NOTES a last note counts the rest."""
         self.count += num
         if len(self.notes) < MAX_NOTES:
             self.notes.append(note)
@@ -63,58 +62,56 @@ class Damage:
             self.notes[MAX_NOTES:] = [f"and {self._num_unsaid} more"]
 
     def remark(self, text: str) -> None:
-        """Count what is no damage; behind MAX_NOTES remarks, new ones share one."""
+        """Count what is no damage; after MAX_NOTES, new remarks share one."""
         is_room = text in self.remarks or len(self.remarks) < MAX_NOTES
         self.remarks[text if is_room else "more of this kind"] += 1
 
     @property
     def all_notes(self) -> list[str]:
-        """Damage, then each remark with how often it was met."""
+        """Damage, then remarks with counts."""
         return [*self.notes, *(text if num == 1 else f"{text} ({num} times)" for text, num in self.remarks.items())]
 
 
 class RawLog(Protocol):
-    """A log that can be read from its start any number of times."""
+    """A log that can be read repeatedly."""
 
     @property
     def path(self) -> Path: ...
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files the log consists of."""
+        """The log's files."""
         ...
 
     @property
     def container(self) -> str:
-        """What the file is, in words (``MCAP``, ``ROS 1 bag``, ``ROS 2 bag (sqlite3)``)."""
+        """``MCAP``, ``ROS 1 bag``, ``ROS 2 bag (sqlite3)``."""
         ...
 
     def topics(self) -> tuple[Topic, ...]:
-        """The topics that the log's index names, also those without messages; empty where there is no index."""
+        """Topics in the index, even without messages; none without an index."""
         ...
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of topics `names` (all, if None) in file order; what is damaged goes to `damage`."""
+        """Yield messages of `names` (None: all) in file order; losses go to `damage`."""
         ...
 
 
 class JoinedLog:
-    """Logs as one, read one after the other; a note says what is wrong with them together, and counts as damage."""
+    """Logs read in turn; `note` is a fault of the whole, counted as damage."""
 
     def __init__(
         self, path: Path, parts: Sequence[RawLog], container: str, *, files: tuple[Path, ...] = (), note: str = ""
     ) -> None:
-        """files: those that the log consists of, by default those of its parts."""
+        """files: by default the parts'."""
         self.path, self.container = path, container
         self.files = files or tuple(file for part in parts for file in part.files)
         self._parts, self._note = parts, note
 
     def topics(self) -> tuple[Topic, ...]:
-        """The topics of all parts, each once."""
         return tuple(dict.fromkeys(topic for part in self._parts for topic in part.topics()))
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of each part in turn."""
         if self._note:
             damage.add(self._note)
         for part in self._parts:

@@ -1,8 +1,8 @@
-"""DTU scans in MVSNet's layout: reads real ones and writes ours.
+"""DTU scans in MVSNet's layout: reads real ones, writes ours.
 
 ROOT/Cameras/[train/]00000000_cam.txt (world-to-camera and K), ROOT/Cameras/pair.txt,
 ROOT/Rectified/SCAN_train/rect_001_3_r5000.png (view 0, light 3), ROOT/Depths_raw/SCAN/depth_map_0000.pfm with
-depth_visual_0000.png (above 10 where the depth counts). Lengths there are millimetres, here metres.
+depth_visual_0000.png (above 10 where depth is valid). Lengths there are millimetres, here metres.
 """
 
 import re
@@ -28,9 +28,9 @@ LEAST_SPREAD = 0.005  # of the depth, by which the cameras stand apart
 
 @dataclass(frozen=True, kw_only=True)
 class DtuView:
-    """One view: color (H, W, 3) uint8 RGB, depth (H, W) float32 [m] (0 = none), K in pixels, camera pose [m].
+    """A view: color (H, W, 3) uint8 RGB, depth (H, W) float32 [m], K [px], pose [m].
 
-    mask (H, W): True on the object, None where no mask is known.
+    Depth 0 = none. mask (H, W): True on the object, None if unknown.
     """
 
     name: str
@@ -46,7 +46,7 @@ Shrink = Callable[[DtuView], DtuView]
 
 @dataclass(frozen=True, kw_only=True)
 class DtuScan:
-    """The views of one scan, their numbers, the files that were read, and the names of views without_depth."""
+    """A scan's views, their numbers, files read, and names without_depth."""
 
     name: str
     views: tuple[DtuView, ...]
@@ -58,13 +58,11 @@ class DtuScan:
 def read_dtu(
     root: Path, scan: str | None = None, masks: Path | None = None, shrink: Shrink = lambda view: view
 ) -> DtuScan:
-    """The views of scan `scan` (default: the only one) of a DTU folder; `masks` holds NNN.png by view number.
+    """Read scan `scan` (default: the only one) of a DTU folder; `masks` contains NNN.png by view number.
 
-    `shrink` makes of each view the one that is kept, before the next is read.
-
-    K is scaled to the images (the file's K may be for 1600x1200 or for a quarter of the image). Depth of another
-    size than the image is sampled, not blended: a larger map at the pixels that the image's come from; a smaller map
-    sets only the pixels it was made for. A view without depth is left out. Raises InputError naming the file.
+    `shrink` maps each view before the next is read. K is scaled to the images (the file's may be for 1600x1200 or a
+    quarter). Depth of another size is sampled, not blended: larger maps at the image's pixels, smaller ones only at
+    their own. Drops views without depth. Raises InputError naming the file.
     """
     scan, folder = chosen_scan(root, scan_folders(root), scan)
 
@@ -92,7 +90,7 @@ def read_dtu(
 
 
 def chosen_scan(root: Path, folders: Mapping[str, Path], scan: str | None) -> tuple[str, Path]:
-    """The scan of that name, or the only one, and its folder. Raises InputError with the choices."""
+    """The scan of that name, or the only one. Raises InputError with the choices."""
     if scan is None and len(folders) == 1:
         scan = next(iter(folders))
     if scan is None or scan not in folders:
@@ -111,8 +109,10 @@ def read_views(
     shrink: Shrink,
     keeps_without_depth: bool,
 ) -> DtuScan:
-    """The views of images by number, one at a time in memory before `shrink`; a view that has no file of depth has a
-    depth of 0 everywhere, or is left out. camera: intrinsics and T_world_camera by number and (width, height).
+    """Read views by number, one at a time in memory before `shrink`.
+
+    A view without a depth file has depth 0, or is left out. camera: intrinsics and T_world_camera by number and
+    (width, height).
     """
     views: list[DtuView] = []
     numbers: list[int] = []
@@ -149,8 +149,10 @@ def read_views(
 
 
 def check_lengths(where: str, views: Sequence[DtuView]) -> None:
-    """Raise InputError where depth or the cameras' distances were no millimetres: of a table seen from near, not from
-    a thousandth or a thousand times as far."""
+    """Raise InputError if depth or camera distances are not millimetres.
+
+    It expects a table seen from near; a wrong unit is a thousand times off.
+    """
     known = [view.depth[view.depth > 0] for view in views]
     medians = [float(np.median(depth)) for depth in known if depth.size]
     if not medians:
@@ -173,7 +175,7 @@ def check_lengths(where: str, views: Sequence[DtuView]) -> None:
 
 
 def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
-    """Write views as one scan of a new DTU folder; a view's K is for its own image size."""
+    """Write a new DTU folder of one scan."""
     cameras = root / "Cameras"
     rectified = root / "Rectified" / f"{scan}_train"
     depths = root / "Depths_raw" / scan
@@ -188,12 +190,12 @@ def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
 
 
 def write_png(path: Path, image: UInt8) -> None:
-    """Write an image, blue first where it has colours."""
+    """Write an image, BGR if coloured."""
     path.write_bytes(cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes())
 
 
 def scan_folders(root: Path) -> dict[str, Path]:
-    """The folders of images by scan. Raises InputError where there is no Rectified."""
+    """Image folders by scan. Raises InputError without Rectified."""
     rectified = root / "Rectified"
     if not rectified.is_dir():
         raise InputError(
@@ -205,7 +207,6 @@ def scan_folders(root: Path) -> dict[str, Path]:
 
 
 def _images(folder: Path) -> dict[int, Path]:
-    """Image of each view number, of light 3 where there is a choice."""
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         match = re.fullmatch(r"rect_(\d+)_(\d+|max)(_r5000)?\.(png|jpg)", path.name)
@@ -219,7 +220,7 @@ def _images(folder: Path) -> dict[int, Path]:
 
 
 def read_image(path: Path) -> UInt8:
-    """The image (H, W, 3) as RGB, its orientation tag ignored. Raises InputError for what is none, or was cut."""
+    """RGB (H, W, 3), ignoring the orientation tag. Raises InputError if unreadable."""
     image = decode_file(path.read_bytes(), color=True) if path.is_file() else None
     if image is None:
         raise InputError(f"{path}: not an image that can be read", remedy="copy the file anew")
@@ -227,7 +228,7 @@ def read_image(path: Path) -> UInt8:
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Bool:
-    """(H, W) True where the image is bright in every channel; of another size, the nearest pixel says."""
+    """(H, W) True where bright in every channel, by nearest pixels."""
     image = read_image(path)
     if image.shape[1::-1] != size:
         width, height = size
@@ -240,7 +241,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool:
 
 
 def _mask_file(folder: Path, number: int) -> Path:
-    """``007.png`` or the like, in the folder or in its ``mask``, as IDR's archive and RegNeRF's have it."""
+    """``007.png`` or the like in the folder (RegNeRF) or ``mask`` (IDR)."""
     for place in (folder, folder / "mask"):
         for path in sorted(place.glob("*.png")):
             if path.stem.isdecimal() and int(path.stem) == number:
@@ -251,7 +252,6 @@ def _mask_file(folder: Path, number: int) -> Path:
 
 
 def _camera_file(root: Path, number: int) -> Path:
-    """The camera of the training images where there is one, else of the full images."""
     candidates = [root / "Cameras" / part / f"{number:08d}_cam.txt" for part in ("train", ".")]
     for path in candidates:
         if path.is_file():
@@ -260,7 +260,10 @@ def _camera_file(root: Path, number: int) -> Path:
 
 
 def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
-    """K (3, 3) [px], T_camera_world (4, 4) in any length and the least depth (0: none) of a camera file of MVSNet."""
+    """Read K (3, 3) [px], T_camera_world (4, 4) and least depth of MVSNet's file.
+
+    Lengths have the file's unit; depth 0 is none.
+    """
     words = path.read_text(encoding="utf-8", errors="replace").split()
     try:
         extrinsic = np.array(words[words.index("extrinsic") + 1 :][:16], dtype=np.float64).reshape(4, 4)
@@ -278,11 +281,11 @@ def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
 
 
 def fitted_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
-    """K for an image of `size` (width, height), whichever of the sizes in use the file's K was made for.
+    """Fit K to an image of `size` (width, height), whichever common size it is for.
 
-    Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). In an image made smaller they are at
-    (u + 0.5) scale - 0.5, as `shrunk` has it; but MVSNet's cameras for 640x512, and for a quarter of that, are
-    multiples of those for 1600x1200 (train/ has 4 x 82.9 = 823.2 / 2 - 80), and its loaders take them so.
+    Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). Shrinking moves it to (u + 0.5) scale -
+    0.5, as in `shrunk`. MVSNet's cameras for 640x512, and for a quarter, are instead multiples of those for 1600x1200
+    (train/ has 4 x 82.9 = 823.2 / 2 - 80), and its loaders agree.
     """
     width, height = size
     shift, crop = 0.0, (0, 0)
@@ -320,7 +323,7 @@ def _depth_file(root: Path, scan: str, number: int) -> Path | None:
 
 
 def read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:
-    """Depth (H, W) [m] at the pixels of an image of `size` (width, height), 0 = none."""
+    """Depth (H, W) [m] for an image of `size` (width, height), 0 = none."""
     depth = read_pfm(path)
     depth = np.where(np.isfinite(depth) & (depth > 0), depth / np.float32(MILLIMETRES), np.float32(0))
     if visual.is_file():
@@ -360,7 +363,7 @@ def _rows(matrix: Float64) -> list[str]:
 
 
 def _pairs(views: Sequence[DtuView]) -> str:
-    """For each view the others, nearest camera first; the score falls with the distance of the cameras [mm]."""
+    """Nearest cameras first; the score falls with distance [mm]."""
     centers = np.array([view.T_world_camera[:3, 3] for view in views]) * MILLIMETRES
     lines = [str(len(views))]
     for number in range(len(views)):

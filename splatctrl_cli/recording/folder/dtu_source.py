@@ -1,4 +1,4 @@
-"""A DTU scan (MVSNet's or IDR's layout) as a record source: views to train from and views held out for scoring."""
+"""A DTU scan (MVSNet or IDR) as training and held-out records."""
 
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ HOLDOUT_CAMERA = "holdout"
 
 
 def view_numbers(words: Sequence[str]) -> list[int]:
-    """View numbers as a person gives them, ``2`` and ``5``; raises UsageError for what is none."""
+    """Parse ``2`` and ``5``. Raises UsageError for others."""
     bad = [word for word in words if not word.isdigit()]
     if bad:
         raise UsageError(f"--holdout: expected view numbers such as 2,5, got {bad[0]!r}")
@@ -26,13 +26,11 @@ def view_numbers(words: Sequence[str]) -> list[int]:
 
 
 class DtuSource:
-    """The views of a scan, by their numbers (view 0 is ``rect_001``), which are their stamps, too.
+    """A scan's views by number (view 0 is ``rect_001``), which is also the stamp.
 
-    The scene does not move, so there is no clock. Views whose number is in `holdout` belong to camera ``holdout``,
-    the others to ``camera``; a `protocol` says instead which train, are held out, and are left out. masks, depths:
-    folders with what the layout itself lacks. downscale: the factor by which images are made smaller; None: down to
-    the protocol's size, where that is a whole factor of theirs. layout: ``MVSNet`` or ``IDR``; scan: its name in its
-    data set; split: which views train and which are held out.
+    The scene is static, so there is no clock. Views in `holdout` belong to camera ``holdout``, others to ``camera``,
+    unless a `protocol` assigns or drops them. masks, depths: folders the layout misses. downscale: shrink factor;
+    None: to the protocol's size, if whole. layout: ``MVSNet`` or ``IDR``; split: training and held-out views.
     """
 
     joint_names: tuple[str, ...] = ()
@@ -84,11 +82,11 @@ class DtuSource:
 
     @property
     def has_depth(self) -> bool:
-        """Whether any view has any depth."""
+        """True if any view has depth."""
         return any(bool((view.depth > 0).any()) for view in self._views.values())
 
     def mask(self, number: int) -> Bool | None:
-        """(H, W) True on the object in the view of that number; None where no mask is known."""
+        """(H, W) True on the object, or None."""
         return self._views[number].mask
 
     def records(self) -> Iterator[Record]:
@@ -113,11 +111,11 @@ class DtuSource:
 
 
 def shrunk(view: DtuView, factor: int) -> DtuView:
-    """The view with every `factor` x `factor` pixels as one: the mean colour, the middle's depth, the first's mask.
+    """Merge every `factor` x `factor` pixels: mean colour, the middle's depth, the first's mask.
 
-    Colour and mask as RegNeRF has them (regnerf/internal/datasets.py, downsample: cv2.INTER_AREA, for masks
-    cv2.INTER_NEAREST, which takes the first pixel). Pixel (0, 0) has its centre at
-    (0, 0), so that u becomes (u + 0.5) / factor - 0.5. Raises UsageError for a factor that does not divide the size.
+    Colour and mask follow RegNeRF (regnerf/internal/datasets.py, downsample: cv2.INTER_AREA; masks cv2.INTER_NEAREST,
+    which takes the first pixel). Pixel (0, 0) has its centre at (0, 0): u becomes (u + 0.5) / factor - 0.5. Raises
+    UsageError for a factor that does not divide the size.
     """
     k = view.intrinsics
     if factor < 1 or k.width % factor or k.height % factor:
@@ -145,7 +143,7 @@ def shrunk(view: DtuView, factor: int) -> DtuView:
 
 
 def _factor(view: DtuView, protocol: ScoreProtocol | None) -> int:
-    """By how much to shrink for the protocol's published size; 1 where no whole factor leads to one."""
+    """Shrink factor to the protocol's published size; 1 if not whole."""
     if protocol is None or protocol.size is None:
         return 1
     width, height = protocol.size

@@ -1,4 +1,4 @@
-"""The TOML file that describes a folder of colour and depth images (docs/input.md)."""
+"""The TOML description of an image folder (docs/input.md)."""
 
 import tomllib
 from collections.abc import Callable, Collection, Mapping
@@ -18,7 +18,7 @@ DEPTH_ENCODINGS = ("uint16", "uint16-rotated3", "float32")
 
 @dataclass(frozen=True, kw_only=True)
 class CameraTable:
-    """``[camera]`` or ``[depth_camera]``; pixel_center is the coordinate of the first pixel's centre (0 or 0.5)."""
+    """``[camera]`` or ``[depth_camera]``; pixel_center: the first pixel's coordinate (0 or 0.5)."""
 
     width: int
     height: int
@@ -34,7 +34,7 @@ class CameraTable:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """With pixel (0, 0) centred at u = v = 0."""
+        """Intrinsics with pixel (0, 0) centred at u = v = 0."""
         return Intrinsics(
             fx=self.fx,
             fy=self.fy,
@@ -47,9 +47,9 @@ class CameraTable:
 
 @dataclass(frozen=True, kw_only=True)
 class FramesTable:
-    """``[frames]``: globs with one ``*``; files with the same text for it belong together.
+    """``[frames]``: globs with one ``*``; files with equal text for it belong together.
 
-    human_mask: 8-bit grey images, not 0 where the colour image shows a person.
+    human_mask: 8-bit grey, not 0 on a person.
     """
 
     color: str
@@ -59,7 +59,7 @@ class FramesTable:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthTable:
-    """``[depth]``: how depth is stored, metres per count, and the count that means none beside 0 (-1: no other)."""
+    """``[depth]``: encoding, metres per count, an invalid count next to 0 (-1: none)."""
 
     encoding: str = "uint16"
     scale: float = 1e-3
@@ -79,7 +79,7 @@ class PosesTable:
 
 @dataclass(frozen=True, kw_only=True)
 class StampsTable:
-    """``[stamps]``: rate [1/s] of the frame numbers, or `names`: file names are seconds."""
+    """``[stamps]``: rate [1/s] of frame numbers; names: file names are seconds."""
 
     rate: float | None = None
     names: bool = False
@@ -87,15 +87,16 @@ class StampsTable:
 
 @dataclass(frozen=True, kw_only=True)
 class SplitTable:
-    """``[split]``: frames (position or name) that become camera `holdout`."""
+    """``[split]``: frames (position or name) for camera `holdout`."""
 
     holdout: list[int | str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImagePart:
-    """An image that is a part of a file, used as the path of an image file is: its number there, (columns, rows), and
-    what gives it as an image file of that suffix, without bytes where it is damaged.
+    """An image inside a file, used like an image file's path.
+
+    number: its index; size: (columns, rows); read_bytes: an image file of that suffix, empty if damaged.
     """
 
     file: Path
@@ -106,11 +107,10 @@ class ImagePart:
 
     @property
     def name(self) -> str:
-        """The file's, with the image's number."""
+        """The file's name with the number."""
         return f"{self.file.name}#{self.number}"
 
     def is_file(self) -> bool:
-        """Whether the file is there."""
         return self.file.is_file()
 
     def absolute(self) -> Path:
@@ -130,12 +130,10 @@ ImageFile = Path | ImagePart
 
 @dataclass(frozen=True, kw_only=True)
 class ListedView:
-    """A view by its files, where a layout names them one by one instead of by globs.
+    """A view by its files, for layouts that list them.
 
-    depth: None where no view of a layout has any; matrix: its pose as the layout writes it, None where it has none;
-    camera: its lens, None for [camera];
-    depth_scale: metres per count, None for that of [depth]; valid: an 8-bit grey image, 0 where a pixel is not to be
-    used, None where all are.
+    depth: None if no view has any. matrix: pose as written, or None. camera: None for [camera]. depth_scale: metres
+    per count, None for [depth]'s. valid: 8-bit grey, 0 on invalid pixels, or None.
     """
 
     name: str
@@ -151,12 +149,11 @@ class ListedView:
 
 @dataclass(frozen=True, kw_only=True)
 class Description:
-    """A whole description; camera and frames may be left to a transforms.json, poses to --camera-pose.
+    """A whole description; transforms.json may give camera and frames, --camera-pose the poses.
 
-    listed: the views of a layout, instead of frames; is_depth_resized: depth of another size shows the same view and
-    is brought to the size of colour by nearest pixels; unpaired: colour and depth files without partner; num_damaged:
-    views that a damaged file lacks; supply: how depth may be added where no view has any; notes: what a layout leaves
-    open and was taken as usual.
+    listed: a layout's views, instead of frames. is_depth_resized: depth of another size takes nearest pixels.
+    unpaired: colour and depth files without partner. num_damaged: views lost to damage. supply: how to add depth if
+    none has it. notes: assumptions that the layout leaves open.
     """
 
     path: Path
@@ -195,7 +192,7 @@ def _refused(what: str) -> InputError:
 
 
 def read_description(path: Path, root: Path | None = None) -> Description:
-    """Parse a description. Raises InputError naming the key that is unknown, missing or wrong."""
+    """Parse a description. Raises InputError naming an unknown, missing or wrong key."""
     return _read(_content(path), path, root)
 
 
@@ -207,9 +204,9 @@ def read_table(
     beside: Collection[str] = (),
     fill: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
 ) -> T:
-    """The table [name] of a TOML file that holds none but those `beside`; `fill` gives it keys that it leaves out.
+    """Read table [name] of a TOML file with no others but `beside`; `fill` adds keys.
 
-    Raises InputError as `read_description`.
+    Raises as `read_description`.
     """
     content = _content(path)
     _check_keys(content, {name, *beside}, str(path), "")
@@ -221,15 +218,15 @@ def read_table(
 
 
 def has_table(path: Path, name: str) -> bool:
-    """Whether a TOML file has a table [name]. Raises InputError where it is not TOML."""
+    """True with table [name]. Raises InputError if not TOML."""
     return name in _content(path)
 
 
 def read_rig(path: Path, root: Path | None = None) -> list[Description]:
-    """One description per ``[[cameras]]`` of a file that has them: its keys are those of [camera], and `color`,
-    `depth` and `poses` for its files; all else is common to them. Empty where the file has none.
+    """A description per ``[[cameras]]``; empty without them.
 
-    Raises InputError as `read_description`, and where two cameras share a name or any is without.
+    Keys are [camera]'s, and `color`, `depth`, `poses` for files; the rest is common. Raises as `read_description`,
+    and for shared or missing names.
     """
     content = _content(path)
     cameras = content.pop("cameras", [])
@@ -246,7 +243,6 @@ def read_rig(path: Path, root: Path | None = None) -> list[Description]:
 
 
 def _of_camera(common: dict[str, Any], camera: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The description of one of several cameras."""
     for key in ("color", "depth", "poses"):
         if not isinstance(camera.get(key), str):
             raise _refused(f"{path}: [[cameras]]: {key} is missing")
@@ -303,7 +299,7 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
 
 
 def check_camera(camera: CameraTable, where: str) -> None:
-    """Raises InputError naming a size or focal length that no camera has."""
+    """Raise InputError naming an impossible size or focal length."""
     for name in ("width", "height", "fx", "fy"):
         value = getattr(camera, name)
         if not 1e-2 <= value < 1e5:

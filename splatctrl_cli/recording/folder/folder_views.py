@@ -1,4 +1,4 @@
-"""The views that a description of an image folder comes to: files, poses, stamps and lenses, matched by name."""
+"""The views of an image folder's description, matched by name."""
 
 import os
 import re
@@ -34,10 +34,10 @@ UNITS = {MILLIMETRE: "millimetres", 0.01: "centimetres"}  # [m] of each, the lik
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """One pair of files, and a mask where there is one; name is the text that `*` stood for.
+    """A pair of files with an optional mask; name is the text of `*`.
 
-    camera: its name, or HOLDOUT; lens: the camera that took it; depth_scale: metres per count; valid: a mask of the
-    pixels to use.
+    camera: its name, or HOLDOUT. lens: its actual camera. depth_scale: metres per count. valid: mask of usable
+    pixels.
     """
 
     name: str
@@ -52,17 +52,17 @@ class View:
     valid: Path | None = None
 
     def in_unit(self, metres: float) -> "View":
-        """The same with lengths of so many metres, of pose and depth."""
+        """Scale pose and depth to metres."""
         T = self.T_world_camera.copy()
         T[:3, 3] *= metres
         return replace(self, T_world_camera=T, depth_scale=self.depth_scale * metres)
 
 
 def length_unit(median: float, apart: float) -> float:
-    """Metres per length of a recording whose depth has this median, and whose cameras are so far apart.
+    """Metres per length of a recording with this median depth and camera distance.
 
-    1 unless depth is too large for metres and the cameras' places have the same unit: where depth alone is too large
-    its scale is wrong, and the cameras are near each other in comparison. `reconstruct` then compares the views.
+    1 unless depth is too large for metres and the cameras agree. If depth alone is, its scale is wrong: the cameras
+    are relatively close. `reconstruct` then compares the views.
     """
     if median <= PLAUSIBLE_DEPTH[1] or apart < UNIT_APART * median:
         return 1.0
@@ -72,7 +72,7 @@ def length_unit(median: float, apart: float) -> float:
 
 
 def views_of(description: Description, options: SourceOptions, loss: LossReport) -> list[View]:
-    """By stamp; what has no partner or pose is counted in `loss`. Raises InputError where nothing is left."""
+    """Views by stamp; losses are counted in `loss`. Raises InputError without any."""
     listed = _present(description, loss) if description.listed else _listed(description, options, loss)
     names = [view.name for view in listed]
     held = _holdout(description, names, options)
@@ -120,7 +120,7 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
 
 
 def _present(description: Description, loss: LossReport) -> list[ListedView]:
-    """Listed views whose files are there; others are counted as unpaired. Raises InputError for a file outside."""
+    """Keep views with files; others count as unpaired. Raises InputError for a file outside."""
     root, present, absent = description.root.absolute(), [], []
     for view in description.listed:
         files = [path for path in (view.color, view.depth, view.valid) if path is not None]
@@ -145,7 +145,7 @@ def _present(description: Description, loss: LossReport) -> list[ListedView]:
 
 
 def find_files(root: Path, pattern: str) -> list[tuple[str, Path]]:
-    """Files by the text that the pattern's `*` stands for, sorted; a pattern without `*` is one file, by no text."""
+    """Files sorted by the text of `*`; without it one file, with empty text."""
     if "*" not in pattern:
         return [("", root / pattern)] if (root / pattern).is_file() else []
     expression = re.compile(".*".join(re.escape(part) for part in pattern.split("*")).replace(".*", "(.*)", 1))
@@ -164,7 +164,6 @@ def _pose(table: PosesTable | None, view: ListedView, lens: CameraTable, options
 
 
 def _scale(description: Description, view: ListedView, options: SourceOptions) -> float:
-    """Metres per count. Raises InputError for one that no image has."""
     if options.depth_scale is not None:
         return options.depth_scale
     scale = description.depth.scale if view.depth_scale is None else view.depth_scale
@@ -177,7 +176,6 @@ def _scale(description: Description, view: ListedView, options: SourceOptions) -
 
 
 def _listed(description: Description, options: SourceOptions, loss: LossReport) -> list[ListedView]:
-    """Views by the globs of [frames]."""
     frames, camera = description.frames, description.camera
     assert frames is not None and camera is not None
     colors = dict(find_files(description.root, frames.color))
@@ -205,7 +203,7 @@ def _listed(description: Description, options: SourceOptions, loss: LossReport) 
 
 
 def _masks(description: Description, names: list[str], loss: LossReport) -> dict[str, Path]:
-    """Mask files by view name; views without one are noted in `loss`."""
+    """Masks by view name; missing ones are noted in `loss`."""
     assert description.frames is not None
     pattern = description.frames.human_mask
     if not pattern:
@@ -223,7 +221,6 @@ def _masks(description: Description, names: list[str], loss: LossReport) -> dict
 
 
 def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float64]:
-    """Matrices as written, by view name."""
     table, root = description.poses, description.root
     if table is None:
         raise InputError(
@@ -251,7 +248,7 @@ def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float
 
 
 def _holdout(description: Description, names: list[str], options: SourceOptions) -> set[str]:
-    """Names held out; an entry is a name, else a position in the sorted list of pairs."""
+    """Held-out names; an entry is a name, else a position."""
     entries = description.split.holdout if options.holdout is None else options.holdout
     held = set()
     for entry in entries:
@@ -268,7 +265,7 @@ def _holdout(description: Description, names: list[str], options: SourceOptions)
 
 
 def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
-    """From the layout, the file name, the frame number and the rate, or (no clock) one second a frame."""
+    """Stamp by layout, file name, frame rate, or one second a frame."""
     stamps = description.stamps
     if view.stamp_ns is not None:
         return view.stamp_ns

@@ -1,10 +1,10 @@
 """DTU scans in the layout of IDR and NeuS.
 
-SCAN/cameras_sphere.npz (or cameras.npz) with world_mat_I, the projection (4, 4) of world points to pixels of image I,
-and scale_mat_I, from the unit sphere around the object to the world; SCAN/image/000000.png; SCAN/mask/000.png.
-Image I is the I-th by name (Totoro97/NeuS, models/dataset.py); where images are missing, the one with that number for
-a name. World lengths are millimetres there, metres here.
-There is no depth: SCAN/depth may hold depth_map_0000.pfm (and depth_visual_0000.png) as MVSNet names them.
+SCAN/cameras_sphere.npz (or cameras.npz) has world_mat_I, the projection (4, 4) of world points to pixels of image I,
+and scale_mat_I, the object's unit sphere to the world; SCAN/image/000000.png; SCAN/mask/000.png.
+Image I is the I-th by name (Totoro97/NeuS, models/dataset.py), or by number if some are missing. World lengths are
+millimetres there, metres here. SCAN/depth may have our depth as MVSNet's depth_map_0000.pfm (and
+depth_visual_0000.png).
 """
 
 import re
@@ -35,23 +35,22 @@ PLAUSIBLE_RADIUS = (0.02, 20.0)  # [m] of the sphere around the object
 
 
 def idr_scans(root: Path) -> dict[str, Path]:
-    """The folders of scans in this layout, by name: `root` itself, or those in it."""
+    """Scan folders by name: `root`, or its children."""
     folders = [root] if is_idr(root) else sorted(p for p in root.glob("*") if is_idr(p))
     return {path.name.removeprefix("dtu_"): path for path in folders}
 
 
 def is_idr(folder: Path) -> bool:
-    """Whether a folder holds a scan in this layout."""
+    """True for a scan in this layout."""
     return any((folder / name).is_file() for name in CAMERAS)
 
 
 def read_idr(
     root: Path, scan: str | None = None, depths: Path | None = None, shrink: Shrink = lambda view: view
 ) -> DtuScan:
-    """The views of scan `scan` (default: the only one); `depths` holds their depth maps (default: SCAN/depth).
+    """Read scan `scan` (default: the only one); `depths` contains its depth maps (default: SCAN/depth).
 
-    `shrink` makes of each view the one that is kept. A view without a depth map stays, with a depth of 0 everywhere.
-    Raises InputError naming the file.
+    `shrink` maps each view. A view without a depth map has depth 0. Raises InputError naming the file.
     """
     scan, folder = chosen_scan(root, idr_scans(root), scan)
     path = next(folder / name for name in CAMERAS if (folder / name).is_file())
@@ -82,10 +81,9 @@ def read_idr(
 
 
 def write_idr(root: Path, scan: str, views: Sequence[DtuView]) -> Path:
-    """Write views as the folder of one scan, with a mask for every view that has one; returns it.
+    """Write views as one scan folder, with their masks; returns it.
 
-    The sphere around the object is about the point that the cameras' axes come nearest to, and half as far from it as
-    the nearest camera.
+    The object's sphere is centred nearest to the cameras' axes; its radius is half the nearest camera's distance.
     """
     folder = root / scan
     (folder / "image").mkdir(parents=True)
@@ -114,7 +112,6 @@ def projection(view: DtuView) -> Float64:
 
 
 def _sphere(views: Sequence[DtuView]) -> tuple[Float64, float]:
-    """Centre (3,) and radius, [mm]."""
     centers = MILLIMETRES * np.array([view.T_world_camera[:3, 3] for view in views])
     axes = np.array([view.T_world_camera[:3, 2] for view in views])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # what of a vector is no way along the axis
@@ -123,10 +120,10 @@ def _sphere(views: Sequence[DtuView]) -> tuple[Float64, float]:
 
 
 def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
-    """K (3, 3) with K[2, 2] = 1 and T_world_camera (4, 4) [m] of a projection (3, 4) of world points [mm].
+    """Split P (3, 4) of world points [mm] into K (3, 3) and T_world_camera (4, 4) [m].
 
-    P = s K [R | t] with any scale s, negative ones too; the camera stands where P is 0. Raises InputError for a P
-    that is no camera.
+    P = s K [R | t] with K[2, 2] = 1 and any scale s, even negative; the camera is where P is 0. Raises InputError if
+    P is no camera.
     """
     M = P[:, :3]
     determinant = np.linalg.det(M)
@@ -139,8 +136,9 @@ def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
 
 
 def _numbered(folder: Path, num: int) -> dict[int, Path]:
-    """The pictures in `folder` by the number of their camera, of which there are `num`: their places by name where
-    there is one for each, else the numbers that are their names. Raises InputError for a name that is no such number.
+    """Images by camera number: in order if there are `num`, else by name.
+
+    Raises InputError for another name.
     """
     paths = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
     if len(paths) == num:
@@ -159,7 +157,7 @@ def _numbered(folder: Path, num: int) -> dict[int, Path]:
 
 
 def _projections(path: Path) -> list[Float64]:
-    """World points [mm] to pixels (3, 4), of each camera in the file."""
+    """World points [mm] to pixels, (3, 4) each."""
     try:
         arrays = read_arrays(path, most=1 << 24)  # bytes of cameras: 500 each
         num = sum(1 for name in arrays if re.fullmatch(r"world_mat_\d+", name))

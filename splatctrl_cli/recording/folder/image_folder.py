@@ -1,4 +1,4 @@
-"""Folders of colour and depth images with a TOML description, of one camera or of several, as records."""
+"""Image folders with a TOML description, of one or several cameras, as records."""
 
 import heapq
 from collections.abc import Iterator
@@ -39,8 +39,9 @@ _NOT_FOR_FOLDERS = (
 
 
 class ImageFolderSource(Recording):
-    """Frames of an image folder, without joint states. Each camera has its own description; these differ in files,
-    lens and poses alone.
+    """Frames of an image folder, without joint states.
+
+    The descriptions, one per camera, differ only in files, lens and poses.
     """
 
     joint_names: tuple[str, ...] = ()
@@ -68,11 +69,11 @@ class ImageFolderSource(Recording):
 
     @property
     def has_depth(self) -> bool:
-        """Whether the views have depth; without, that of every frame is 0."""
+        """False if every depth is 0."""
         return any(view.depth is not None for view in self._views)
 
     def no_depth(self) -> InputError:
-        """What to say where depth is needed and there is none."""
+        """The error for missing depth."""
         return InputError(
             f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
             remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
@@ -80,13 +81,13 @@ class ImageFolderSource(Recording):
 
     @property
     def has_clock(self) -> bool:
-        """Whether the description says when the images were taken."""
+        """True if the description has stamps."""
         stamps = self._description.stamps
         return stamps.rate is not None or stamps.names
 
     @property
     def loss(self) -> LossReport:
-        """Unpaired and unposed images, and those that did not decode while `records` was read."""
+        """Unpaired, unposed and undecodable images."""
         loss = self._loss
         return replace(
             loss,
@@ -96,7 +97,7 @@ class ImageFolderSource(Recording):
         )
 
     def _in_metres(self) -> str:
-        """Take lengths for millimetres or centimetres where depth and the cameras' places both look so; in words."""
+        """Convert millimetres or centimetres; return a note."""
         places = [view.T_world_camera[:3, 3] for view in self._views]
         apart = float(np.linalg.norm(np.ptp(places, axis=0)))  # the diagonal of their box, in the unit of the poses
         for view in self._views if apart > UNIT_BASELINE / max(UNITS) else ():
@@ -132,7 +133,6 @@ class ImageFolderSource(Recording):
             yield stored
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Of every view."""
         return ((view.stamp_ns, view.camera, view.T_world_camera) for view in self._views)
 
     def count_views(self) -> dict[str, int]:
@@ -140,7 +140,7 @@ class ImageFolderSource(Recording):
         return {name: sum(view.camera == name for view in self._views) for name in self.cameras}
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the description, the pose files and the images, by path below the root."""
+        """sha256 of description, pose files and images, by path below the root."""
         return dict(self._digests)
 
     @cached_property
@@ -192,7 +192,7 @@ class ImageFolderSource(Recording):
         )
 
     def _depth_file(self, view: View) -> bytes | None:
-        """The PNG of a view's depth, where its counts are the depth as they are."""
+        """The PNG, if its counts are the depth."""
         table = self._description.depth
         if (
             view.depth is None
@@ -205,7 +205,6 @@ class ImageFolderSource(Recording):
         return data if is_png(data) else None
 
     def _lens(self, view: View) -> Lens:
-        """That of a view's camera, made once."""
         table = view.lens
         if table.name not in self._lenses:
             undistortion, depth_camera = _undistortion(table), self._description.depth_camera
@@ -226,7 +225,7 @@ class ImageFolderSource(Recording):
         return self._lenses[table.name]
 
     def _valid(self, view: View, lens: Lens) -> Bool | None:
-        """Pixels that the lens saw and the view's mask leaves; a mask that cannot be read leaves none."""
+        """Pixels seen and kept by the mask; none if it is unreadable."""
         seen = None if lens.undistortion is None else lens.undistortion.valid
         if view.valid is None:
             return seen
@@ -243,7 +242,7 @@ class ImageFolderSource(Recording):
         return lens.labels(human_mask(pixels, lens.intrinsics, str(path)))
 
     def _depth(self, view: View, lens: Lens) -> Float32 | None:
-        """Depth (H, W) [m] at the pixels of colour, 0 where there is none; None where its file cannot be read."""
+        """(H, W) [m] at colour's pixels, 0 = no return; None if unreadable."""
         if view.depth is None:
             return np.zeros((view.lens.height, view.lens.width), np.float32)
         depth = self._recorded_depth(view.depth, view.depth_scale)
@@ -279,7 +278,7 @@ class ImageFolderSource(Recording):
 
 
 def _is_float(encoding: str, path: ImageFile) -> bool:
-    """Whether a depth file holds floats; a .npy does, whatever the others of its folder are (nerfstudio)."""
+    """True for floats, which every .npy has (nerfstudio)."""
     return encoding == "float32" or path.suffix == ".npy"
 
 
@@ -311,7 +310,6 @@ def _check_size(path: ImageFile, pixels: NDArray[Any], camera: CameraTable) -> N
 
 
 def open_image_folder(path: Path, options: SourceOptions) -> ImageFolderSource:
-    """The records that a TOML description names."""
     rig = {part.camera.name: part for part in read_rig(path, options.root) if part.camera is not None}
     if not rig:
         options.refuse(("intrinsics",), "a folder whose description has [camera]", path)

@@ -1,4 +1,4 @@
-"""What the readers of dataset layouts share: lenses by name, sizes of images, numbers in names, a description."""
+"""Shared parts of dataset layouts: lenses, image sizes, numbers, descriptions."""
 
 import json
 import re
@@ -35,11 +35,10 @@ _IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"})
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """A layout, in the ``ENTRIES`` of its module: its name, whether a folder has it, and the folder as a description.
+    """A dataset layout, in its module's ``ENTRIES``.
 
-    Of layouts that a folder has, that of the lowest `order` counts; a file that ends in `suffix` has it by itself.
-    `docs` are its rows in docs/input.md, cells between bars, an empty line between rows: layout, what it is known by,
-    poses, depth, intrinsics.
+    The lowest matching `order` wins; a file with `suffix` is one by itself. `docs`: rows in docs/input.md, cells
+    between bars, an empty line between rows: layout, marks, poses, depth, intrinsics.
     """
 
     name: str
@@ -51,7 +50,7 @@ class Layout:
 
 
 def marked(*alternatives: str) -> Callable[[Path], bool]:
-    """Return a test of a folder: it has every name of one alternative (a name that ends in / is a folder)."""
+    """A folder test: every name of one alternative; a trailing / means a folder."""
 
     def has(folder: Path, mark: str) -> bool:
         return any(path.is_dir() if mark.endswith("/") else path.is_file() for path in folder.glob(mark))
@@ -60,7 +59,7 @@ def marked(*alternatives: str) -> Callable[[Path], bool]:
 
 
 def by_description(name: str, *examples: str) -> Callable[[Path, SourceOptions], Description]:
-    """Return a reader that refuses a folder: a person has to describe it, beginning with one of the examples."""
+    """A reader that asks for a description, like one of the examples."""
 
     def refuse(folder: Path, _: SourceOptions) -> Description:
         raise InputError(
@@ -73,7 +72,7 @@ def by_description(name: str, *examples: str) -> Callable[[Path, SourceOptions],
 
 
 class Lenses:
-    """The different lenses of a layout's views, as cameras ``camera``, ``camera-1``, ``camera-2``, ..."""
+    """A layout's different lenses, as cameras ``camera``, ``camera-1``, ``camera-2``, ..."""
 
     def __init__(self) -> None:
         self._tables: list[CameraTable] = []
@@ -82,7 +81,7 @@ class Lenses:
         return len(self._tables)
 
     def named(self, table: CameraTable, where: str) -> CameraTable:
-        """The camera of a lens; a new one where no view before had it. Raises InputError as `check_camera`."""
+        """A lens's camera, new or known. Raises as `check_camera`."""
         for known in self._tables:
             if asdict(replace(known, name=table.name)) == asdict(table):
                 return known
@@ -94,9 +93,9 @@ class Lenses:
 
 @dataclass(frozen=True, kw_only=True)
 class Pairs:
-    """The views of a layout whose description is at `path`, and how many colour and depth files have no partner.
+    """A layout's views, described at `path`, and numbers of unpaired colour and depth files.
 
-    Raises InputError where there is no view.
+    Raises InputError without a view.
     """
 
     path: Path
@@ -108,7 +107,7 @@ class Pairs:
             raise InputError(f"{self.path}: no colour image has a depth image", remedy=_WHOLE)
 
     def moved(self, change: Callable[[Float64], Float64]) -> "Pairs":
-        """With `change` of the pose of each view that has one."""
+        """Apply `change` to each known pose."""
         views = [v if v.matrix is None else replace(v, matrix=change(v.matrix)) for v in self.views]
         return replace(self, views=views)
 
@@ -120,7 +119,7 @@ def paired_by_name(
     pose: Callable[[Key], Float64 | None],
     name: Callable[[Key], str] = str,
 ) -> Pairs:
-    """Files that have one key, with the pose and the name of it."""
+    """Pair equal keys, named and posed by key."""
     views = [
         ListedView(name=name(key), color=color, depth=depths[key], matrix=pose(key))
         for key, color in colors.items()
@@ -136,7 +135,7 @@ def paired_by_stamp(
     pose_at: Callable[[int], Float64 | None],
     options: SourceOptions,
 ) -> Pairs:
-    """Stamps [ns] and files that lie within the pairing tolerance, posed at the colour's stamp."""
+    """Pair stamps [ns] within the tolerance, posed at the colour's."""
     tolerance_ns = round(options.pairing_tolerance_s * 1e9)
     pairs = paired([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns).tolist()
     views = [
@@ -167,8 +166,9 @@ def described(
     supply: str = Description.supply,
     notes: tuple[str, ...] = (),
 ) -> Description:
-    """The description of paired views, all of the lens that --intrinsics gives, else of `lens` (of the first image);
-    without `lens` of one each. Raises InputError where a camera is impossible.
+    """Describe paired views with the lens of --intrinsics, else `lens` of the first image.
+
+    Without `lens` each view has one. Raises InputError if impossible.
     """
     first = pairs.views[0]
     camera = first.camera if lens is None else given_lens(options, first.color) or lens(first.color)
@@ -193,20 +193,20 @@ def described(
 
 
 def given_lens(options: SourceOptions, image: ImageFile) -> CameraTable | None:
-    """The lens that --intrinsics gives for camera ``camera``, of the size of `image`; None where it gives none."""
+    """--intrinsics for ``camera``, in the size of `image`, or None."""
     values = options.intrinsics.get(CAMERA)
     return None if values is None else pinhole(values[:4], image, values[4:])
 
 
 def pinhole(values: Sequence[float], image: ImageFile, distortion: Sequence[float] = ()) -> CameraTable:
-    """A lens of fx, fy, cx, cy [px] and the size of an image file."""
+    """fx, fy, cx, cy [px] and an image's size."""
     width, height = image_size(image)
     fx, fy, cx, cy = values
     return CameraTable(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=list(distortion))
 
 
 def read_K(path: Path) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy of a text file with a 3x3 matrix."""
+    """fx, fy, cx, cy of a text file's 3x3 matrix."""
     values = read_numbers(path)
     if len(values) != 9:
         raise InputError(
@@ -217,14 +217,14 @@ def read_K(path: Path) -> tuple[float, float, float, float]:
 
 
 def own_depth_camera(color: CameraTable, depth: CameraTable, T_color_depth: Float64) -> CameraTable | None:
-    """The depth camera with its place in the colour camera; None where it is the colour camera."""
+    """The depth camera posed in the colour camera; None if one."""
     if depth == color and np.abs(T_color_depth - np.eye(4)).max() <= 1e-6:
         return None
     return replace(depth, depth_to_color=T_color_depth.tolist())
 
 
 def image_size(path: ImageFile) -> tuple[int, int]:
-    """Columns and rows of an image file. Raises InputError where it is none."""
+    """Columns and rows. Raises InputError if it is no image."""
     if isinstance(path, ImagePart):
         return path.size
     try:
@@ -240,28 +240,28 @@ def image_size(path: ImageFile) -> tuple[int, int]:
 
 
 def images_of(folder: Path) -> dict[str, Path]:
-    """Image files by stem, in the order of the numbers in their names."""
+    """Images by stem, sorted by numbers."""
     files = [p for p in folder.iterdir() if p.suffix.lower() in _IMAGES]
     return {path.stem: path for path in sorted(files, key=lambda p: by_numbers(p.stem))}
 
 
 def by_numbers(name: str) -> tuple[list[int], str]:
-    """Key that sorts names by the numbers in them (2 before 10)."""
+    """A key that sorts 2 before 10."""
     return [int(number) for number in re.findall(r"\d+", name)], name
 
 
 def pose_or_none(matrix: Float64) -> Float64 | None:
-    """A pose file's matrix, None where it is not finite: how trackers write that they were lost."""
+    """The matrix, None if not finite: how trackers write a loss."""
     return matrix if np.isfinite(matrix).all() else None
 
 
 def read_pose(path: Path) -> Float64 | None:
-    """The matrix (4, 4) of a pose file, None where there is no file or tracking was lost."""
+    """A pose (4, 4); None without a file or tracking."""
     return pose_or_none(read_matrix_file(path)) if path.is_file() else None
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file. Raises InputError where it is none."""
+    """Read JSON. Raises InputError if unreadable."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:

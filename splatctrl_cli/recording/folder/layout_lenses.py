@@ -1,25 +1,19 @@
-"""Layouts in which each image has its lens: ARKitScenes, BOP scenes, and scenes in MVSNet's text form.
+"""Layouts with a lens per image: ARKitScenes, BOP scenes, and MVSNet scenes.
 
-ARKitScenes: ``lowres_wide/``, ``lowres_depth/``, ``lowres_wide_intrinsics/`` and ``lowres_wide.traj``.
+ARKitScenes: ``lowres_wide/``, ``lowres_depth/``, ``lowres_wide_intrinsics/``, ``lowres_wide.traj``. Images are named
+by video and seconds; depth in millimetres; an image's ``.pincam`` has width, height, fx, fy, cx, cy. Trajectory lines
+are seconds, rotation vector, translation [m], world to camera, interpolated like tf (apple/ARKitScenes, DATA.md, and
+threedod/benchmark_scripts/utils/tenFpsDataLoader.py).
 
-Images are named by video and seconds; depth in millimetres; a ``.pincam`` for each image holds width, height, fx, fy,
-cx, cy; a line of the trajectory is seconds, a rotation vector and a translation [m], world to camera
-(apple/ARKitScenes, DATA.md, and threedod/benchmark_scripts/utils/tenFpsDataLoader.py). Poses are interpolated as
-those of tf.
+BOP: ``scene_camera.json``, ``rgb/`` (or ``gray/``), ``depth/``. Per image: cam_K by rows [px], depth_scale counts to
+millimetres, cam_R_w2c by rows, cam_t_w2c in millimetres (thodan/bop_toolkit, docs/bop_datasets_format.md). PNG, JPEG
+or TIFF. Several sensors: ``scene_camera_cam1.json``, ``rgb_cam1/``, ``depth_cam1/``.
 
-BOP: one scene folder with ``scene_camera.json``, ``rgb/`` (or ``gray/``) and ``depth/``.
-
-Lens, depth unit and pose of each image are its own: cam_K by rows [px], depth_scale counts to millimetres, cam_R_w2c
-by rows and cam_t_w2c in millimetres (thodan/bop_toolkit, docs/bop_datasets_format.md). Images are PNG, JPEG or TIFF.
-Scenes of several sensors name them behind an underscore: ``scene_camera_cam1.json``, ``rgb_cam1/``, ``depth_cam1/``.
-
-A scene in MVSNet's text form: ``cams/NUMBER_cam.txt``, ``pair.txt``, images, and depth (.pfm) where there is any.
-
-By MVSNet's README ("File Formats") a camera file is the world-to-camera matrix, K, and ``DEPTH_MIN DEPTH_INTERVAL
-[DEPTH_NUM [DEPTH_MAX]]``; others end in ``DEPTH_MIN DEPTH_MAX``. Images lie in ``images/`` (DTU's test set, Tanks and
-Temples, ETH3D, colmap2mvsnet.py), in ``blended_images/`` (BlendedMVS) or beside ``cams/``; depth, in the cameras'
-length, in ``rendered_depth_maps/`` (BlendedMVS) or any folder with ``depth`` in its name. No file says what that
-length is.
+MVSNet: ``cams/NUMBER_cam.txt``, ``pair.txt``, images, optional depth (.pfm). A camera file is the world-to-camera
+matrix, K, and ``DEPTH_MIN DEPTH_INTERVAL [DEPTH_NUM [DEPTH_MAX]]`` (README, "File Formats") or ``DEPTH_MIN
+DEPTH_MAX``. Images: ``images/`` (DTU's test set, Tanks and Temples, ETH3D, colmap2mvsnet.py), ``blended_images/``
+(BlendedMVS) or next to ``cams/``. Depth, in the cameras' unknown unit: ``rendered_depth_maps/`` (BlendedMVS) or any
+folder with ``depth`` in its name.
 """
 
 import re
@@ -62,7 +56,7 @@ TRAJECTORY = "lowres_wide.traj"
 
 
 def read_arkit(folder: Path, options: SourceOptions) -> Description:
-    """The folder as a description; lenses that differ become cameras of their own."""
+    """Describe the folder; different lenses become separate cameras."""
     options.refuse(("intrinsics",), "a video of ARKitScenes", folder)
     root = _frames(folder)
     assert root is not None
@@ -98,12 +92,11 @@ def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
 
 
 def _stamp_ns(path: Path) -> int | None:
-    """Of ``41069021_305.367.png``."""
+    """Stamp of ``41069021_305.367.png``."""
     return stamp_of_text(path.stem.rpartition("_")[2])
 
 
 def _poses(path: Path) -> dict[str, Float64]:
-    """T_world_camera by stamp [s] as written."""
     poses = {}
     for where, words, values in read_rows(path):
         if len(values) != 7 or not np.isfinite(values).all():
@@ -145,7 +138,7 @@ COLOR_FOLDERS = ("rgb", "gray")
 
 
 def read_bop(folder: Path, options: SourceOptions) -> Description:
-    """The scene as a description; a scene without cam_R_w2c has no poses."""
+    """Describe the scene, without poses if cam_R_w2c is missing."""
     options.refuse(("intrinsics",), "a BOP scene", folder)
     views: list[ListedView] = []
     num_colors = num_depths = 0
@@ -171,14 +164,13 @@ def read_bop(folder: Path, options: SourceOptions) -> Description:
 
 
 def _sensors(folder: Path) -> list[str]:
-    """What stands behind the names of each sensor's files: nothing for an only one, else ``_cam1``."""
+    """File suffixes, such as ``_cam1``; one sensor's is empty."""
     stem = Path(FILE).stem
     found = sorted(path.stem.removeprefix(stem) for path in folder.glob(f"{stem}*.json"))
     return [sensor for sensor in found if (folder / f"depth{sensor}").is_dir()]
 
 
 def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, Path]) -> list[ListedView]:
-    """Those of one sensor."""
     content = read_json(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected an object by image number, got {type(content).__name__}", remedy=_REMEDY)
@@ -208,7 +200,6 @@ def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, P
 
 
 def _pose(entry: dict[str, Any]) -> Float64 | None:
-    """World to camera [m], None where the scene does not say."""
     if "cam_R_w2c" not in entry or "cam_t_w2c" not in entry:
         return None
     return pose_at(
@@ -229,7 +220,7 @@ _ESTIMATED = ("est", "mvsnet")  # in the names of folders with a network's depth
 
 
 def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
-    """The folder as a description, a lens for each K; --depth-scale is metres per length of cameras and depth."""
+    """Describe the folder, a lens per K; --depth-scale is metres per length of cameras and depth."""
     options.refuse(("intrinsics",), "an MVSNet scene", folder)
     files = {path.name.removesuffix("_cam.txt"): path for path in sorted(folder.glob(_CAMERAS))}
     cameras = {stem: read_camera_file(path) for stem, path in files.items()}
@@ -268,7 +259,6 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
 
 
 def _images(folder: Path, stems: set[str]) -> dict[str, Path]:
-    """The image of each camera, from the folder with most of them."""
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and "depth" not in path.name.lower()]
     found = [{stem: path for stem, path in images_of(place).items() if stem in stems} for place in (*inner, folder)]
     most = max(found, key=len)
@@ -280,7 +270,6 @@ def _images(folder: Path, stems: set[str]) -> dict[str, Path]:
 
 
 def _depths(folder: Path) -> tuple[dict[int, Path], list[str]]:
-    """Depth by number, and a note where folders with others are left out."""
     found = {
         path.name: dict(_maps(path)) for path in folder.iterdir() if path.is_dir() and "depth" in path.name.lower()
     }

@@ -1,10 +1,9 @@
-"""nerfstudio's and instant-ngp's ``transforms.json`` with depth: lens, files and pose of each frame, or one lens.
+"""nerfstudio's and instant-ngp's ``transforms.json`` with depth: lens, files and pose per frame.
 
-Fields, defaults and axes (OpenGL) are those of nerfstudio's documentation ("Data conventions") and of its
-nerfstudio/data/dataparsers/nerfstudio_dataparser.py and data/utils/data_utils.py: masks are 0 where a pixel is not to
-be used, depth of another size is brought to that of the images by nearest pixels, and poses that were scaled
-(``applied_scale``) are scaled back, so that they fit metric depth. instant-ngp says ``depth_path``,
-``integer_depth_scale`` [m per count], ``camera_angle_x``, ``is_fisheye``, and leaves the centre out where it is the
+Fields, defaults and axes (OpenGL): nerfstudio's documentation ("Data conventions"),
+nerfstudio/data/dataparsers/nerfstudio_dataparser.py and data/utils/data_utils.py. Masks are 0 on invalid pixels;
+depth of another size takes nearest pixels; ``applied_scale`` is undone to fit metric depth. instant-ngp has
+``depth_path``, ``integer_depth_scale`` [m per count], ``camera_angle_x``, ``is_fisheye``; its default centre is the
 image's (NVlabs/instant-ngp, scripts/nerfcapture2nerf.py, and src/nerf_loader.cu).
 """
 
@@ -35,7 +34,7 @@ _SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
 
 
 def read(folder: Path, options: SourceOptions) -> Description:
-    """The folder as a description; depth is in millimetres unless the file or --depth-scale says otherwise."""
+    """Describe the folder; depth defaults to millimetres."""
     options.refuse(("intrinsics",), "a folder with transforms.json", folder)
     file = next(name for name in FILES if (folder / name).is_file())
     poses = PosesTable(format="nerfstudio", file=file, axes="opengl")
@@ -43,7 +42,7 @@ def read(folder: Path, options: SourceOptions) -> Description:
 
 
 def with_transforms(description: Description) -> Description:
-    """With the camera and the views of a transforms.json where the description leaves them to it."""
+    """Fill missing camera and views from transforms.json."""
     table = description.poses
     is_whole = bool(description.listed or (description.camera and description.frames))
     if is_whole or table is None or table.format != "nerfstudio":
@@ -83,7 +82,6 @@ def _view(
     description: Description,
     matrices: dict[str, Float64],
 ) -> ListedView:
-    """A frame; its own values stand before those of the file."""
     name, said = str(entry["file_path"]), {**content, **entry}
     color = _image(path.parent / _with_slashes(name))
     depth, scale = _only(entry, _DEPTHS, path), _only(said, _SCALES, path)
@@ -107,7 +105,7 @@ def _view(
 
 
 def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
-    """The value under one of the keys, None without any. Raises InputError where two of them differ."""
+    """The value of any key, or None. Raises InputError if two differ."""
     found = {key: said[key] for key in keys if said.get(key) not in (None, "")}
     if len(set(found.values())) > 1:
         both = " and ".join(f"{key} = {value}" for key, value in found.items())
@@ -116,19 +114,17 @@ def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
 
 
 def _with_slashes(name: str) -> str:
-    """The path with slashes, where Windows wrote backslashes."""
     return name.replace("\\", "/")
 
 
 def _image(path: Path) -> Path:
-    """An image by a name that may leave `.png` or `.jpg` out, as Blender's scenes do."""
+    """An image whose name may omit `.png` or `.jpg`, as in Blender's scenes."""
     if path.suffix:
         return path
     return next((file for end in (".png", ".jpg") if (file := path.with_name(path.name + end)).is_file()), path)
 
 
 def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
-    """The lens of a frame."""
     model = str(said.get("camera_model") or ("OPENCV_FISHEYE" if said.get("is_fisheye") else "OPENCV"))
     if model not in _MODELS:
         raise InputError(

@@ -1,9 +1,8 @@
-"""Organised point clouds of PCL: a ``.pcd`` with a point for each pixel of the camera, or a folder of them.
+"""Organised PCL point clouds: a ``.pcd`` with a point per pixel, or a folder.
 
-The format is that of PCL's tutorial "The PCD file format" (v0.7; ascii, binary, binary_compressed), read by pypcd4
-(extra `pcd`). The file says no intrinsics, but its grid does: the point of column u and row v lies on the ray of that
-pixel. VIEWPOINT is the camera's pose; the points are in the camera's frame (z forward), or in the world, whichever
-the grid fits.
+Format: PCL's tutorial "The PCD file format" (v0.7; ascii, binary, binary_compressed), read by pypcd4 (extra `pcd`).
+Intrinsics follow from the grid: column u, row v is on that pixel's ray. VIEWPOINT is the camera's pose; points are in
+the camera (z forward) or world, whichever fits.
 """
 
 import struct
@@ -44,19 +43,22 @@ _AGAIN = "copy the file again"
 
 @dataclass(frozen=True, kw_only=True)
 class Cloud:
-    """A cloud as written: points (H, W, 3) float64, NaN where there is none, color (H, W, 3) uint8 RGB, VIEWPOINT."""
+    """A cloud as written: points (H, W, 3) float64, color (H, W, 3) uint8 RGB, VIEWPOINT.
+
+    A missing point is NaN.
+    """
 
     points: Float64
     color: UInt8
     T_world_camera: Float64
 
     def in_camera(self, *, is_world: bool) -> Float64:
-        """Points (H, W, 3) in the camera's frame, of a file that has them there, or in the world."""
+        """Points (H, W, 3) in the camera; is_world: the file's are in world."""
         return transform_points(invert_transform(self.T_world_camera), self.points) if is_world else self.points
 
 
 def read_cloud(path: Path) -> Cloud:
-    """An organised cloud with colour. Raises InputError for any other file."""
+    """Read an organised coloured cloud. Raises InputError for another."""
     said = _head(path)
     size = (said.height, said.width)
     try:
@@ -73,8 +75,9 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def pinhole_of(points: Float64) -> Intrinsics | None:
-    """The pinhole camera whose pixel (u, v) the point (H, W, 3) of row v and column u lies in, by least squares over
-    u and v; None where there are too few points before it, or none fits.
+    """Fit a pinhole whose pixel (u, v) sees the point (H, W, 3) of row v, column u.
+
+    Least squares over u and v; None with too few points in front, or a bad fit.
     """
     valid = _is_seen(points)
     v, u = np.nonzero(valid)
@@ -89,7 +92,7 @@ def pinhole_of(points: Float64) -> Intrinsics | None:
 
 
 def residual(points: Float64, camera: Intrinsics | None) -> float:
-    """How far [px] the points (H, W, 3) lie from their pixels: 95 % of them at most so far; inf without a camera."""
+    """95th percentile [px] of points (H, W, 3) from their pixels; inf without a camera."""
     valid = _is_seen(points)
     if camera is None or not valid.any():
         return float("inf")
@@ -98,7 +101,7 @@ def residual(points: Float64, camera: Intrinsics | None) -> float:
 
 
 def read(path: Path, options: SourceOptions) -> Description:
-    """A cloud, or those of a folder, as a description; --depth-scale is metres per length of points and VIEWPOINT."""
+    """Describe clouds; --depth-scale is metres per length of points and VIEWPOINT."""
     files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"), key=lambda p: by_numbers(p.stem))
     heads, unit = [_head(file) for file in files], options.depth_scale or 1.0
     k, is_world, notes = _fitted(files[0], options)
@@ -141,7 +144,6 @@ def read(path: Path, options: SourceOptions) -> Description:
 
 
 def _fitted(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[str]]:
-    """The camera that a cloud's grid is of, or that --intrinsics gives, whether points are in the world; notes."""
     cloud, given = read_cloud(path), options.intrinsics.get(CAMERA)
     fits = []
     for is_world in (False, True):
@@ -173,7 +175,7 @@ def _library() -> Any:
 
 
 def _head(path: Path) -> Any:
-    """What a cloud says before its points. Raises InputError for one that is not organised or without colour."""
+    """Read a header. Raises InputError if not organised or without colour."""
     lines: list[str] = []
     try:
         with path.open("rb") as stream:
@@ -208,7 +210,7 @@ def _unreadable(path: Path, error: Exception) -> InputError:
 
 
 def _viewpoint(said: Any) -> Float64:
-    """T_world_camera (4, 4) of VIEWPOINT: x, y, z, then qw, qx, qy, qz."""
+    """T_world_camera (4, 4) of x, y, z, qw, qx, qy, qz."""
     x, y, z, qw, qx, qy, qz = said.viewpoint
     return transform_from((x, y, z), (qx, qy, qz, qw))
 
@@ -218,7 +220,6 @@ def _is_seen(points: Float64) -> Bool:
 
 
 def _color_file(path: Path) -> bytes:
-    """The colour of a cloud as a PNG, nothing where it does not read."""
     try:
         color = read_cloud(path).color
     except InputError:
@@ -227,8 +228,9 @@ def _color_file(path: Path) -> bytes:
 
 
 def _depth_file(path: Path, camera: Intrinsics, first: Path, *, is_world: bool) -> bytes:
-    """The depth of a cloud in its own length, 0 for none, as .npy. Raises InputError for another camera than that of
-    the first cloud.
+    """Depth in the cloud's length, 0 for none, as .npy, empty if unreadable.
+
+    Raises InputError if the camera is not the first cloud's.
     """
     try:
         points = read_cloud(path).in_camera(is_world=is_world)

@@ -1,10 +1,10 @@
-"""ScanNet's sensor files: ``X.sens`` of version 4, by itself or in its folder.
+"""ScanNet's sensor files: ``X.sens`` of version 4, alone or in its folder.
 
-As ScanNet's SensReader reads it (python/SensorData.py, c++/src/sensorData.h), little-endian: version (uint32), name
-(uint64 and text), four 4x4 float32 matrices (intrinsics and extrinsics of colour, then of depth), two int32 of how
-colour and depth are stored, their sizes (four uint32), counts per metre (float32), number of frames (uint64). A
-frame: camera to world (16 float32, -inf where tracking was lost), stamps of colour and depth [us] and lengths of both
-images (four uint64), the images. What follows the frames (IMU) is passed over.
+Layout of ScanNet's SensReader (python/SensorData.py, c++/src/sensorData.h), little-endian: version (uint32), name
+(uint64 and text), four 4x4 float32 matrices (intrinsics and extrinsics of colour, then depth). Storage of colour and
+depth (two int32), their sizes (four uint32), counts per metre (float32), number of frames (uint64). A frame: camera
+to world (16 float32, -inf if lost), stamps of colour and depth [us] and lengths of both images (four uint64), the
+images. IMU data follows, and is skipped.
 """
 
 import struct
@@ -55,8 +55,9 @@ _AGAIN = "copy the file again"
 
 @dataclass(frozen=True, kw_only=True)
 class _Sens:
-    """The head of a file: lenses of both cameras (4, 4) [px], their poses in the rig's base,
-    metres per count of depth, how images are stored, where the frames begin, and how many there are.
+    """The head: lenses of both cameras (4, 4) [px], and poses in the rig's base.
+
+    depth_scale: metres per count. is_packed: depth is zlib. first: the frames' offset.
     """
 
     color: Float64
@@ -73,7 +74,7 @@ class _Sens:
 
 
 def read_sens(path: Path, options: SourceOptions) -> Description:
-    """The file, or the only one of a folder, as a description; depth is registered to colour."""
+    """Describe the file, or a folder's only one; depth is registered to colour."""
     files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"))
     if len(files) > 1:
         raise InputError(f"{path}: {len(files)} files *{SUFFIX}", remedy=f"give one of them, such as {files[0]}")
@@ -156,7 +157,6 @@ def _head(path: Path) -> _Sens:
 
 
 def _frames(path: Path, sens: _Sens) -> Iterator[ListedView]:
-    """The frames up to the end of the file."""
     end = path.stat().st_size
     with path.open("rb") as stream:
         stream.seek(sens.first)
@@ -194,7 +194,6 @@ def _part(path: Path, first: int, length: int) -> bytes:
 
 
 def _png(read: Callable[[], bytes], sens: _Sens) -> bytes:
-    """Words of depth as a PNG; nothing where there are fewer, or more."""
     data, (width, height) = read(), sens.depth_size
     num = 2 * width * height
     if sens.is_packed:

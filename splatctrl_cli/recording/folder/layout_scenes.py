@@ -1,27 +1,21 @@
-"""Scenes of rooms with one trajectory or a pose a frame: 7-Scenes and its kin, Open3D and Redwood, Replica.
+"""Room scenes with a trajectory or a pose per frame: 7-Scenes, Open3D, Redwood, Replica.
 
 7-Scenes and its kin: ``frame-NNNNNN.color.*``, ``.depth.*``, ``.pose.txt``, in one folder, ``seq-NN/``, ``data/``.
+Depth in millimetres, 65535 for none; poses camera to world. Three calibrations:
 
-Depth in millimetres with 65535 for none, poses camera to world. Three calibrations:
-
-- an ``info.txt`` of ScanNet's SensReader (12-Scenes, BundleFusion, 3RScan), from which a person describes the folder;
+- ``info.txt`` of ScanNet's SensReader (12-Scenes, BundleFusion, 3RScan): the user describes the folder;
 - ``camera-intrinsics.txt``, one 3x3 matrix for both (3DMatch, Zeng et al., CVPR 2017);
-- none: 7-Scenes, which publishes the depth camera's default of 585, 585, 320, 240, whose poses are those of the depth
-  camera, and whose colour is not registered to depth (Shotton et al., CVPR 2013, and the dataset's page). Colour is
-  taken to be a Kinect's of focal length 525, placed as another Kinect's calibration says: as ACE does
-  (nianticlabs/ace, datasets/setup_7scenes.py, after LIRIS' Kinect calibration).
+- none: 7-Scenes publishes the depth camera's 585, 585, 320, 240 and poses; colour is not registered (Shotton et al.,
+  CVPR 2013, and the dataset's page). Colour is a Kinect's of focal length 525, placed by another Kinect's
+  calibration, as in ACE (nianticlabs/ace, datasets/setup_7scenes.py, after LIRIS' Kinect calibration).
 
-Open3D's and Redwood's scenes: a colour folder, ``depth/``, ``trajectory.log`` and ``camera_intrinsic.json``.
+Open3D and Redwood: a colour folder, ``depth/``, ``trajectory.log``, ``camera_intrinsic.json``, named as in
+open3d.data (RedwoodIndoorLivingRoom1 with ``colors/``, LoungeRGBDImages, BedroomRGBDImages). Poses are camera to
+world: Open3D integrates with their inverse (examples/python/reconstruction_system/integrate_scene.py). Images match
+poses in natural order (open3d_example.py there, get_rgbd_file_lists), or by number if there are more poses.
 
-Names are those that Open3D's data classes unpack (open3d.data: RedwoodIndoorLivingRoom1 with ``colors/``,
-LoungeRGBDImages, BedroomRGBDImages). Poses are camera to world: the reconstruction system writes those whose inverse
-it integrates with (examples/python/reconstruction_system/integrate_scene.py). Images go by their place in natural
-order, as in Open3D's reconstruction system
-(examples/python/reconstruction_system/open3d_example.py, get_rgbd_file_lists); where the trajectory has more poses
-than there are images, by the number in the file name.
-
-Replica as rendered for NICE-SLAM and for Semantic-NeRF, ICL-NUIM in its TUM-compatible form, and ScanNet as its
-SensReader exports it are known, and described by hand (docs/input.md).
+Described by hand (docs/input.md): Replica of NICE-SLAM and Semantic-NeRF, ICL-NUIM in TUM's form, ScanNet of
+SensReader.
 """
 
 import re
@@ -78,7 +72,7 @@ _NOTE = (
 
 
 def read_frames(folder: Path, options: SourceOptions) -> Description:
-    """The folder, or all its sequences, as a description."""
+    """Describe the folder, or all its sequences."""
     sequence = next(s for s in _SEQUENCES if next(folder.glob(f"{s}frame-*.pose.txt"), None) is not None)
     colors = _files(folder, f"{sequence}frame-*.color.*", ".color")
     depths = _files(folder, f"{sequence}frame-*.depth.*", ".depth")
@@ -107,7 +101,6 @@ def read_frames(folder: Path, options: SourceOptions) -> Description:
 
 
 def _files(folder: Path, pattern: str, kind: str) -> dict[str, Path]:
-    """Files by their path up to `kind`, in the order of their numbers."""
     paths = sorted(folder.glob(pattern), key=lambda p: by_numbers(p.relative_to(folder).as_posix()))
     return {path.relative_to(folder).as_posix().partition(kind)[0]: path for path in paths}
 
@@ -139,7 +132,7 @@ INTRINSICS = ("camera_intrinsic.json", "camera_intrinsics.json", "intrinsic.json
 
 
 def read_redwood(folder: Path, options: SourceOptions) -> Description:
-    """The folder as a description; depth in millimetres."""
+    """Describe the folder; depth in millimetres."""
     trajectory = next(path for pattern in TRAJECTORIES for path in sorted(folder.glob(pattern)))
     colors = images_of(next(folder / name for name in COLOR_FOLDERS if (folder / name).is_dir()))
     depths = images_of(folder / "depth")
@@ -165,7 +158,7 @@ def read_redwood(folder: Path, options: SourceOptions) -> Description:
 
 
 def _pairs(colors: list[str], depths: list[str]) -> list[tuple[str, str]]:
-    """Of the same name; else, of as many, in order; else of the same first number."""
+    """Pair equal names; else all in order; else equal first numbers."""
     same = [(name, name) for name in colors if name in depths]
     if same:
         return same

@@ -1,21 +1,18 @@
-"""Layouts that pair images by their stamps: TUM RGB-D and what is published in its form, SUN3D.
+"""Layouts with images paired by stamp: TUM RGB-D and its kin, and SUN3D.
 
-TUM RGB-D and what others publish in its form: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``, all by stamps.
+TUM RGB-D: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``. Depth counts 1/5000 m. Files, factor and cameras: the
+dataset's page (Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012; "File Formats" and
+"Intrinsic Camera Calibration"; the same in raulmur/ORB_SLAM2, Examples/RGB-D/TUM1.yaml to TUM3.yaml). Poses are the
+colour camera's. Depth is registered to raw colour, so both are undistorted alike.
 
-Depth counts 1/5000 m. Files, factor and cameras are those of the dataset's page (Sturm et al., A benchmark for the
-evaluation of RGB-D SLAM systems, IROS 2012; "File Formats" and "Intrinsic Camera Calibration"; the same in
-raulmur/ORB_SLAM2, Examples/RGB-D/TUM1.yaml to TUM3.yaml). Poses are those of the colour camera. Depth is registered
-to the colour image as it was taken, so both are undistorted alike.
+Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): its page gives the lens, and T_camera = T_ros^-1 T_groundtruth T_ros
+T_m from groundtruth.txt's marker frame. T_m's rotation has a scale of 1.059, which is dropped. ETH3D SLAM (Schöps et
+al., CVPR 2019): ``calibration.txt`` with fx, fy, cx, cy.
 
-Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): its page gives the lens, and the camera in the frame of the markers
-that groundtruth.txt follows, T_camera = T_ros^-1 T_groundtruth T_ros T_m. The rotation of T_m has a scale of 1.059
-there, which is left out. ETH3D SLAM (Schöps et al., CVPR 2019): ``calibration.txt`` with fx, fy, cx, cy.
-
-SUN3D: ``image/NUMBER-MICROSECONDS.jpg``, ``depth/NUMBER-MICROSECONDS.png``, ``intrinsics.txt``, ``extrinsics/``.
-
-As the dataset's own reader takes them (SUN3DreaderWithAnnotation, readSUN3Dannotation.m): depth with its bits rotated
-left by three, in millimetres, registered to colour; the depth nearest in time belongs to an image; the last file of
-``extrinsics/`` holds a 3x4 matrix for each image in order, camera to world; the first pixel's centre is at 1.
+SUN3D: ``image/NUMBER-MICROSECONDS.jpg``, ``depth/NUMBER-MICROSECONDS.png``, ``intrinsics.txt``, ``extrinsics/``, as
+in its reader (SUN3DreaderWithAnnotation, readSUN3Dannotation.m). Depth has bits rotated left by three, in
+millimetres, registered to colour, nearest in time. The last file of ``extrinsics/`` has a 3x4 matrix per image in
+order, camera to world; the first pixel's centre is at 1.
 """
 
 import re
@@ -51,7 +48,7 @@ SCALE = 1.0 / 5000.0  # [m] per count
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """A series of recordings: the pattern of its names, fx, fy, cx, cy and k1, k2, p1, p2, k3."""
+    """A series: name pattern, fx, fy, cx, cy and k1, k2, p1, p2, k3."""
 
     pattern: str
     lens: tuple[float, float, float, float]
@@ -104,7 +101,7 @@ _BONN_NOTE = (
 
 
 def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
-    """The folder as a description: pairs within the pairing tolerance, poses interpolated."""
+    """Describe pairs within the tolerance, with interpolated poses."""
     colors, depths = listed(folder / "rgb.txt"), listed(folder / "depth.txt")
     series = _series(folder)
     file = folder / "groundtruth.txt"
@@ -125,7 +122,7 @@ def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
 
 
 def listed(path: Path) -> list[tuple[int, Path]]:
-    """Stamp [ns] and file of each line ``stamp path``."""
+    """Stamp [ns] and file of lines ``stamp path``."""
     found = []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         words = line.split()
@@ -138,7 +135,7 @@ def listed(path: Path) -> list[tuple[int, Path]]:
 
 
 def _series(folder: Path) -> Series | None:
-    """The series of recordings that a folder's name is of, else the name in the heads of its lists."""
+    """The series in the folder's name, else in its lists' heads."""
     names = [folder.resolve().name]
     for file in ("rgb.txt", "depth.txt", "groundtruth.txt"):
         if (folder / file).is_file():
@@ -185,7 +182,7 @@ ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
 
 
 def read_sun3d(folder: Path, options: SourceOptions) -> Description:
-    """The folder as a description; images within the pairing tolerance of a depth image."""
+    """Describe images within the tolerance of a depth image."""
     colors, depths = _by_stamp(folder / "image"), _by_stamp(folder / "depth")
     extrinsics = sorted((folder / "extrinsics").glob("*.txt"))
     poses = _poses(extrinsics[-1]) if extrinsics else []
@@ -207,7 +204,6 @@ def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
 
 
 def _poses(path: Path) -> list[Float64]:
-    """T_world_camera (4, 4) of each image."""
     values = read_numbers(path)
     if len(values) % 12:
         raise InputError(f"{path}: expected 3x4 matrices, got {len(values)} numbers", remedy="copy the file again")

@@ -1,4 +1,4 @@
-"""The dataset layouts that are known by their own files, so that their folders need no description."""
+"""Dataset layouts known by their own files, without a description."""
 
 from pathlib import Path
 
@@ -19,19 +19,18 @@ LAYOUTS = entries_of(__package__, Layout)
 
 
 def layout_of(path: Path) -> Layout | None:
-    """The layout of a folder or file, None where it has none of these."""
     if path.is_file():
         return next((layout for layout in LAYOUTS if layout.suffix == path.suffix.lower() != ""), None)
     return next((layout for layout in LAYOUTS if layout.matches(path)), None)
 
 
 def has_views(path: Path) -> bool:
-    """Whether a path is read as a dataset: a folder that is no ROS 2 bag, or a file of its own layout."""
+    """True for a folder but a ROS 2 bag, or a file with a layout."""
     return layout_of(path) is not None if path.is_file() else path.is_dir() and not is_bag_folder(path)
 
 
 def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
-    """The records of a dataset's folder. Raises InputError where it has no layout that is known."""
+    """Open a dataset's folder. Raises InputError for an unknown layout."""
     check_not_partial(folder)
     layout = layout_of(folder)
     if layout is None and ((folder / "Rectified").is_dir() or idr_scans(folder)):
@@ -61,14 +60,14 @@ BARE_REMEDY = (
 
 
 def bare_images(folder: Path) -> str:
-    """That depth is missing, in words, of a folder that holds colour alone; empty where it holds no images."""
+    """Words for missing depth in a folder of colour; "" without images."""
     num = max(len(images_of(place)) for place in (folder, *(folder / name for name in _COLORS)) if place.is_dir())
     is_colmap = any((folder / place).exists() for place in ("sparse", "images.bin", "images.txt"))
     return f"depth is missing: images{' of a COLMAP model' if is_colmap else ''} alone ({num})" if num else ""
 
 
 def readable_in(folder: Path) -> str:
-    """What of a folder can be read by itself, in words; empty where nothing."""
+    """Names of readable parts, or ""."""
     found = []
     for name in names_in(folder)[:_MOST_LOOKED_AT]:
         path = folder / name

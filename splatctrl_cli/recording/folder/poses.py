@@ -1,4 +1,4 @@
-"""Camera poses from text and JSON files, as T_world_camera of optical cameras (z forward)."""
+"""Camera poses from text and JSON, as T_world_camera of optical cameras (z forward)."""
 
 import json
 import re
@@ -28,10 +28,7 @@ _CORRECT = "correct the file, or [poses] where a .toml names it"
 
 
 def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Float64:
-    """T_world_camera (4, 4), optical, of a matrix as written in a file.
-
-    Raises InputError where it is not a rigid transform.
-    """
+    """T_world_camera (4, 4), optical, of a file's matrix. Raises InputError if not rigid."""
     T = rigid(matrix, where)
     if convention == "world_to_camera":
         T = invert_transform(T)
@@ -41,9 +38,9 @@ def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Flo
 
 
 def rigid(matrix: Float64, where: str) -> Float64:
-    """The matrix (4, 4) with its rotation replaced by the nearest one, which undoes the rounding of text.
+    """Replace a matrix's (4, 4) rotation by the nearest one, against rounding in text.
 
-    Raises InputError where it is none: scale, shear, mirror, NaN.
+    Raises InputError for scale, shear, mirror or NaN.
     """
     is_finite = matrix.shape == (4, 4) and bool((np.abs(matrix) < MAX_PLACE).all())
     if not is_finite or np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max() > MAX_SKEW:
@@ -58,7 +55,7 @@ def rigid(matrix: Float64, where: str) -> Float64:
 
 
 def read_matrix_blocks(path: Path, heading: str) -> dict[str, Float64]:
-    """4x4 blocks under ``# heading ... NUMBER`` lines, by that number; other headings are passed over."""
+    """4x4 blocks under ``# heading ... NUMBER`` lines, by number."""
     poses: dict[str, Float64] = {}
     lines = _lines(path)
     for index, line in enumerate(lines):
@@ -69,7 +66,7 @@ def read_matrix_blocks(path: Path, heading: str) -> dict[str, Float64]:
 
 
 def read_trajectory_log(path: Path) -> dict[str, Float64]:
-    """Open3D's .log: a line of three numbers, the first of which is the frame's, then a 4x4 matrix."""
+    """Open3D's .log: three numbers, first the frame's, then a 4x4 matrix."""
     poses: dict[str, Float64] = {}
     lines = [line for line in _lines(path) if line]
     for index in range(0, len(lines), 5):
@@ -82,7 +79,7 @@ def read_trajectory_log(path: Path) -> dict[str, Float64]:
 
 
 def tum_rows(path: Path) -> dict[str, Float64 | None]:
-    """``stamp tx ty tz qx qy qz qw`` lines, by stamp [s] as written; None for a line with NaN, which is no pose."""
+    """Read ``stamp tx ty tz qx qy qz qw`` by stamp [s] as written; None for a line with NaN."""
     poses: dict[str, Float64 | None] = {}
     for where, words, values in read_rows(path):
         if len(values) == 8 and np.isfinite(values[0]) and np.isnan(values[1:]).any():
@@ -98,7 +95,7 @@ def tum_rows(path: Path) -> dict[str, Float64 | None]:
 
 
 def read_matrix_lines(path: Path) -> dict[str, Float64]:
-    """A 4x4 matrix in each line, by rows, or its first three rows (KITTI); by the number of the line, from 0."""
+    """A 4x4 or 3x4 (KITTI) matrix per line, by number from 0."""
     poses: dict[str, Float64] = {}
     for where, _, values in read_rows(path):
         if len(values) not in {12, 16}:
@@ -110,7 +107,7 @@ def read_matrix_lines(path: Path) -> dict[str, Float64]:
 
 
 def read_rows(path: Path) -> Iterator[tuple[str, list[str], list[float]]]:
-    """Place, words and numbers of each line that is neither empty nor a comment."""
+    """Yield place, words and numbers of lines but empty ones and comments."""
     for index, line in enumerate(_lines(path)):
         if line and not line.startswith("#"):
             words, where = line.split(), f"{path}:{index + 1}"
@@ -118,7 +115,7 @@ def read_rows(path: Path) -> Iterator[tuple[str, list[str], list[float]]]:
 
 
 def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
-    """The whole transforms.json, and its matrices by file_path."""
+    """A transforms.json, and its matrices by file_path."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         matrices = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=np.float64) for f in content["frames"]}
@@ -131,19 +128,17 @@ def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
 
 
 def read_matrix_file(path: Path) -> Float64:
-    """A 4x4 matrix alone in a text file."""
+    """A text file's only 4x4 matrix."""
     return _matrix([line for line in _lines(path) if line and not line.startswith("#")][:4], str(path))
 
 
 def read_numbers(path: Path) -> list[float]:
-    """All numbers of a text file, in order."""
+    """All numbers in order."""
     return [value for line in _lines(path) if not line.startswith("#") for value in _numbers(line.split(), str(path))]
 
 
 class Trajectory:
-    """Poses of one camera by stamp [s, as text], interpolated as those of tf, but not past a stamp without a pose
-    (None).
-    """
+    """A camera's poses by stamp [s, as text], interpolated like tf, never across None."""
 
     def __init__(self, poses: Mapping[str, Float64 | None]) -> None:
         self._tree = TfTree()
@@ -158,7 +153,7 @@ class Trajectory:
         self._known, self._lost = np.array(sorted(known), dtype=np.int64), np.array(sorted(lost), dtype=np.int64)
 
     def at(self, stamp_ns: int) -> Float64 | None:
-        """T_world_camera (4, 4); None where the trajectory does not reach."""
+        """T_world_camera (4, 4); None out of reach."""
         after = np.searchsorted(self._known, stamp_ns)
         is_known = after < len(self._known) and self._known[after] == stamp_ns
         before = self._known[after : after + 1] if is_known else self._known[max(after - 1, 0) : after]
@@ -170,9 +165,7 @@ class Trajectory:
 
 
 def stamp_of_text(text: str, unit_ns: int = 1_000_000_000) -> int | None:
-    """Nanoseconds of a time as written in units of so many (default: seconds), without the rounding of floats; None
-    where the text is not a time.
-    """
+    """Nanoseconds of a text in `unit_ns`, without float rounding; None if no time."""
     try:
         stamp_ns = Decimal(text) * unit_ns
         return round(stamp_ns) if abs(stamp_ns) < _MOST_NS else None  # rounding 1e999 writes out its digits

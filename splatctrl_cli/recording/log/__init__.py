@@ -1,1 +1,1 @@
-"""From the messages of a log to frames and joint states: decoded, paired, placed, in time order."""
+"""Messages of a log to frames and joint states, in time order."""

@@ -1,8 +1,7 @@
-"""RGB-D cameras in a log: which colour, depth and CameraInfo topics belong together, or why there are none; and poses
-that a log has as messages of their own instead of tf: odometry, tracked poses, stamped transforms.
+"""A log's RGB-D cameras, and their poses from messages instead of tf.
 
-Fields of poses are those of nav_msgs/Odometry (the pose of child_frame_id in header.frame_id),
-geometry_msgs/PoseStamped, PoseWithCovarianceStamped and TransformStamped.
+Poses: nav_msgs/Odometry (child_frame_id in header.frame_id), geometry_msgs/PoseStamped, PoseWithCovarianceStamped and
+TransformStamped.
 """
 
 import re
@@ -43,15 +42,16 @@ _ENCODINGS = ("cdr", "ros1", "protobuf", "json")  # of messages
 
 
 def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
-    """Topics whose first image is of this kind: color, depth or other; ``unlike`` are those whose name says that they
-    are not what they look like, as infrared of sixteen bits or depth in a JPEG.
+    """Topics whose first image is color, depth, other or ``unlike``.
+
+    ``unlike``: the name contradicts the image, such as 16-bit infrared or depth in a JPEG.
     """
     topics = [(t, t.first_image) for t in survey.of_type(IMAGE, COMPRESSED_IMAGE)]
     return [t for t, image in topics if image is not None and kind == ("unlike" if _unlike(t) else image.kind)]
 
 
 def _unlike(topic: TopicSurvey) -> str:
-    """The word in the names of a topic or its frame that says that its images are neither depth nor colour."""
+    """The word in a name that contradicts the image kind."""
     image, parts = topic.image, _parts(topic.topic.name)
     if image.kind == "depth":
         word = word_of(parts) or word_of((image.frame_id,))
@@ -61,10 +61,10 @@ def _unlike(topic: TopicSurvey) -> str:
 
 
 def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraTopics, ...]:
-    """Cameras by name: colour and depth topics that share a namespace, deepest namespaces first.
+    """Pair colour and depth topics that share a namespace, deepest first, into named cameras.
 
-    /cam0/color/image_raw and /cam0/depth/image_raw make camera `cam0`. Registered depth is preferred to raw depth,
-    colour to grey, rectified images to raw ones, uncompressed to compressed. Topics in `without` are left out.
+    /cam0/color/image_raw and /cam0/depth/image_raw make `cam0`. Prefers registered depth, colour to grey, rectified
+    to raw, uncompressed images. Skips topics `without`.
     """
     colors = [topic for topic in image_topics(survey, "color") if topic.topic.name not in without]
     depths = image_topics(survey, "depth")
@@ -116,16 +116,16 @@ def _camera(
 
 
 def _family(name: str) -> tuple[str, ...]:
-    """What raw, rectified and compressed images of one sensor share of their topics."""
+    """Topic parts shared by a sensor's raw, rectified and compressed images."""
     parts = _parts(name)
     return (*parts[:-1], re.sub("_?(rect|raw)", "", parts[-1]))
 
 
 def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | None = None) -> str:
-    """The CameraInfo topic of an image topic, "" if there is none.
+    """The CameraInfo topic of an image topic, "" if none.
 
-    It shares more of its path than the camera's namespace, or lies in the image's own folder or the namespace's, or
-    has the image's frame and size.
+    It shares more path than the namespace, is in the image's or namespace's folder, or has the image's frame and
+    size.
     """
     folder = _parts(image.topic.name)[:-1]
     level = len(folder) - 1 if namespace is None else len(namespace)
@@ -143,7 +143,7 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
 
 
 def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info: str) -> bool:
-    """Whether depth pixels already lie on colour pixels: of one size, frame (or a name says so), K and distortion."""
+    """True if depth is on colour pixels: equal size, frame (or name), K and distortion."""
     color_image, depth_image = survey.topics[color].image, survey.topics[depth].image
     if (color_image.width, color_image.height) != (depth_image.width, depth_image.height):
         return False
@@ -161,7 +161,6 @@ def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info:
 
 
 def _same_distortion(one: Calibration, two: Calibration) -> bool:
-    """Whether two lenses bend alike, coefficients that are left out being 0."""
     bent = [is_distorted(c.distortion_model, c.distortion) for c in (one, two)]
     if not all(bent):
         return not any(bent)
@@ -170,17 +169,16 @@ def _same_distortion(one: Calibration, two: Calibration) -> bool:
 
 
 def frame_of(survey: Survey, color: str, depth: str) -> str:
-    """The frame of a colour topic's images; a video file names none: that of its depth, which is aligned to it."""
+    """Colour's frame; a video file has its aligned depth's."""
     return survey.topics[depth if _is_of_file(survey.topics[color]) else color].image.frame_id
 
 
 def _is_of_file(topic: TopicSurvey) -> bool:
-    """Whether images are those of a video file beside a log."""
     return topic.topic.encoding == VIDEO and topic.first_image is not None and not topic.first_image.frame_id
 
 
 def common_prefix(name: str, other: str) -> tuple[str, ...]:
-    """The leading path parts that two topics share, their last parts left out."""
+    """Leading path parts two topics share, without their last."""
     pairs = zip(_parts(name)[:-1], _parts(other)[:-1], strict=False)
     return tuple(a for a, _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
@@ -206,10 +204,9 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
-    """The last part of the namespace where that is unique, else all of it; `camera` where there is none.
+    """Name cameras by the namespace's last part if unique, else all of it; `camera` if empty.
 
-    A name becomes a folder: characters but letters, digits, ``_``, ``-`` and ``.`` become ``_``, and it begins with
-    none of the last two.
+    Names are folders: characters but letters, digits, ``_``, ``-``, ``.`` become ``_``; the last two cannot be first.
     """
     short = [_folder_name(camera.name.rpartition("/")[2]) for camera in cameras]
     long = [_folder_name(camera.name.replace("/", "_")) for camera in cameras]
@@ -226,7 +223,7 @@ def _folder_name(name: str) -> str:
 
 
 def no_camera(log: RawLog, survey: Survey) -> InputError:
-    """The refusal of a log in which no colour and depth belong together."""
+    """The error for a log without matching colour and depth."""
     colors = [t.topic.name for t in image_topics(survey, "color")]
     depths = [t.topic.name for t in image_topics(survey, "depth")]
     broken = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
@@ -280,7 +277,6 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
 
 
 def _named_unlike(survey: Survey) -> str:
-    """The topics whose names say that they are neither depth nor colour, and why; begins with a semicolon."""
     found = []
     for topic in image_topics(survey, "unlike"):
         image, name = topic.image, topic.topic.name
@@ -312,7 +308,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def _kind(topic: Topic) -> str:
-    """The type of a topic's messages, and their encoding where it is none of ROS."""
+    """The message type, with an encoding that is not ROS."""
     name = topic.schema or topic.type_name
     return name if is_ros(topic) and name else f"{name} ({topic.encoding})".strip()
 
@@ -333,11 +329,11 @@ StampedPose = tuple[str, str, int, Float64, Float64]
 def join_pose_topics(
     log: RawLog, survey: Survey, options: SourceOptions, cameras: Sequence[CameraTopics], *, only_first: bool = False
 ) -> None:
-    """Add to the tf tree of a survey what pose topics say of its cameras; what is used without being asked is noted.
+    """Add pose topics to a survey's tf tree; those used unasked are noted.
 
-    A person names topics by camera. Otherwise an odometry is used if tf lacks its child, a camera's frame, or if
-    its parent is the world frame asked for. only_first: the first pose alone, enough to see what joins what.
-    Raises InputError where a topic cannot place its camera, and where several odometries could.
+    Options name topics by camera. Otherwise an odometry is used if tf misses its child, a camera's frame, or if its
+    parent is the requested world frame. only_first: one pose, enough to see connections. Raises InputError if a topic
+    cannot place its camera, or several odometries could.
     """
     frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
     asked = {name: given for name, given in options.camera_pose_topics.items() if name in frames}
@@ -349,12 +345,12 @@ def join_pose_topics(
 
 
 def pose_topics(survey: Survey) -> list[str]:
-    """The topics that hold poses."""
+    """Topics of pose messages."""
     return [topic.topic.name for topic in survey.of_type(*POSE_TYPES)]
 
 
 def _child_of(log: RawLog, survey: Survey, camera: str, given: PoseTopic, frame: str) -> str:
-    """The frame that a topic poses. Raises InputError where that does not place the camera."""
+    """The posed frame. Raises InputError if it does not place the camera."""
     where = f"{log.path}: --camera-pose {camera}={given.topic}"
     if given.topic not in pose_topics(survey):
         raise InputError(
@@ -378,7 +374,7 @@ def _child_of(log: RawLog, survey: Survey, camera: str, given: PoseTopic, frame:
 
 
 def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set[str]) -> dict[str, str]:
-    """By odometry, the frame that it places, if nothing else places that frame."""
+    """Frames by the odometry that alone places them."""
     known = set(survey.tf.frames)
     found: dict[str, str] = {}
     for topic in survey.of_type(ODOMETRY):
@@ -406,7 +402,6 @@ def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set
 
 
 def _add(log: RawLog, survey: Survey, topic: str, child: str, *, only_first: bool) -> None:
-    """The poses of a topic as those of a frame."""
     if survey.tf.root_of(child) != child:
         return  # added before
     for parent, _, stamp, position, quat_xyzw in _poses(log, survey, topic, survey.damage):
@@ -419,7 +414,6 @@ def _add(log: RawLog, survey: Survey, topic: str, child: str, *, only_first: boo
 
 
 def _poses(log: RawLog, survey: Survey, topic: str, damage: Damage) -> Iterator[StampedPose]:
-    """The poses of a topic; messages that do not decode go to `damage`."""
     decoder = MessageDecoder()
     for message in log.messages(Damage(), {topic}):  # the survey has counted this damage
         try:

@@ -1,13 +1,12 @@
-"""Messages of the standard types from their bytes, by the definitions the log itself carries.
+"""Decoded messages of the standard types, by the definitions in the log; and RealSense extras.
 
-Bags of the RealSense SDK say where the sensors are, and how far a count of depth reaches, in messages of their own.
-Topics are ``/device_D/sensor_S/STREAM_N/...`` (librealsense, src/media/ros/ros_file_format.h). ``tf/R`` maps points
-of the reference stream of group R to this stream, so that in one group T_color_depth = T_color_R T_R_depth: the way
-round in which the edges of depth and colour meet (docs/formats.md).
+RealSense bags have extrinsics and depth units on ``/device_D/sensor_S/STREAM_N/...`` (librealsense,
+src/media/ros/ros_file_format.h). ``tf/R`` maps points of group R's reference stream to this stream: T_color_depth =
+T_color_R T_R_depth, the direction in which edges of depth and colour meet (docs/formats.md).
 
-In newer bags (2.5x) the frame of an image's header is "1", and four bytes follow the message that its definition does
-not know: a little-endian float32, metres per count of depth, 0 of other images (librealsense, src/media/ros/
-ros_writer.cpp, third-party/realsense-file/rosbag/msgs/sensor_msgs/Image.h).
+In newer bags (2.5x) an image's frame is "1", and a little-endian float32 follows the message: metres per count of
+depth, 0 for others (librealsense, src/media/ros/ros_writer.cpp,
+third-party/realsense-file/rosbag/msgs/sensor_msgs/Image.h).
 """
 
 import re
@@ -55,28 +54,28 @@ class UndecodableMessageError(ValueError):
 
 
 class UnreadFormError(UndecodableMessageError):
-    """A message of a form that is not read, or is refused; nothing says that its bytes are damaged."""
+    """A message of an unread or refused form, perhaps whole."""
 
 
 def is_ros(topic: Topic) -> bool:
-    """Whether the topic's messages are in a ROS encoding, or stand for a ROS message in another."""
+    """True for ROS encodings, or messages that stand for ROS."""
     return topic.encoding in {"cdr", "ros1", VIDEO} or is_foxglove(topic)
 
 
 def is_foxglove(topic: Topic) -> bool:
-    """Whether the topic's messages stand for ROS messages in protobuf or JSON."""
+    """True for protobuf or JSON that stands for ROS."""
     return topic.schema != "" and topic.encoding in {"protobuf", "json"}
 
 
 class MessageDecoder:
-    """Decodes messages, one type store per definition met, so that one odd definition spoils no other topic."""
+    """A decoder with a store per definition: a bad one spoils no other topic."""
 
     def __init__(self) -> None:
         self._stores: dict[Topic, Any] = {}
         self._refused: dict[Topic, str] = {}
 
     def decode(self, message: RawMessage) -> Any:
-        """The message as an object with its fields. Raises UndecodableMessageError."""
+        """Decode to an object with fields. Raises UndecodableMessageError."""
         topic = message.topic
         if topic.encoding == VIDEO:
             return _unpack_image(message.data)
@@ -109,8 +108,8 @@ class MessageDecoder:
 def header_stamp_ns(message: RawMessage) -> int:
     """Stamp of a message that begins with a std_msgs/Header, without decoding the rest.
 
-    The stamp follows four bytes (CDR's encapsulation, or ROS 1's `seq`) as two 32-bit words. Foxglove's messages are
-    decoded. Raises UndecodableMessageError for a message too short.
+    Two 32-bit words follow four bytes (CDR's encapsulation, or ROS 1's `seq`). Foxglove's are decoded. Raises
+    UndecodableMessageError if too short.
     """
     if message.topic.schema == TEXT:
         return message.log_time_ns
@@ -126,14 +125,13 @@ def header_stamp_ns(message: RawMessage) -> int:
 
 
 def pack_image(header: Any, pixels: NDArray[np.uint8]) -> bytes:
-    """An image (H, W, 3) RGB out of a video as a message; its stamp is where CDR has that of a header."""
+    """Pack a video image (H, W, 3) RGB, its stamp at CDR's place."""
     frame, (height, width) = header.frame_id.strip("/").encode(), pixels.shape[:2]
     head = _IMAGE_HEAD.pack(b"\0\1\0\0", header.stamp.sec, header.stamp.nanosec, height, width, len(frame))
     return bytes(head + frame + pixels.tobytes())
 
 
 def _unpack_image(data: bytes) -> Any:
-    """Such a message as a sensor_msgs/Image."""
     _, seconds, nanoseconds, height, width, length = _IMAGE_HEAD.unpack_from(data)
     start, stamp = _IMAGE_HEAD.size + length, SimpleNamespace(sec=seconds, nanosec=nanoseconds)
     return SimpleNamespace(
@@ -167,7 +165,7 @@ def _type_store(topic: Topic) -> Any:
 
 @lru_cache(maxsize=32)
 def _store_of(definition: str, form: str, type_name: str) -> Any:
-    """The types of a definition; kept, as to compile them takes some ten milliseconds."""
+    """Cached types: compiling takes some ten milliseconds."""
     store = get_typestore(Stores.EMPTY)
     if form == "idl":
         parts = [part for part in definition.split("=" * 80 + "\n") if part.strip()]
@@ -184,13 +182,12 @@ def _store_of(definition: str, form: str, type_name: str) -> Any:
 
 
 def _names(description: Any) -> list[str]:
-    """The types that a field names."""
     kind, detail = description
     return [detail] if kind == Nodetype.NAME else [] if kind == Nodetype.BASE else _names(detail[0])
 
 
 def _check_fields(store: Any) -> None:
-    """Raise ValueError where a type with a standard name lacks a standard field; cases, lengths and more are free."""
+    """Raise ValueError for a missing standard field; case, lengths and extras are free."""
     standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
     for name in sorted(_KNOWN & store.fielddefs.keys()):
         there = {key.lower(): _kind(description) for key, description in store.fielddefs[name][1]}
@@ -208,7 +205,7 @@ def _foxglove_store() -> Any:
 
 
 def _kind(description: Any) -> object:
-    """What a field holds, without the lengths of arrays, sequences and strings."""
+    """A field's type without array, sequence and string lengths."""
     kind, detail = description
     if kind == Nodetype.NAME:
         return detail
@@ -224,16 +221,14 @@ _DEPTH_UNITS = re.compile(r"(/device_\d+/sensor_\d+)/option/Depth[ _]Units/value
 
 @dataclass(kw_only=True)
 class RealSense:
-    """Extrinsics by stream and group, depth units by sensor, as one pass over a bag finds them; the units that images
-    say themselves, in the order of the bag.
-    """
+    """Extrinsics by stream and group, depth units by sensor, image units in order."""
 
     extrinsics: dict[str, dict[str, Float64]] = field(default_factory=dict)
     depth_units: dict[str, float] = field(default_factory=dict)
     image_units: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, topic: str, message: Any) -> None:
-        """Take a Transform or an option's value; other topics are passed over. Raises ValueError for nonsense."""
+        """Take a Transform or option; ignore others. Raises ValueError if invalid."""
         extrinsics, units = _EXTRINSICS.fullmatch(topic), _DEPTH_UNITS.fullmatch(topic)
         if extrinsics:
             t, r = message.translation, message.rotation
@@ -248,7 +243,7 @@ class RealSense:
             self._say(topic, message.data)
 
     def add_image(self, message: RawMessage) -> None:
-        """Take the depth unit of an image that says one. Raises ValueError for nonsense."""
+        """Take an image's depth unit, if any. Raises ValueError if invalid."""
         if has_unit(message) and (value := struct.unpack("<f", message.data[-4:])[0]):
             self._say(message.topic.name, value)
 
@@ -258,13 +253,13 @@ class RealSense:
             units.append(unit)
 
     def T_between(self, to_topic: str, from_topic: str) -> Float64 | None:
-        """T_to_from (4, 4) of the streams of two image topics; None where no group holds both."""
+        """(4, 4) between image topics' streams; None without a common group."""
         to_all, from_all = (self.extrinsics.get(_stream(topic), {}) for topic in (to_topic, from_topic))
         group = next((group for group in to_all if group in from_all), None)
         return None if group is None else to_all[group] @ invert_transform(from_all[group])
 
     def depth_unit(self, topic: str) -> float | None:
-        """Metres per count of a depth topic, None where the bag does not say. Raises InputError where it changes."""
+        """Metres per count, None if unknown. Raises InputError if it changes."""
         said = self.image_units.get(_stream(topic), [])
         if len(said) > 1:
             raise InputError(
@@ -275,14 +270,14 @@ class RealSense:
 
 
 def has_unit(message: RawMessage) -> bool:
-    """Whether four bytes with a depth unit follow a message of the SDK's images."""
+    """True if a depth unit follows an SDK image."""
     topic = message.topic
     is_image = topic.encoding == "ros1" and topic.type_name == "sensor_msgs/msg/Image"
     return is_image and message.data[_AT : _AT + len(_FRAME_1)] == _FRAME_1 and device_of(topic.name) != ""
 
 
 def device_of(topic: str) -> str:
-    """The device whose stream a topic of the SDK is, "" for any other topic."""
+    """An SDK topic's device, or ""."""
     match = _STREAM.match(topic)
     return match[1] if match else ""
 

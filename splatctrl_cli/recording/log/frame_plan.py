@@ -1,6 +1,6 @@
-"""Which images of a log become frames, and the second pass that brings them together in the plan's order.
+"""A log's images that become frames, and the pass that reads them in plan order.
 
-The plan takes some fifty bytes of memory a frame.
+A frame's plan takes some fifty bytes.
 """
 
 import tempfile
@@ -20,7 +20,7 @@ NO_MASK = -1
 
 @dataclass(frozen=True, kw_only=True)
 class Planned:
-    """A frame to be: message numbers within the colour, depth and mask topics (None: no mask), and the pose."""
+    """A planned frame: message numbers by topic (human_index None: no mask), and the pose."""
 
     stamp_ns: int
     camera: Camera
@@ -31,14 +31,14 @@ class Planned:
 
     @property
     def keys(self) -> list[tuple[str, int]]:
-        """Topic and number of each of its images."""
+        """Topic and number of each image."""
         camera = self.camera
         keys = [(camera.color_topic, self.color_index), (camera.depth_topic, self.depth_index)]
         return keys if self.human_index is None else [*keys, (camera.human_topic, self.human_index)]
 
 
 class FramePlan:
-    """The frames of a log, by stamp, then camera, then number of the colour image."""
+    """Frames by stamp, then camera, then colour number."""
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         self._cameras = tuple(sorted(cameras, key=lambda camera: camera.name))
@@ -71,7 +71,7 @@ class FramePlan:
         masks: Mapping[int, int],
         poses: Iterable[Float64 | None],
     ) -> int:
-        """Take those frames (K,) of a camera whose pose (4, 4) is known, masks by colour number; returns how many."""
+        """Add frames (K,) with known poses (4, 4), masks by colour number; return their number."""
         first = len(self._poses)
         is_known = np.fromiter(map(self._keep, poses), np.bool_, len(stamp_ns))
         number = self._cameras.index(camera)
@@ -84,13 +84,12 @@ class FramePlan:
         return num
 
     def _keep(self, T: Float64 | None) -> bool:
-        """Store a pose if it is known, and return whether it is."""
         if T is not None:
             self._poses.append(T[None])
         return T is not None
 
     def uses(self) -> dict[str, Index]:
-        """How many frames need each image, by topic and number."""
+        """Number of frames that need each image."""
         found: dict[str, list[Index]] = {}
         for number, camera in enumerate(self._cameras):
             of_camera = self._columns[:, self._columns[1] == number]
@@ -106,7 +105,7 @@ Key = tuple[str, int]  # topic, number of the message within it
 
 
 class HeldMessages:
-    """Messages that wait for others; where a log keeps its topics apart, these can be half of it."""
+    """Waiting messages, which can be half of a log that stores topics apart."""
 
     def __init__(self) -> None:
         self._messages: dict[Key, RawMessage] = {}
@@ -119,7 +118,6 @@ class HeldMessages:
         return key in self._messages
 
     def add(self, key: Key, message: RawMessage) -> None:
-        """Keep a message."""
         if self._num_bytes + len(message.data) > HELD_BYTES:
             first = self._file.seek(0, 2)
             self._file.write(message.data)
@@ -137,7 +135,7 @@ class HeldMessages:
         return replace(message, data=self._file.read(place[1]))
 
     def pop(self, key: Key) -> RawMessage:
-        """A message, which goes."""
+        """Remove and return a message."""
         found = self.get(key)
         self._num_bytes -= len(self._messages.pop(key).data)
         self._places.pop(key, None)
@@ -150,8 +148,9 @@ class HeldMessages:
 def planned_images(
     log: RawLog, plan: FramePlan, damage: Damage, held: HeldMessages
 ) -> Iterator[tuple[Planned, list[RawMessage]]]:
-    """Yield each frame of a plan with the messages of its colour, depth and mask, which the log may hold in another
-    order; `held` keeps those that wait. Frames that are gone go to `damage`.
+    """Yield each planned frame with its colour, depth and mask messages, in any log order.
+
+    `held` keeps waiting ones; missing frames go to `damage`.
     """
     uses, position, num = plan.uses(), 0, len(plan)
     numbers, planned = dict.fromkeys(uses, 0), plan[0]

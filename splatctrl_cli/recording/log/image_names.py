@@ -1,7 +1,7 @@
-"""What the name of an image topic says of its images: infrared of sixteen bits is as depth by its encoding alone.
+"""The image kind in a topic's name: 16-bit infrared has the encoding of depth.
 
-Names are those of drivers: /ir (Azure Kinect, Orbbec), /infra1 (RealSense), image_ir (Kinect 2), confidence (ZED,
-L515), amplitude and noise (time of flight), aux (MultiSense), signal, reflec and nearir (Ouster).
+Drivers: /ir (Azure Kinect, Orbbec), /infra1 (RealSense), image_ir (Kinect 2), confidence (ZED, L515), amplitude and
+noise (time of flight), aux (MultiSense), signal, reflec and nearir (Ouster).
 """
 
 import re
@@ -31,9 +31,9 @@ _CAMERAS = frozenset({"camera", "cam"})  # words of parts that name a device, wh
 
 
 def word_of(parts: tuple[str, ...], *, is_device: bool = True) -> str:
-    """The word that says what images hold, of the last part of a topic that has one; "" where none has.
+    """The kind word in a topic's last part that has one; "" if none.
 
-    ``aligned_depth_to_infra1`` is depth: of ``a_to_b`` the first counts. is_device: parts such as ``depth_camera``
+    In ``a_to_b`` the first counts: ``aligned_depth_to_infra1`` is depth. is_device: parts such as ``depth_camera``
     count too.
     """
     for part in reversed(parts):
@@ -46,5 +46,5 @@ def word_of(parts: tuple[str, ...], *, is_device: bool = True) -> str:
 
 
 def is_other(word: str) -> bool:
-    """Whether images of sixteen bits under this word are no depth."""
+    """True if 16-bit images so named are not depth."""
     return word in _OTHERS

@@ -1,6 +1,6 @@
-"""Images of sensor_msgs messages as arrays: colour (H, W, 3) uint8 RGB, depth (H, W) float32 [m]; RVL.
+"""Decoders of sensor_msgs images: colour (H, W, 3) uint8 RGB, depth (H, W) float32 [m].
 
-The encodings are those of sensor_msgs/image_encodings.hpp.
+The encodings follow sensor_msgs/image_encodings.hpp.
 """
 
 import struct
@@ -76,11 +76,10 @@ _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
 
 @dataclass(frozen=True, kw_only=True)
 class ImageMessage:
-    """An image as recorded, of any type and encoding; only who asks for its pixels has a JPEG or PNG decoded.
+    """An image as recorded; a JPEG or PNG is decoded only for its pixels.
 
-    width, height [px]; decode gives pixels (H, W[, channels]) in `encoding`, or raises UndecodableMessageError;
-    compressed is the image file's bytes where the message held one (JPEG, PNG) that decodes to `pixels`; remark says
-    where its bytes are not laid out as its format says.
+    width, height [px]. decode: pixels (H, W[, channels]) in `encoding`, or UndecodableMessageError. compressed: JPEG
+    or PNG bytes of `pixels`, if any. remark: a deviation from the format.
     """
 
     stamp_ns: int
@@ -94,12 +93,11 @@ class ImageMessage:
 
     @cached_property
     def pixels(self) -> NDArray[Any]:
-        """Those of `decode`, once."""
         return self.decode()
 
     @property
     def is_counts(self) -> bool:
-        """Whether depth is whole counts of a unit."""
+        """True if depth is integer counts."""
         return self.encoding != "32FC1"
 
     @property
@@ -111,19 +109,18 @@ class ImageMessage:
 
     @property
     def is_gray(self) -> bool:
-        """Whether a colour image has one channel only."""
+        """True for a one-channel colour image."""
         return self.encoding in {"mono8", "8UC1"}
 
     def unit(self, scale: float | None) -> float:
-        """[m] that a depth of 1 is: `scale` where that is given, else 1 mm of counts and 1 m of floats (REP 118)."""
+        """Metres per unit: `scale`, else 1 mm for counts, 1 m for floats (REP 118)."""
         return scale if scale is not None else MILLIMETRE if self.is_counts else 1.0
 
 
 def read_image(message: Any, type_name: str, *, lazily: bool = False) -> ImageMessage:
-    """The image of a decoded sensor_msgs/Image or CompressedImage. Raises UndecodableMessageError.
+    """Read a decoded sensor_msgs/Image or CompressedImage. Raises UndecodableMessageError.
 
-    lazily: leave a JPEG or PNG of a plain kind undecoded until its pixels are asked for; it is whole as far as its
-    marks and checksums say.
+    lazily: a plain JPEG or PNG stays undecoded; only its markers and checksums are checked.
     """
     if type_name == IMAGE:
         pixels = raw_pixels(message)
@@ -157,7 +154,7 @@ def _image(
 
 
 class _Packed(NamedTuple):
-    """The image file of a CompressedImage, and the bytes that compressedDepth puts before it."""
+    """An image file, and compressedDepth's bytes before it."""
 
     form: str
     file: bytes
@@ -167,19 +164,19 @@ class _Packed(NamedTuple):
 
     @property
     def recorded(self) -> str:
-        """The encoding that was compressed, where the format says it."""
+        """Encoding before compression, if stated."""
         return self.form.partition(";")[0].strip()
 
     @property
     def is_rvl(self) -> bool:
-        """Whether the format says RVL."""
+        """True if the format names RVL."""
         return "rvl" in self.form.lower()
 
 
 def _packed(form: str, data: bytes) -> _Packed:
-    """Where the file of a message begins, by its first bytes: not all publishers write what `format` says.
+    """Find the image file by its first bytes, as publishers misuse `format`.
 
-    Raises UnreadFormError for depth that JPEG has changed, and for RVL that is called something else.
+    Raises UnreadFormError for depth in a JPEG, and for RVL under another name.
     """
     says_depth, head, file = "compressedDepth" in form, data[:_DEPTH_HEAD], data[_DEPTH_HEAD:]
     plain, behind = _Packed(form, data), _Packed(form, file, True, head)
@@ -207,7 +204,7 @@ def _is_rvl(file: bytes) -> bool:
 
 
 def _plain(packed: _Packed) -> tuple[str, tuple[int, int], bool] | None:
-    """Encoding, (height, width) and whether it is colour of a file that needs no decoding to be kept."""
+    """Encoding, (height, width) and is_color; None if it must be decoded."""
     is_depth = packed.is_depth
     if is_depth and (packed.is_rvl or packed.recorded == "32FC1"):
         return None
@@ -229,9 +226,9 @@ def _decoded(packed: _Packed, *, color: bool) -> NDArray[Any]:
 
 
 def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
-    """Colour (H, W, 3) uint8 of pixels as `raw_pixels` gives them; a Bayer mosaic is interpolated linearly.
+    """Convert `raw_pixels` to colour (H, W, 3) uint8; Bayer mosaics are interpolated linearly.
 
-    Of sixteen bits, 65535 becomes 255, as in cv_bridge (src/cv_bridge.cpp), whatever the sensor's own depth.
+    Of 16 bits, 65535 becomes 255, as in cv_bridge (src/cv_bridge.cpp), whatever the sensor's depth.
     """
     code = COLOR_CONVERSIONS[encoding]
     converted = pixels if code is None else cv2.cvtColor(np.ascontiguousarray(pixels), code)
@@ -241,10 +238,9 @@ def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
 
 
 def raw_pixels(message: Any) -> NDArray[Any]:
-    """The pixels (H, W[, channels]) of a decoded sensor_msgs/Image, of no channel where the encoding is not known.
+    """Pixels (H, W[, channels]) of a sensor_msgs/Image; no channel for an unknown encoding.
 
-    Bytes between rows and behind the last are passed over, in either byte order. Raises UndecodableMessageError where
-    the data do not hold the image.
+    Skips padding; reads either byte order. Raises UndecodableMessageError for too few data.
     """
     width, height, step = int(message.width), int(message.height), int(message.step)
     name = f"image {width}x{height} {message.encoding}"
@@ -275,7 +271,7 @@ def raw_pixels(message: Any) -> NDArray[Any]:
 
 
 def _nv24(message: Any, name: str) -> UInt8:
-    """RGB (H, W, 3); BT.601 of limited range, as OpenCV takes nv12."""
+    """RGB (H, W, 3), BT.601 limited range, as OpenCV's nv12."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     data = np.asarray(message.data, dtype=np.uint8)
     if not 0 < width * height * 3 == data.size or step not in {width, 2 * width, 3 * width}:
@@ -288,17 +284,16 @@ def _nv24(message: Any, name: str) -> UInt8:
 
 
 def color_of(image: ImageMessage) -> UInt8:
-    """Colour (H, W, 3) uint8 RGB."""
     return to_rgb(image.pixels, image.encoding)
 
 
 def depth_of(image: ImageMessage, scale: float | None) -> Float32:
-    """Depth (H, W) float32 [m] in the `unit` of `scale`, 0 = none."""
+    """Depth (H, W) float32 [m] in the `unit` of `scale`; 0 = no return."""
     return (metres if image.is_counts else measured)(image.pixels, image.unit(scale))
 
 
 def num_invalid(depth: NDArray[Any]) -> int:
-    """Pixels of a depth image (H, W) as recorded that are negative, NaN, infinite or a code for no return."""
+    """Count depths (H, W) negative, NaN, infinite or a no-return code."""
     is_invalid = depth == NO_RETURN
     if depth.dtype.kind != "u":
         is_invalid |= ~(depth >= 0) | (np.abs(depth - NO_RETURN_M) < 1e-4) | (depth >= FARTHEST)
@@ -306,16 +301,18 @@ def num_invalid(depth: NDArray[Any]) -> int:
 
 
 def measured(depth: NDArray[Any], scale: float) -> Float32:
-    """Float depth (H, W) as float32 [m]; what is not measured becomes 0: 0, negative and non-finite values (REP 118),
-    65535 and 65.535 (counts without return, and the same as metres), and all from `FARTHEST` on.
+    """Convert float depth (H, W) to float32 [m]; 0 = no return.
+
+    No return: 0, negative, non-finite (REP 118), 65535, 65.535 (its metres), and from `FARTHEST` on.
     """
     is_code = (depth == NO_RETURN) | (np.abs(depth - NO_RETURN_M) < 1e-4)
     return np.where((depth > 0) & (depth < FARTHEST) & ~is_code, depth * np.float32(scale), 0).astype(np.float32)
 
 
 def metres(counts: NDArray[Any], scale: float) -> Float32:
-    """Integer depth counts (H, W) as float32 [m], 0 where they are `NO_RETURN`; the one formula, so that re-reading
-    gives the same bits.
+    """Convert depth counts (H, W) to float32 [m], 0 at `NO_RETURN`.
+
+    The only such formula: re-reading gives the same bits.
     """
     depth = counts.astype(np.float32)
     depth[counts == NO_RETURN] = 0.0
@@ -344,8 +341,9 @@ def _compressed_pixels(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None
 
 
 def _compressed_depth(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None]:
-    """compressed_depth_image_transport: 12 bytes (int32, two float32 A, B), then a PNG or the sizes (two int32) and
-    RVL; 32FC1 is A / (count - B) (its codec.cpp and rvl_codec.cpp).
+    """Decode compressed_depth_image_transport (its codec.cpp and rvl_codec.cpp).
+
+    12 bytes (int32, two float32 A, B), then a PNG, or the sizes (two int32) and RVL; 32FC1 is A / (count - B).
     """
     counts = _rvl_counts(packed.file) if packed.is_rvl else decode_file(packed.file, color=False)
     if counts is None or counts.ndim != 2:
@@ -371,14 +369,13 @@ def _rvl_counts(data: bytes) -> NDArray[np.uint16]:
 
 
 def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
-    """The pixels (num_pixels,) of an RVL stream of little-endian words, of compressed_depth_image_transport.
+    """Decode an RVL stream of little-endian words to pixels (num_pixels,).
 
-    A. D. Wilson, Fast Lossless Depth Image Compression, ISS 2017 (its listing is the definition): the image is runs
-    of zeros and of values in turn, each value the zigzag-coded difference to the last one that was not zero; every
-    number is written in groups of three bits, low ones first, in four-bit nibbles whose high bit says that another
-    follows; nibbles fill 32-bit words from the top.
+    A. D. Wilson, Fast Lossless Depth Image Compression, ISS 2017 (its listing is the definition). Runs of zeros and
+    of values alternate; a value is the zigzag-coded difference to the last nonzero one. Numbers are three-bit groups,
+    low first, in nibbles whose high bit marks a continuation; nibbles fill 32-bit words from the top.
 
-    Raises ValueError where it holds no such image. Memory is that of the image and a few times that of `data`.
+    Raises ValueError if invalid. Memory is the image and a few times `data`.
     """
     numbers = _numbers(data)
     runs: list[tuple[int, int, int]] = []  # first pixel, first number, length
@@ -405,7 +402,6 @@ def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
 
 
 def _numbers(data: bytes) -> NDArray[np.int64]:
-    """All numbers of a stream, those of the filling at its end too."""
     words = np.frombuffer(data, dtype="<u4", count=len(data) // 4)
     nibbles = ((words[:, None] >> np.arange(28, -4, -4, dtype=np.uint32)) & 15).astype(np.int64).ravel()
     ends = np.flatnonzero(nibbles < 8)

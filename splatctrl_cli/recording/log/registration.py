@@ -1,5 +1,6 @@
-"""The tree of frames of /tf and /tf_static, asked at any time; depth seen from the colour camera, and images
-without lens distortion. The tree takes 16 bytes of memory a sample.
+"""The tf tree over time, depth registered to the colour camera, and lens undistortion.
+
+The tree takes 16 bytes of memory a sample.
 """
 
 import re
@@ -32,7 +33,7 @@ from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
 
 
 class _Edge:
-    """T_parent_child over time, its rows (4, 4) in `transforms` by number."""
+    """T_parent_child over time; `numbers` index rows (4, 4) of `transforms`."""
 
     def __init__(self, parent: str, transforms: RowFile) -> None:
         self.parent = parent
@@ -86,7 +87,7 @@ def _is_still(T_a: Float64, T_b: Float64) -> bool:
 
 
 class TfTree:
-    """Frames by their parent; moving edges interpolated in time, static ones valid always."""
+    """Frames by parent; moving edges are interpolated, static ones always valid."""
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
@@ -104,11 +105,11 @@ class TfTree:
         static: bool,
         holds: bool = False,
     ) -> None:
-        """Add T_parent_child at a time; a static one holds always, one that `holds` as long as it is the only one.
+        """Add T_parent_child at a time; one that `holds` is valid always while it is the only one.
 
-        The first parent of a frame stays its parent, what would close a loop is left out, each of different static
-        transforms holds from its stamp on (of one stamp the last, before all the first); all of this is noted.
-        Raises ValueError for a rotation or position that is not one (a zero quaternion, NaN).
+        A frame keeps its first parent; edges that would close a loop are left out. Differing static transforms are
+        valid from their stamps on, the first also before; of one stamp the last. All is noted. Raises ValueError if
+        not rigid (a zero quaternion, NaN).
         """
         parent, child = parent.strip("/"), child.strip("/")
         if not (np.isfinite(position).all() and 0.5 < float(np.linalg.norm(quat_xyzw)) < 2.0):
@@ -135,36 +136,36 @@ class TfTree:
             self.note(f"tf: {parent} -> {child} is both static and moving; the static one holds")
 
     def note(self, note: str) -> None:
-        """Keep a remark on the tree, once."""
+        """Note a remark once."""
         if note not in self.notes:
             self.notes.append(note)
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """All frames, sorted by name."""
+        """All frames, sorted."""
         return tuple(sorted(set(self._edges) | {edge.parent for edge in self._edges.values()}))
 
     @property
     def roots(self) -> tuple[str, ...]:
-        """Frames without a parent, sorted by name."""
+        """Frames without a parent, sorted."""
         return tuple(frame for frame in self.frames if frame not in self._edges)
 
     def root_of(self, frame: str) -> str:
-        """The topmost ancestor of `frame` (itself, where it has no parent)."""
+        """The topmost ancestor, perhaps itself."""
         return self._ancestors(frame)[-1]
 
     def span_ns(self, frame: str) -> tuple[int, int] | None:
-        """First and last stamp for which the moving edges above `frame` are all known; None if none moves."""
+        """Stamps between which all moving edges above are known; None without any."""
         edges = [self._edges[f] for f in self._ancestors(frame)[:-1]]
         moving = [edge.stamps for edge in edges if not edge.static]
         return (max(min(s) for s in moving), min(max(s) for s in moving)) if moving else None
 
     def connects(self, target: str, source: str) -> bool:
-        """Whether a chain of edges joins the two frames."""
+        """True if edges join them."""
         return self.root_of(target.strip("/")) == self.root_of(source.strip("/"))
 
     def lookup(self, target: str, source: str, stamp_ns: int, tolerance_ns: int = 0) -> Float64 | None:
-        """T_target_source (4, 4) at a time; None where unconnected or unknown at that time."""
+        """T_target_source (4, 4) at a time; None if unconnected or unknown then."""
         target, source = target.strip("/"), source.strip("/")
         up_target, up_source = self._ancestors(target), self._ancestors(source)
         common = next((frame for frame in up_source if frame in up_target), None)
@@ -204,12 +205,12 @@ _PINHOLES = ("", "none", "pinhole", "perspective", "rectilinear", "inversebrownc
 
 
 def lens_model(name: str) -> str:
-    """Translate a driver's name into one of `DISTORTION_MODELS`; other names come back unchanged."""
+    """One of `DISTORTION_MODELS` for a driver's name, else unchanged."""
     return _SAME_MODELS.get(_letters(name), name)
 
 
 def is_distorted(model: str, coefficients: Float64) -> bool:
-    """False where a lens is a pinhole. An equidistant lens never is, nor one of a model that is not known."""
+    """False for a pinhole; equidistant and unknown models always distort."""
     is_radial = lens_model(model) in DISTORTION_MODELS[:2] or _letters(model) in _PINHOLES
     return not is_radial or bool(np.any(np.abs(coefficients) > 1e-9))
 
@@ -220,7 +221,7 @@ def _letters(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthToColor:
-    """Warps depth images of one camera into another's view; undistortion: of the depth camera's own lens."""
+    """A warp of depth into another camera; undistortion: the depth lens's."""
 
     depth_intrinsics: Intrinsics
     color_intrinsics: Intrinsics
@@ -228,10 +229,9 @@ class DepthToColor:
     undistortion: "Undistortion | None" = None
 
     def warp(self, depth: Float32) -> Float32:
-        """Depth (H', W') [m] of the depth camera -> (H, W) [m] in the colour camera, 0 = none.
+        """Warp depth (H', W') [m] into the colour camera, (H, W) [m], 0 = none.
 
-        Each depth pixel covers its square's image in the colour camera (no holes where that has the finer pixels);
-        of several that land on a pixel, the nearest counts.
+        Each depth pixel covers its square's image, so finer colour pixels get no holes; the nearest wins.
         """
         target = self.color_intrinsics
         depth = depth if self.undistortion is None else self.undistortion.depth(depth)
@@ -257,11 +257,11 @@ class DepthToColor:
 
 
 class Undistortion:
-    """Removes a lens distortion.
+    """A remap that removes lens distortion.
 
-    intrinsics: those of the result, which are the lens's own unless `lens` says others; R (3, 3) turns the lens's
-    axes into those of the result. valid: (H, W), False where the lens did not see the pixel, as in the corners of a
-    pincushion; None where it saw all. There colour is black, and depth and labels are 0.
+    intrinsics: of the result, the lens's own unless `lens` differs. R (3, 3): the lens's axes to the result's. valid:
+    (H, W), False where the lens saw nothing, as in a pincushion's corners; None if it saw all. There colour is black,
+    depth and labels 0.
     """
 
     def __init__(
@@ -302,36 +302,36 @@ class Undistortion:
         self._map_u[~is_seen] = -10.0  # folded back into the image, or outside of it
 
     def color(self, image: UInt8) -> UInt8:
-        """Colour (H, W, 3), interpolated."""
+        """Undistort (H, W, 3), interpolated."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_LINEAR), dtype=np.uint8)
 
     def labels(self, image: UInt8) -> UInt8:
-        """Labels (H, W), nearest pixel."""
+        """Undistort (H, W), nearest pixel."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.uint8)
 
     def depth(self, image: Float32) -> Float32:
-        """Depth (H, W) [m], nearest pixel."""
+        """Undistort (H, W) [m], nearest pixel."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
-    """Corrections of a camera's images: intrinsics (of the result), lens distortion, registration of depth."""
+    """Image corrections; intrinsics: of the result."""
 
     intrinsics: Intrinsics
     undistortion: Undistortion | None = None
     depth_to_color: DepthToColor | None = None
 
     def color(self, image: UInt8) -> UInt8:
-        """Colour (H, W, 3) as recorded -> without distortion."""
+        """Undistort (H, W, 3)."""
         return image if self.undistortion is None else self.undistortion.color(image)
 
     def labels(self, image: UInt8) -> UInt8:
-        """Labels (H, W) of colour as recorded -> without distortion."""
+        """Undistort (H, W)."""
         return image if self.undistortion is None else self.undistortion.labels(image)
 
     def depth(self, image: Float32) -> Float32:
-        """Depth [m] as recorded -> (H, W) at the pixels of colour."""
+        """Map recorded depth [m] to colour's pixels (H, W)."""
         if self.depth_to_color is not None:
             return self.depth_to_color.warp(image)
         return image if self.undistortion is None else self.undistortion.depth(image)
@@ -340,7 +340,7 @@ class Lens:
 def _maps(
     lens: Intrinsics, model: str, coefficients: Float64, R: Float64, result: Intrinsics
 ) -> tuple[Float32, Float32]:
-    """Column and row in the distorted image of each pixel of the result."""
+    """Column and row in the distorted image, by result pixel."""
     K, P = (np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]], dtype=np.float64) for k in (lens, result))
     size = (result.width, result.height)
     if model == "equidistant":
@@ -351,7 +351,7 @@ def _maps(
 
 
 def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
-    """Distances from the axis at a depth of one, and where the lens shows them, both in focal lengths."""
+    """Undistorted and distorted radii at depth one, in focal lengths."""
     r = np.linspace(0.0, FARTHEST_RAY, 20001)
     k = np.zeros(8)
     k[: min(len(coefficients), 8)] = coefficients[:8]
@@ -363,10 +363,10 @@ def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
 
 
 def undistortion_of(lens: Intrinsics, model: str, coefficients: Float64) -> Undistortion | None:
-    """Build what removes a lens's distortion, None for a pinhole. Raises InputError for an impossible lens.
+    """A lens's undistortion, None for a pinhole. Raises InputError for an impossible lens.
 
-    The result has the lens's focal lengths. Of an equidistant lens they are shortened, so that the result shows what
-    lies on the image's axes, but nothing beyond `WIDEST_RAY`: that would leave the middle few pixels.
+    It keeps focal lengths. An equidistant lens's are shortened to show all on the image's axes, up to `WIDEST_RAY`:
+    beyond it the middle would keep few pixels.
     """
     if not is_distorted(model, coefficients):
         return None

@@ -1,4 +1,4 @@
-"""The cameras of a log made ready: intrinsics, world frame, lens and depth registration, or why they cannot be."""
+"""A log's cameras with intrinsics, world frame, lens and registration, or their problems."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -43,9 +43,10 @@ _RECTIFIED = frozenset({"rect", "rectified", "undistorted"})  # words in the nam
 
 @dataclass(frozen=True, kw_only=True)
 class Camera(Lens):
-    """One RGB-D camera of a log; valid (H, W) is False where its lens did not see the pixel, fixed_pose is
-    T_world_camera where a person gave it, human_topic its masks, depth_scale [m per count] what a person or the log
-    says of it.
+    """An RGB-D camera of a log.
+
+    valid (H, W): False where the lens did not see the pixel. fixed_pose: the user's T_world_camera. human_topic: its
+    masks. depth_scale [m per count]: the user's or the log's.
     """
 
     name: str
@@ -59,14 +60,14 @@ class Camera(Lens):
     human_topic: str = ""
 
     def pose_at(self, tf: TfTree, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
-        """T_world_camera at a time; None where tf does not know it."""
+        """T_world_camera, None if tf does not know it."""
         if self.fixed_pose is not None:
             return self.fixed_pose
         return tf.lookup(self.world_frame, self.frame_id, stamp_ns, tolerance_ns)
 
 
 def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[Camera, ...]:
-    """Every camera to be read, complete. Raises InputError naming the camera, the topic and what it lacks."""
+    """Build requested cameras. Raises InputError naming camera, topic and problem."""
     found = camera_topics(log, survey, options)
     if not found:
         raise no_camera(log, survey)
@@ -93,12 +94,12 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
 
 
 def camera_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    """The cameras that the options name, else those found; a mask is no camera's colour."""
+    """The options' cameras, else those found; a mask is never colour."""
     return _given_topics(log, survey, options) or find_cameras(survey, without=options.human_topics.values())
 
 
 def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
-    """What a reconstruction from this log would lack, in words; empty where nothing."""
+    """List what a reconstruction would miss."""
     found = camera_topics(log, survey, options)
     if not found:
         lacks = [str(no_camera(log, survey)).removeprefix(f"{log.path}: ")]
@@ -124,7 +125,7 @@ def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
 
 
 def nearest_gap_ns(color_ns: Sequence[int], depth_ns: Sequence[int]) -> int:
-    """The smallest difference between a colour and a depth stamp [ns]."""
+    """Smallest difference of a colour and a depth stamp."""
     color, depth = np.sort(np.array(color_ns)), np.sort(np.array(depth_ns))
     after = np.clip(np.searchsorted(depth, color), 0, len(depth) - 1)
     before = np.clip(after - 1, 0, None)
@@ -132,7 +133,7 @@ def nearest_gap_ns(color_ns: Sequence[int], depth_ns: Sequence[int]) -> int:
 
 
 def intrinsics_of(calibration: Calibration) -> Intrinsics:
-    """The pinhole part of a CameraInfo (its pixel convention is ours)."""
+    """A CameraInfo's pinhole (its pixel convention is ours)."""
     K = calibration.K
     return Intrinsics(
         fx=float(K[0, 0]),
@@ -145,7 +146,7 @@ def intrinsics_of(calibration: Calibration) -> Intrinsics:
 
 
 def _rectified(calibration: Calibration) -> Calibration:
-    """The camera of the rectified image: P where it is set, and no distortion; valid where the lens is known."""
+    """The rectified camera: P if set, without distortion; valid if the lens is known."""
     K = calibration.projection if calibration.projection[0, 0] > 0 else calibration.K
     pinhole = replace(calibration, K=K, distortion_model="plumb_bob", distortion=np.zeros(0))
     model = lens_model(calibration.distortion_model)
@@ -162,11 +163,11 @@ ImageLens = Literal["pinhole", "distorted", "rectified", "contradicted"]  # by C
 
 
 def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> ImageLens:
-    """Decide whether images are rectified, where their topic's name says so and their CameraInfo has a distortion.
+    """Decide if images are rectified, by topic name and CameraInfo.
 
-    A CameraInfo may describe the rectified images beside the raw ones (image_proc): by a P that is not K, or a topic
-    of raw images in the same folder. RealSense's ``image_rect_raw`` is as the lens sees it. Depth is computed in
-    rectified images. Otherwise name and CameraInfo contradict each other.
+    A distorted CameraInfo may describe rectified images next to raw ones (image_proc): by a P unlike K, or raw images
+    in the folder. RealSense's ``image_rect_raw`` is distorted; depth is computed in rectified images. Otherwise name
+    and CameraInfo contradict each other.
     """
     says_rectified = not _RECTIFIED.isdisjoint(re.split("[/_]", image_topic.lower()))
     if not is_distorted(calibration.distortion_model, calibration.distortion):
@@ -181,8 +182,6 @@ def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> Im
 
 
 class _Builder:
-    """Makes one camera ready."""
-
     def __init__(self, log: RawLog, survey: Survey, options: SourceOptions, topics: CameraTopics) -> None:
         self._path = log.path
         self._where = f"{log.path}: camera {topics.name}"
@@ -191,7 +190,7 @@ class _Builder:
         self._topics = topics
 
     def build(self) -> Camera:
-        """The camera. Raises InputError for the first thing it lacks."""
+        """Build the camera. Raises InputError for the first problem."""
         topics = self._topics
         self._check_depth()
         self._check_clock()
@@ -215,7 +214,7 @@ class _Builder:
         )
 
     def problems(self) -> list[str]:
-        """Everything that the camera lacks, in words; empty where `build` succeeds."""
+        """List all problems; empty if `build` succeeds."""
         found = []
         intrinsics = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
         steps: list[Callable[[], object]] = [
@@ -295,7 +294,6 @@ class _Builder:
         )
 
     def _given(self, intrinsics: tuple[float, ...], image_topic: str) -> Calibration:
-        """What --intrinsics says, for images of the size that they are."""
         image = self._survey.topics[image_topic].image
         fx, fy, cx, cy, *distortion = intrinsics
         return Calibration(
@@ -310,7 +308,6 @@ class _Builder:
         )
 
     def _check_depth(self) -> None:
-        """Raise InputError where the depth topic holds something else, or several could be it."""
         topics = self._topics
         image = self._survey.topics[topics.depth].image
         if image.kind != "depth":
@@ -325,7 +322,7 @@ class _Builder:
             )
 
     def _check_clock(self) -> None:
-        """Raise InputError where a clock went back: then a stamp of images and tf is ambiguous."""
+        """Raise InputError if a clock went back: stamps are then ambiguous."""
         for name in (self._topics.color, self._topics.depth):
             clock = self._survey.topics[name].clock
             if clock.went_back:
@@ -337,7 +334,7 @@ class _Builder:
                 )
 
     def _check_world(self) -> str:
-        """The world frame, after checking that tf joins the camera to it."""
+        """The world frame, if tf joins the camera to it."""
         tf, frame_id = self._survey.tf, self._frame_id
         if self._topics.name in self._options.camera_poses:
             return self._options.world_frame or "world"
@@ -365,7 +362,6 @@ class _Builder:
             raise InputError(f"{self._where}: {info}: {error.message}", remedy=error.remedy) from None
 
     def _registration(self, color: Intrinsics) -> DepthToColor:
-        """How raw depth reaches the colour camera. Raises InputError where K or the transform is not known."""
         topics, tf, color_frame = self._topics, self._survey.tf, self._frame_id
         depth_image = self._survey.topics[topics.depth].image
         size = f"{depth_image.encoding} {depth_image.width}x{depth_image.height}"
@@ -412,7 +408,6 @@ class _Builder:
 
 
 def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    """The topics that --camera names, their CameraInfo looked up where it names none."""
     cameras = []
     for given in options.camera_topics:
         for topic, kind in ((given.color, "colour"), (given.depth, "depth")):
@@ -441,7 +436,7 @@ def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
 
 
 def check_mask_topics(path: Path, survey: Survey, topics: Mapping[str, str], cameras: tuple[str, ...]) -> None:
-    """Raise InputError where a mask topic, by camera name, is for no camera or holds no grey images."""
+    """Raise InputError for a mask topic without camera or grey images."""
     grey = [
         topic.topic.name
         for topic in survey.of_type(IMAGE, COMPRESSED_IMAGE)

@@ -1,8 +1,7 @@
-"""A ROS log as records: cameras found, colour and depth paired, poses from tf, joints in one order.
+"""A ROS log as records: paired images, poses from tf, joints in one order.
 
-Two passes: the first takes all but the images (transforms may follow the images that need them) and plans every
-frame; the second takes only planned images and holds no more of them than the log's disorder demands. For `ingest`,
-files that a capture can hold as they are stay undecoded.
+The first pass skips images, as transforms may follow them, and plans every frame. The second takes planned images, as
+few at once as the log's order allows. For `ingest`, files that a capture can keep stay undecoded.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,14 +37,14 @@ from splatctrl_cli.records import SECOND_NS, Float64, Index, LossReport, Record,
 
 @dataclass(kw_only=True)
 class _Pass:
-    """What one pass over the images met; one that ends early has not met all."""
+    """Findings of one pass, incomplete if it ends early."""
 
     damage: Damage = field(default_factory=Damage)
     num_invalid: int = 0
 
 
 class RosLogSource(Recording):
-    """Records of an MCAP, ROS 1 bag or ROS 2 bag."""
+    """Records of an MCAP or ROS bag."""
 
     has_clock = True
 
@@ -78,7 +77,7 @@ class RosLogSource(Recording):
 
     @property
     def loss(self) -> LossReport:
-        """What did not become records; images that do not decode are those of the pass of `records` that met most."""
+        """The loss; undecodable images are the fullest pass's."""
         loss, most = self._loss, max(self._passes, key=lambda one: (one.damage.count, one.num_invalid))
         return replace(
             loss,
@@ -91,11 +90,10 @@ class RosLogSource(Recording):
         return decoded(by_stamp(self.states, self._frames(lazily=False)))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Of every planned frame."""
         return ((planned.stamp_ns, planned.camera.name, planned.T_world_camera) for planned in self._plan)
 
     def pose_at(self, camera: str, stamp_ns: int) -> Float64 | None:
-        """T_world_camera (4, 4) of a camera at any time [ns]; None where tf does not know it."""
+        """T_world_camera (4, 4) at [ns]; None if tf does not know it."""
         found = next(c for c in self._rig if c.name == camera)
         return found.pose_at(self._tf, stamp_ns, round(self._options.pose_tolerance_s * SECOND_NS))
 
@@ -131,7 +129,7 @@ class RosLogSource(Recording):
         return plan
 
     def _images(self, found: Survey, topic: str) -> tuple[Index, Index]:
-        """Number and stamp of each image but those that came again; these and missing ones are counted."""
+        """Numbers and stamps without repeats; counts repeated and missing images."""
         stamps = np.array(found.topics[topic].stamps_ns, dtype=np.int64)
         if len(stamps) > 1 and not stamps.any():
             raise InputError(
@@ -152,7 +150,6 @@ class RosLogSource(Recording):
     def _add(
         self, plan: FramePlan, found: Survey, camera: Camera, stamp_ns: Index, color: Index, depth: Index
     ) -> None:
-        """Plan the pairs of a camera, those without a pose counted. Raises InputError where none has one."""
         tolerance_ns = round(self._options.pose_tolerance_s * SECOND_NS)
         pairing_ns = round(self._options.pairing_tolerance_s * SECOND_NS)
         masks = _mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
@@ -167,7 +164,7 @@ class RosLogSource(Recording):
         self._loss.without_pose += len(color) - num
 
     def _frames(self, *, lazily: bool = True) -> Iterator[StoredFrame]:
-        """lazily: files of images that need no change are only decoded on demand."""
+        """Yield frames; lazily: unchanged image files are decoded on demand."""
         lost, decoder, checked = _Pass(), MessageDecoder(), set[str]()
         self._passes.append(lost)
         for planned, messages in planned_images(self._log, self._plan, lost.damage, HeldMessages()):
@@ -193,8 +190,9 @@ class RosLogSource(Recording):
 def _images(
     decoder: MessageDecoder, camera: Camera, messages: Sequence[RawMessage], *, is_whole: bool
 ) -> list[ImageMessage]:
-    """Colour, depth and mask; is_whole: all decoded, not only what a capture cannot keep. Raises
-    UndecodableMessageError.
+    """Colour, depth and mask; is_whole: all decoded, not only what a capture cannot keep.
+
+    Raises UndecodableMessageError.
     """
     kept = (False,) * 3 if is_whole else (*_keeps_files(camera), False)
     images = [
@@ -212,7 +210,7 @@ def _images(
 
 
 def _keeps_files(camera: Camera) -> tuple[bool, bool]:
-    """Whether image files of colour and depth go into a capture as they are."""
+    """True for colour and depth whose files a capture keeps."""
     is_plain = camera.undistortion is None
     return is_plain, is_plain and camera.depth_to_color is None
 
@@ -241,7 +239,6 @@ def _stored_frame(
 
 
 def _rig(log: RawLog, found: Survey, options: SourceOptions) -> tuple[Camera, ...]:
-    """The cameras. Raises InputError for what they lack, which in a damaged log may be what was lost."""
     try:
         return build_cameras(log, found, options)
     except InputError as error:
@@ -263,7 +260,7 @@ def _times(found: Survey, camera: Camera) -> str:
 def _mask_by_color(
     survey: Survey, color_topic: str, mask_topic: str, tolerance_ns: int, camera: str, loss: LossReport
 ) -> dict[int, int]:
-    """Mask number by colour number, the closest stamps paired; images without a mask are noted in `loss`."""
+    """Mask number by colour number, closest stamps paired; missing ones are noted."""
     if not mask_topic:
         return {}
     color_ns, mask_ns = survey.topics[color_topic].stamps_ns, survey.topics[mask_topic].stamps_ns

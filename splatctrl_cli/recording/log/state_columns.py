@@ -1,4 +1,4 @@
-"""Cleaned joint states as columns that memory need not hold, and as the states they are."""
+"""Cleaned joint states, as columns on disk and as states."""
 
 from array import array
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -17,10 +17,10 @@ COLUMNS = (*OF_JOINTS, "T_base_ee", "T_world_ee")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateColumns(Sequence[JointState]):
-    """T states by stamp: stamp_ns (T,); position, velocity (T, J); what a log may have beside them, None where it has
-    none: commanded_velocity (T, J), T_base_ee and T_world_ee (T, 4, 4), NaN where a state has none.
+    """T states by stamp: stamp_ns (T,); position, velocity (T, J).
 
-    ``columns[i]`` and iteration give states, read a block at a time.
+    commanded_velocity (T, J), T_base_ee, T_world_ee (T, 4, 4): None if absent, NaN where a state has none. Indexing
+    and iteration give states, read a block at a time.
     """
 
     stamp_ns: Stamps
@@ -51,7 +51,7 @@ class StateColumns(Sequence[JointState]):
             yield from self.states(first, last)
 
     def postures(self, within_ns: int) -> Posture:
-        """Joint positions at any time, linearly between the states around it that are at most `within_ns` away."""
+        """Positions at any time, linear between states at most `within_ns` away."""
 
         def posture(stamp_ns: int) -> Float64 | None:
             after = int(np.searchsorted(self.stamp_ns, stamp_ns))
@@ -71,7 +71,7 @@ class StateColumns(Sequence[JointState]):
         return posture
 
     def states(self, first: int, last: int) -> list[JointState]:
-        """The states of a range."""
+        """States first to last, excluded."""
         optional = (self.commanded_velocity, self.T_base_ee, self.T_world_ee)
         commanded, base, world = (_optional(values, first, last) for values in optional)
         position, velocity = self.position[first:last], self.velocity[first:last]
@@ -88,15 +88,14 @@ class StateColumns(Sequence[JointState]):
         ]
 
     def select(self, index: Index) -> Self:
-        """The states of an index (K,), in its order."""
+        """States of an index (K,), in its order."""
         return self._changed(lambda table, _: selected(table, index), COLUMNS, stamp_ns=self.stamp_ns[index])
 
     def of_joints(self, order: Index) -> Self:
-        """The joints of an order (J,)."""
         return self._changed(lambda table, _: of_columns(table, order), OF_JOINTS)
 
     def of_log(self, order: Index, factor: Float64, offset: Float64) -> Self:
-        """Joints (J,) each of which moves as a column: ``position[order] * factor + offset``."""
+        """Joints (J,): ``position[order] * factor + offset``."""
         plain = self.of_joints(order)
         if (factor == 1.0).all() and (offset == 0.0).all():
             return plain
@@ -108,11 +107,10 @@ class StateColumns(Sequence[JointState]):
         return plain._changed(moved, OF_JOINTS)
 
     def tables(self) -> dict[str, Table]:
-        """The columns of `COLUMNS` that are present."""
+        """The present `COLUMNS`."""
         return {name: table for name in COLUMNS if (table := getattr(self, name)) is not None}
 
     def _changed(self, change: Callable[[Table, str], Table], names: Collection[str], **others: Any) -> Self:
-        """A copy with `change` applied to the named columns that are present."""
         changed: dict[str, Any] = {
             name: change(table, name) for name, table in self.tables().items() if name in names
         }
@@ -123,13 +121,10 @@ NO_STATES = StateColumns(stamp_ns=np.zeros(0, np.int64), position=np.zeros((0, 0
 
 
 class ColumnWriter:
-    """Columns of states that come one after the other, a block at a time: NaN where a state has no value."""
+    """A writer of columns by state, in blocks; NaN if missing."""
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]], blocks: Mapping[str, Iterable[Float64]]) -> None:
-        """shapes: of a row of each column; blocks: of whole columns of states that are known already.
-
-        Raises ValueError where these are of several lengths.
-        """
+        """shapes: a row's; blocks: columns of known states. Raises ValueError if they differ in length."""
         self._shapes = shapes
         self._files = {name: RowFile(shapes[name], of_column) for name, of_column in blocks.items()}
         self._num, *others = {len(file) for file in self._files.values()} or {0}  # states that are in the files
@@ -141,13 +136,13 @@ class ColumnWriter:
         return self._num + len(self._waiting)
 
     def add(self, values: Mapping[str, Float64 | None]) -> None:
-        """The next state's, by column."""
+        """Add a state by column."""
         self._waiting.append(values)
         if len(self._waiting) == BLOCK:
             self._flush()
 
     def tables(self) -> dict[str, Rows]:
-        """Of all states so far; a column of which no state has a value is not there."""
+        """Non-empty tables so far."""
         self._flush()
         return {name: Rows(self._files[name]) for name in self._shapes if name in self._files}
 
@@ -164,7 +159,7 @@ class ColumnWriter:
 
 
 class StateCollector:
-    """Takes states one after the other and gives their columns."""
+    """A collector of states."""
 
     def __init__(self, num_joints: int) -> None:
         self._num_joints = num_joints
@@ -173,7 +168,7 @@ class StateCollector:
         self._columns = ColumnWriter({name: joints if name in OF_JOINTS else pose for name in COLUMNS}, {})
 
     def add(self, state: JointState) -> None:
-        """The next state. Raises InputError for one of another number of joints."""
+        """Add a state. Raises InputError for another number of joints."""
         if np.shape(state.position) != (self._num_joints,):
             raise InputError(
                 f"joint state {len(self._stamps)}: expected {self._num_joints} joints, got {np.size(state.position)}"
@@ -182,14 +177,13 @@ class StateCollector:
         self._columns.add({name: getattr(state, name) for name in COLUMNS})
 
     def columns(self) -> StateColumns:
-        """Of all states so far."""
+        """Columns so far."""
         nothing = np.zeros((0, self._num_joints))
         found: dict[str, Table] = {"position": nothing, "velocity": nothing, **self._columns.tables()}
         return StateColumns(stamp_ns=np.array(self._stamps, dtype=np.int64), **found)
 
 
 def _optional(values: Table | None, first: int, last: int) -> list[Float64 | None]:
-    """A value per state of a range, None where it is not finite."""
     if values is None:
         return [None] * (last - first)
     return [value if np.isfinite(value).all() else None for value in values[first:last]]

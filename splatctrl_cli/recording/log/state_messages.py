@@ -1,6 +1,4 @@
-"""Joint states out of decoded messages of the types that robots publish them in, and as columns by which joints a
-message names.
-"""
+"""Joint states of robots' messages, in columns by joint names."""
 
 from array import array
 from collections import Counter
@@ -31,10 +29,10 @@ def _none() -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class RawJoints:
-    """One joint state as recorded, in the order of its names.
+    """A joint state as recorded, in the order of its names.
 
-    position (J,); velocity, commanded_velocity (J,) or empty; log_time_ns: when it was logged; T_base_ee (4, 4): the
-    end effector that the robot's own controller reports; note: what of the message is not used, and why.
+    position (J,); velocity, commanded_velocity (J,) or empty; T_base_ee (4, 4): the controller's end effector; note:
+    what is unused, and why.
     """
 
     stamp_ns: int
@@ -48,7 +46,7 @@ class RawJoints:
 
 
 def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoints]:
-    """The joint states of a message of `STATE_TYPES`, log time [ns]. Raises UndecodableMessageError."""
+    """States of a `STATE_TYPES` message, log time [ns]. Raises UndecodableMessageError."""
     if type_name == JOINT_STATE:
         names, position = tuple(str(name) for name in message.name), _array(message.position)
         velocity = _array(message.velocity)
@@ -61,26 +59,26 @@ def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoint
 
 
 def rigid_or_none(T: Float64) -> Float64 | None:
-    """A pose (4, 4) where it is one: finite, a rotation, not the zeros of a field that nobody filled."""
+    """The pose (4, 4); None unless finite and a rotation (an unfilled field is zeros)."""
     R = T[:3, :3]
     is_rigid = np.isfinite(T).all() and np.abs(R.T @ R - np.eye(3)).max() < _MAX_SKEW and np.linalg.det(R) > 0
     return T if is_rigid else None
 
 
 def pose_of_columns(values: Float64) -> Float64 | None:
-    """T (4, 4) of 16 numbers, columns one after the other, as libfranka stores poses (franka/robot_state.h)."""
+    """T (4, 4) of 16 numbers by columns, as in libfranka (franka/robot_state.h)."""
     return rigid_or_none(values.reshape(4, 4).T)
 
 
 def pose_of_quat(position: Float64, quat_xyzw: Float64) -> Float64 | None:
-    """T (4, 4) of a position [m] and a quaternion, None where its length is not one."""
+    """T (4, 4) of a position [m], None if the quaternion is not unit."""
     if not (np.isfinite(position).all() and abs(float(np.linalg.norm(quat_xyzw)) - 1.0) < _MAX_SKEW):
         return None
     return transform_from(position, quat_xyzw)
 
 
 def _franka(message: Any, log_time_ns: int) -> RawJoints:
-    """FrankaRobotState of franka_ros2 (states with names, PoseStamped), or the older one of bare arrays."""
+    """franka_ros2's FrankaRobotState (named states, PoseStamped), or the older bare arrays."""
     fields = {name.lower(): getattr(message, name) for name in message.__dataclass_fields__}
     if "measured_joint_state" in fields:
         measured, desired, pose = fields["measured_joint_state"], fields["desired_joint_state"], fields["o_t_ee"].pose
@@ -98,7 +96,7 @@ def _franka(message: Any, log_time_ns: int) -> RawJoints:
 
 
 def _controller(message: Any, log_time_ns: int) -> RawJoints:
-    """`feedback` and `reference`, where they are filled, else `actual` and `desired` of before (control_msgs)."""
+    """Filled `feedback` and `reference`, else the older `actual` and `desired` (control_msgs)."""
     names = tuple(str(name) for name in message.joint_names)
     actual = _filled(message, ("feedback", "actual"), len(names))
     wanted = _filled(message, ("reference", "desired"), len(names))
@@ -140,7 +138,7 @@ def _checked(
 
 
 def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
-    """Every point of a planned motion; a header without a stamp means that it begins when it is sent."""
+    """Every point of a planned motion, from log time without a header stamp."""
     names = tuple(str(name) for name in message.joint_names)
     start_ns = stamp_ns(message.header) or log_time_ns
     states = []
@@ -170,10 +168,10 @@ COLUMNS = ("position", "velocity", "commanded_velocity", "T_base_ee")
 
 
 class JointStream:
-    """States that name the same joints; `names` in the order of the first, which is that of the columns."""
+    """States with equal joints, in the first one's order."""
 
     def __init__(self, names: tuple[str, ...], columns: Mapping[str, Iterable[Float64]] | None = None) -> None:
-        """columns: as blocks of rows, of states that are known already."""
+        """columns: rows of known states, in blocks."""
         self.names = names
         self._stamps, self._log_times = array("q"), array("q")
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
@@ -184,7 +182,7 @@ class JointStream:
     def of(
         cls, names: tuple[str, ...], stamp_ns: Stamps, log_time_ns: Stamps, columns: Mapping[str, Iterable[Float64]]
     ) -> "JointStream":
-        """The stream that had these columns, given as blocks of rows. Raises ValueError for other lengths."""
+        """Build from blocks of rows. Raises ValueError for other lengths."""
         stream = cls(names, columns)
         stream._stamps.extend(stamp_ns.tolist())
         stream._log_times.extend(log_time_ns.tolist())
@@ -197,22 +195,23 @@ class JointStream:
 
     @property
     def stamp_ns(self) -> Stamps:
-        """Of the messages (T,)."""
+        """Message stamps (T,)."""
         return np.array(self._stamps, dtype=np.int64)
 
     @property
     def log_time_ns(self) -> Stamps:
-        """When they were logged (T,)."""
+        """Log times (T,)."""
         return np.array(self._log_times, dtype=np.int64)
 
     def columns(self) -> dict[str, Rows]:
-        """position, velocity, commanded_velocity (T, J), T_base_ee (T, 4, 4): NaN where a state has none, not there
-        where none has one.
+        """position, velocity, commanded_velocity (T, J), T_base_ee (T, 4, 4).
+
+        NaN where a state has none, absent if none has one.
         """
         return self._columns.tables()
 
     def add(self, state: RawJoints) -> None:
-        """The next state. Raises OverflowError for a time beyond 64 bits."""
+        """Add a state. Raises OverflowError for a time beyond 64 bits."""
         times = array("q", (state.stamp_ns, state.log_time_ns))  # both, before either is kept
         self._stamps.append(times[0])
         self._log_times.append(times[1])
@@ -228,7 +227,7 @@ class JointStream:
 
 
 class JointLog:
-    """The states of a topic in file order; first_names: of the first, None before it; notes: of states, counted."""
+    """States in file order; first_names: the first one's, or None; notes: counted."""
 
     def __init__(self) -> None:
         self.first_names: tuple[str, ...] | None = None
@@ -238,7 +237,7 @@ class JointLog:
 
     @classmethod
     def of(cls, num: int, streams: Sequence[JointStream]) -> "JointLog":
-        """The log of `num` states that had these streams."""
+        """Build from `num` states' streams."""
         log = cls()
         log._num = num
         log._streams = {frozenset(stream.names): stream for stream in streams}
@@ -250,11 +249,11 @@ class JointLog:
 
     @property
     def streams(self) -> list[JointStream]:
-        """By which joints they name; states that name none are in none."""
+        """Streams by joints, without nameless states."""
         return list(self._streams.values())
 
     def extend(self, states: Iterable[RawJoints]) -> None:
-        """The next states. Raises OverflowError for a time beyond 64 bits."""
+        """Add states. Raises OverflowError for a time beyond 64 bits."""
         for state in states:
             self.notes.update(filter(None, [state.note]))
             if state.names:

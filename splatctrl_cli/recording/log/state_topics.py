@@ -1,6 +1,4 @@
-"""The joint states of a log's topics: which topic, joints spread over several topics, names without a prefix; and
-which of two clocks the log goes by: what stamped the messages, or what logged them.
-"""
+"""Joint states of a log's topics: chosen, merged, renamed, clocks checked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,8 +35,6 @@ _COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoi
 
 @dataclass(frozen=True, kw_only=True)
 class _Stream:
-    """States of one topic that name the same joints, under the names to take them by."""
-
     where: str
     names: tuple[str, ...]
     states: JointStream
@@ -47,10 +43,10 @@ class _Stream:
 def joint_records(
     survey: Survey, options: SourceOptions, loss: LossReport, wanted: Sequence[str] | None = None
 ) -> tuple[tuple[str, ...], StateColumns]:
-    """Joint names and states by stamp; no names and no states where the log holds none.
+    """Joint names and states by stamp; both empty if the log has none.
 
-    With `wanted` (a robot's joints), they are brought together from the topics that have them. Else the states are of
-    one topic, and those that lack a joint of the fullest (a gripper that publishes alone) are left out with a note.
+    With `wanted` (a robot's joints), their topics are merged. Else one topic is used; states without all its joints
+    (a gripper that publishes alone) are left out with a note.
     """
     topics = state_topics(survey, options, loss)
     if not topics:
@@ -68,9 +64,9 @@ def joint_records(
 
 
 def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> list[TopicSurvey]:
-    """The topics with joint states, planned motions only where nothing measured is there.
+    """Topics with states; planned motions only if nothing is measured.
 
-    Raises InputError where --joint-topic is none of them.
+    Raises InputError for an unknown --joint-topic.
     """
     found = [t for t in survey.of_type(*STATE_TYPES) if t.joints.streams]
     for topic in survey.of_type(*STATE_TYPES):
@@ -89,9 +85,7 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
 
 
 def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
-    """/joint_states, else the JointState topic with most messages, else the fullest of another type; one that names
-    commands last.
-    """
+    """/joint_states, else the largest JointState topic, else another; commands last."""
     by_name = {topic.topic.name: topic for topic in topics}
     chosen = by_name[
         max(
@@ -112,7 +106,7 @@ def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
 
 
 def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
-    """The states of a topic that name the most joints; others (a gripper that publishes alone) are noted."""
+    """States with the most joints; others (a gripper that publishes alone) are noted."""
     chosen = max(_streams([topic]), key=lambda s: (len(s.names), len(s.states), sorted(s.names)))
     others = len(topic.joints) - len(chosen.states)
     if others:
@@ -121,11 +115,10 @@ def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
 
 
 def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: LossReport) -> RawTrack:
-    """The states of the joints `wanted` as far as the topics have them, from as few topics as hold them.
+    """Merge the states of the joints `wanted` from as few topics as possible.
 
-    The topic with the most of them gives the stamps, of equals one with end-effector poses, then /joint_states; other
-    joints are interpolated between the states of their topics. States outside of these, or in a gap of more than
-    `STATES_BRIDGED` over which a joint moved, are left out with a note.
+    The topic with most of them gives the stamps; ties prefer end-effector poses, then /joint_states. Other joints are
+    interpolated. States outside their times, or in gaps over `STATES_BRIDGED` with motion, are left out with a note.
     """
     streams = _renamed(_streams(topics), wanted, loss)
     base = _base(streams, wanted)
@@ -156,7 +149,7 @@ def _streams(topics: Sequence[TopicSurvey]) -> list[_Stream]:
 
 
 def _base(streams: Sequence[_Stream], wanted: Sequence[str]) -> _Stream:
-    """The stream with most of the joints `wanted`, of equals one with end-effector poses, then /joint_states."""
+    """The stream with most `wanted`; ties prefer end-effector poses, then /joint_states."""
     return max(
         streams,
         key=lambda stream: (
@@ -175,10 +168,10 @@ def _is_command(topic: str) -> bool:
 
 
 def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | None) -> None:
-    """Raise where the states of joints `wanted` (None: of all) are those of two robots.
+    """Raise if the states of joints `wanted` (None: all) come from two robots.
 
-    InputError for another topic, not one of commands, that has the same joints elsewhere by over `STATES_RIVAL`;
-    NotEvaluableError for two publishers that take turns on one topic.
+    InputError if another topic, not of commands, has them over `STATES_RIVAL` apart; NotEvaluableError if two
+    publishers take turns on one topic.
     """
     streams = _streams(topics)
     if wanted is None:
@@ -207,7 +200,7 @@ def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | 
 
 
 def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
-    """Median distance [rad or m] of two streams' shared joints at the same times; 0 where they do not overlap."""
+    """Median distance [rad or m] of shared joints; 0 without overlap."""
     stamps, its = base.states.stamp_ns, other.states.stamp_ns
     at, at_other = np.argsort(stamps, kind="stable"), np.argsort(its, kind="stable")
     its = its[at_other]
@@ -223,7 +216,7 @@ def _apart(base: _Stream, other: _Stream, shared: Sequence[str]) -> float:
 
 
 def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
-    """Count states that lie far from both neighbours, which are close together: no joint turns back so fast."""
+    """Count states far from both neighbours, which are close: no joint returns so fast."""
     position = stream.states.columns().get("position")
     columns = [stream.names.index(name) for name in names]
     if position is None or not columns:
@@ -241,7 +234,7 @@ def _num_turns(stream: _Stream, names: Sequence[str]) -> int:
 
 
 def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
-    """Rename a stream's unknown joints to the robot's missing ones, where only a prefix differs."""
+    """Rename unknown joints to the robot's if only a prefix differs."""
     found = dict.fromkeys(name for stream in streams for name in stream.names)
     unknown, missing = [n for n in found if n not in wanted], [name for name in wanted if name not in found]
     names = with_prefix(unknown, missing)
@@ -253,7 +246,7 @@ def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) ->
 
 
 def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
-    """Map a log's joint names to the robot's by a prefix that either has; empty unless one prefix fits best."""
+    """A log's joint names to the robot's by either side's prefix; empty unless one fits best."""
     by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
     for name in dict.fromkeys(found):
         for meant in wanted:
@@ -267,7 +260,6 @@ def with_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
 
 
 def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
-    """The states of a stream with `names` as columns."""
     states, columns = stream.states, stream.states.columns()
     return RawTrack(
         where=stream.where,
@@ -278,7 +270,7 @@ def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
 
 
 def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
-    """`track` with the joints of `other`, interpolated at its stamps; states where that cannot be are left out."""
+    """Add the joints of `other`, interpolated; states without them are left out."""
     order = np.argsort(other.stamp_ns, kind="stable")
     at = other.stamp_ns[order]
     stamps = track.stamp_ns
@@ -322,15 +314,14 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
 
 
 def _is_still(table: Table, before: Index, after: Index) -> Bool:
-    """Pairs of states (T,) of which no joint differs."""
     changes = (table[after[first:last]] - table[before[first:last]] for first, last in ranges(len(before)))
     return np.concatenate([np.zeros(0, np.bool_), *(np.abs(c).max(axis=1) < STATES_STILL for c in changes)])
 
 
 def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossReport) -> Stamps:
-    """The stamps (T,) [ns] to use, in file order: those of the headers, or the log's where no header has one.
+    """Stamps (T,) [ns] in file order, of headers, or the log's if none has one.
 
-    Notes another clock, a drift and steps in `loss`. Raises InputError for states of two clocks.
+    Notes another clock, drift and steps in `loss`. Raises InputError for two clocks.
     """
     is_unset = stamp_ns == 0
     if is_unset.all():
@@ -385,10 +376,9 @@ def _mixed(where: str, step: float, state: int) -> InputError:
 
 
 def _drift(late: Float64, seconds: Float64) -> tuple[float, float]:
-    """How much later [s] the last quarter is logged than the first, and the seconds between them.
+    """Growth [s] of the log delay from first to last quarter, and the seconds between.
 
-    Of each quarter the tenth percentile counts: a message may be logged late, but not early. 0 where the change is
-    not spread over the log (a step, a stall).
+    Each quarter's tenth percentile counts: a message may be logged late, not early. 0 if it is a step or a stall.
     """
     quarter = len(late) // 4
     span = float(np.median(seconds[-quarter:]) - np.median(seconds[:quarter])) if quarter >= 10 else 0.0

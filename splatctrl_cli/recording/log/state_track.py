@@ -1,5 +1,6 @@
-"""Joint states of one source, cleaned: in time order, one per stamp, with velocities (from positions whose stamps
-jitter, where there are none); what was wrong is counted.
+"""Joint states of one source, cleaned: in time order, one per stamp, with velocities.
+
+Missing velocities come from positions, without the stamps' jitter; faults are counted.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +18,7 @@ from splatctrl_cli.records import Bool, Float64, LossReport, Stamps
 
 
 def gaps_of(stamp_ns: Stamps) -> NDArray[np.intp]:
-    """Indices i of the gaps between states i and i + 1; stamps (T,) rise."""
+    """Indices i of gaps between states i and i + 1; stamps (T,) rise."""
     steps = np.diff(stamp_ns)
     if not len(steps):
         return np.zeros(0, dtype=np.intp)
@@ -26,10 +27,10 @@ def gaps_of(stamp_ns: Stamps) -> NDArray[np.intp]:
 
 
 def smoothed_seconds(stamp_ns: Stamps) -> Float64:
-    """Times (T,) [s] since the first stamp of a robot that sends at a fixed rate, without the jitter of sending.
+    """Times (T,) [s] since the first stamp, without the sender's jitter.
 
-    The line through the stamps of the neighbouring states over their numbers, lost ones counted. Stamps that follow
-    no fixed rate (residuals above a quarter of a period), or that would no longer rise, come back as they are.
+    A line is fitted through neighbouring stamps over their numbers, lost ones counted. Stamps without a fixed rate
+    (residuals above a quarter period), or that would not rise, are unchanged.
     """
     seconds = np.asarray((stamp_ns - stamp_ns[0]) * 1e-9, dtype=np.float64)
     if len(seconds) < 3:
@@ -54,7 +55,7 @@ def smoothed_seconds(stamp_ns: Stamps) -> Float64:
 
 
 class _Sums:
-    """Running sums of k, r, k^2 and k r over all states so far, of which the newest are kept."""
+    """Running sums of k, r, k^2 and k r; only recent ones are kept."""
 
     def __init__(self) -> None:
         self._sums = np.zeros((4, 1))  # up to but not with state `_start` and those after it
@@ -62,29 +63,28 @@ class _Sums:
 
     @property
     def num(self) -> int:
-        """States that were added."""
+        """States added."""
         return self._start + self._sums.shape[1] - 1
 
     def add(self, k: Float64, r: Float64) -> None:
-        """The next states' (T,)."""
+        """Add values (T,)."""
         rows = [np.cumsum(np.concatenate([s[-1:], v])) for s, v in zip(self._sums, (k, r, k**2, k * r), strict=True)]
         self._sums = np.hstack([self._sums, np.array(rows)[:, 1:]])
 
     def means(self, first: NDArray[np.intp], last: NDArray[np.intp]) -> Float64:
-        """(4, T) of the states from each first up to its last."""
+        """Means (4, T) from first to last, excluded."""
         return np.asarray((self._sums[:, last - self._start] - self._sums[:, first - self._start]) / (last - first))
 
     def forget(self, before: int) -> None:
-        """The sums that no later state asks for."""
+        """Drop sums no later state needs."""
         if before > self._start:
             self._sums, self._start = self._sums[:, before - self._start :].copy(), before
 
 
 def _numbers(seconds: Float64, period: float) -> Float64:
-    """The number (T,) of each state since the first, lost ones counted.
+    """Number (T,) of each state since the first, lost ones counted.
 
-    A clock that ticks with the period follows the stamps slowly, so that jitter of almost half a period
-    is not taken for a loss.
+    A clock that slowly follows the stamps takes jitter up to half a period for no loss.
     """
     numbers = np.zeros(len(seconds))
     clock, number = 0.0, 0
@@ -103,14 +103,14 @@ def _numbers(seconds: Float64, period: float) -> Float64:
 def differentiated(stamp_ns: Stamps, position: Float64) -> Float64:
     """Velocities (T, J) [1/s] of positions (T, J) at rising stamps (T,) [ns].
 
-    The slope, at each state, of the parabola through it and its two neighbours on either side (a Savitzky-Golay
-    derivative for uneven steps), on the smoothed clock; nothing is fitted across a gap. A state alone has velocity 0.
+    The slope of a parabola through the state and two neighbours on either side (Savitzky-Golay for uneven steps), on
+    the smoothed clock, never across a gap. A lone state has 0.
     """
     return np.concatenate([np.zeros((0, *position.shape[1:])), *(v for _, v in slopes_by_block(stamp_ns, position))])
 
 
 def slopes_by_block(stamp_ns: Stamps, position: Table) -> Iterator[tuple[int, Float64]]:
-    """`differentiated` a block at a time: the first state of each and the velocities (K, J) there."""
+    """Yield `differentiated` by block: first state, velocities (K, J)."""
     for start, end in pairwise([0, *(gaps_of(stamp_ns) + 1).tolist(), len(stamp_ns)]):
         if end - start == 1:
             yield start, np.zeros((1, *position.shape[1:]))
@@ -137,25 +137,22 @@ def _slopes(seconds: Float64, position: Float64) -> Float64:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawTrack(StateColumns):
-    """Joint states as recorded, in file order; velocity is NaN where absent.
-
-    where: what to call it in a message (a topic, a file).
-    """
+    """States as recorded, in file order; absent velocity is NaN. where: for messages."""
 
     where: str
     names: tuple[str, ...]
 
     def of_names(self, names: Sequence[str]) -> "RawTrack":
-        """The columns of these joints, in that order."""
+        """Columns of these joints, in order."""
         order = np.array([self.names.index(name) for name in names], dtype=np.int64)
         return replace(self.of_joints(order), names=tuple(names))
 
 
 def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
-    """The states by stamp, each stamp once, each with velocities; every change is noted in `loss`.
+    """Sort states by stamp, each stamp once, each with velocities; changes are noted in `loss`.
 
-    States with a position that is not finite are damage and left out; of states with one stamp the first is kept;
-    velocities that are absent, NaN, or zero throughout for a joint that moves, are differences of the positions.
+    Positions that are not finite are damage; of equal stamps the first is kept. Velocities that are absent, NaN, or
+    always zero for a moving joint become position differences.
     """
     ordered = unwrapped(_in_order(_finite(raw, loss), loss), loss)
     gaps = gaps_of(ordered.stamp_ns)
@@ -172,7 +169,7 @@ def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
 
 
 def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
-    """Remove steps of a whole turn between states, as from pi to -pi. The states are in time order."""
+    """Remove whole turns between states in time order, such as pi to -pi."""
     position, file = raw.position, RowFile(raw.position.shape[1:])
     turns: Float64 = np.zeros(position.shape[1])
     is_close = np.diff(raw.stamp_ns) * 1e-9 <= fixed.STATES_BRIDGED
@@ -196,7 +193,6 @@ def unwrapped(raw: RawTrack, loss: LossReport) -> RawTrack:
 
 
 def _num_posed(raw: RawTrack) -> int:
-    """States with an end-effector pose."""
     poses = [table for table in (raw.T_base_ee, raw.T_world_ee) if table is not None]
     blocks = [[np.isfinite(T[first:last]).all(axis=(1, 2)) for T in poses] for first, last in ranges(len(raw))]
     return sum(int(np.any(block, axis=0).sum()) for block in blocks)
@@ -235,7 +231,6 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
 
 
 def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
-    """velocity (T, J) with what is missing taken from the positions."""
     num_taken, is_zero, why = _missing_velocities(raw)
     if not num_taken:
         thinned = raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // fixed.STATES_COMPARED))
@@ -251,7 +246,7 @@ def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
 
 
 def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
-    """Number of states whose velocity comes from positions, joints (J,) that move at velocity 0, and the note."""
+    """Number of states to differentiate, joints (J,) that move at velocity 0, a note."""
     num, num_joints = raw.position.shape[:2]
     low, high = np.full(num_joints, np.inf), np.full(num_joints, -np.inf)
     is_still, is_missing, is_there = (np.full(num_joints, first) for first in (True, False, False))
@@ -275,7 +270,6 @@ def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
 
 
 def _compare_units(raw: RawTrack, loss: LossReport) -> None:
-    """Of states that are few enough to be read at once."""
     position, velocity = raw.position[: len(raw.stamp_ns)], raw.velocity[: len(raw.stamp_ns)]
     slopes: Float64 = differentiated(raw.stamp_ns, position)
     is_fast = np.abs(slopes) > fixed.STATES_SPEED

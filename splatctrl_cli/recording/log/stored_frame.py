@@ -1,8 +1,8 @@
-"""What `ingest` keeps as its source stored it: frames, lossless without decoding them, and joint states by topic.
+"""Frames and joint states as their source stored them, which `ingest` keeps without decoding.
 
-Joint states of a log's topics are kept as recorded, so that any joints can be asked for: joint_topics/K/stamp_ns.npy,
-log_time_ns.npy (T,) int64; position.npy, and where there are any velocity.npy, commanded_velocity.npy (T, J),
-T_base_ee.npy (T, 4, 4) float64; what K is stands in capture.json.
+All recorded joint states are kept, for any joints. joint_topics/K/: stamp_ns.npy, log_time_ns.npy (T,) int64;
+position.npy and, if any, velocity.npy, commanded_velocity.npy (T, J), T_base_ee.npy (T, 4, 4) float64; capture.json
+describes each K.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -46,8 +46,9 @@ AGAIN = "run `splatctrl ingest` again"
 
 @dataclass(frozen=True, kw_only=True)
 class JointTopics:
-    """The topics with joint states, what became of them (`loss`, its notes from number `first_note` of the whole
-    report on), and the topic that somebody chose.
+    """Topics with joint states, their `loss` and the user's chosen topic.
+
+    first_note: the loss's first note in the whole report.
     """
 
     topics: Sequence[TopicSurvey]
@@ -57,17 +58,17 @@ class JointTopics:
 
 
 def with_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
-    """A report with that of the joint states, its notes from number `at` on."""
+    """Merge the joints' report, its notes at index `at`."""
     return loss.plus(joints, [*loss.notes[:at], *joints.notes, *loss.notes[at:]])
 
 
 def without_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
-    """The reverse of `with_joints`."""
+    """Undo `with_joints`."""
     return loss.plus(joints, [*loss.notes[:at], *loss.notes[at + len(joints.notes) :]], sign=-1)
 
 
 def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) -> dict[str, Any]:
-    """Write the streams of all topics into a capture; `wrote` gets each file. Returns what capture.json says."""
+    """Write streams into a capture; `wrote` gets each file. Returns the capture.json entry."""
     described, number = [], 0
     for topic in kept.topics:
         streams = []
@@ -103,9 +104,9 @@ def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) 
 
 
 def read_topics(folder: Path, described: Mapping[str, Any], checked: Callable[[str], Path]) -> JointTopics:
-    """What `write_topics` wrote. `checked` gives the path of a file whose checksum is right.
+    """Read what `write_topics` wrote; `checked` returns the path of an unchanged file.
 
-    Raises InputError where a file is not as it was written.
+    Raises InputError if damaged.
     """
     try:
         topics = [_topic(entry, checked) for entry in described["topics"]]
@@ -132,14 +133,13 @@ def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSur
 
 
 def write_rows(stream: IO[bytes], rows: Table) -> None:
-    """Rows of float64 as a .npy file, a block at a time."""
+    """Write float64 as .npy, a block at a time."""
     np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": tuple(rows.shape)})
     for block in blocks_of(rows):
         stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())
 
 
 def _blocks(path: Path) -> Iterator[Float64]:
-    """Read a .npy file that `write_rows` wrote. Raises ValueError for another one."""
     with path.open("rb") as stream:
         shape, is_by_columns, dtype = npy_head(stream)
         if dtype != np.dtype("<f8") or is_by_columns or not shape:
@@ -156,14 +156,12 @@ def _blocks(path: Path) -> Iterator[Float64]:
 
 @dataclass(frozen=True, kw_only=True)
 class StoredFrame:
-    """A frame whose images are decoded when they are asked for, and how its source stored them: `ingest` keeps files.
+    """A frame whose images decode on demand, with their files as the source stored them.
 
-    read_color, read_depth: give the frame's color and depth, or raise UndecodableMessageError;
-    color_file: the bytes of a JPEG or PNG that decode to exactly the frame's color, None where there are none;
-    depth_file: those of a 16-bit PNG of which the depth is exactly ``counts * float32(depth_unit)``, or None;
-    depth_unit: [m] of which every depth is a uint16 multiple (``counts * float32(unit)``), None if there is none.
-    origin: where it came from, in words; places: the colour and the depth message without their bytes, empty where
-    there are none.
+    read_color, read_depth: the image, or UndecodableMessageError. color_file: JPEG or PNG bytes of exactly the color.
+    depth_file: 16-bit PNG whose ``counts * float32(depth_unit)`` is exactly the depth. depth_unit: [m] of which every
+    depth is a uint16 multiple. Each is None if there is none. origin: the source in words. places: the messages
+    without bytes, if any.
     """
 
     stamp_ns: int
@@ -182,17 +180,17 @@ class StoredFrame:
 
     @cached_property
     def color(self) -> UInt8:
-        """Of the frame. Raises InputError where the image does not decode."""
+        """The colour. Raises InputError if undecodable."""
         return self._read(self.read_color)
 
     @cached_property
     def depth(self) -> Float32:
-        """Of the frame. Raises InputError where the image does not decode."""
+        """The depth. Raises InputError if undecodable."""
         return self._read(self.read_depth)
 
     @property
     def frame(self) -> RgbdFrame:
-        """The frame, with both images decoded. Raises InputError where one does not."""
+        """The decoded frame. Raises InputError if undecodable."""
         return RgbdFrame(
             stamp_ns=self.stamp_ns,
             camera=self.camera,
@@ -212,29 +210,29 @@ class StoredFrame:
 
 
 class FrameSource(RecordSource, Protocol):
-    """A record source that also says how its frames were stored."""
+    """A record source with frames as stored."""
 
     @property
     def world_frame(self) -> str:
-        """The frame of poses, as the source names it."""
+        """The source's frame of poses."""
         ...
 
     @property
     def states(self) -> StateColumns:
-        """The joint states, by stamp, without a pass over the frames."""
+        """Joint states by stamp, without reading frames."""
         ...
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
-        """As `records`, with the frames as they are stored."""
+        """Yield `records`, undecoded."""
         ...
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp, without its images."""
+        """Yield stamp [ns], camera, T_world_camera (4, 4) by stamp, without images."""
         ...
 
 
 class Recording:
-    """Records by stamp: the joint states, and the frames that a kind of recording gives in `_frames`, if any."""
+    """Records by stamp: joint states, and `_frames`."""
 
     states: StateColumns = NO_STATES
 
@@ -243,7 +241,7 @@ class Recording:
         return decoded(self.stored())
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Yield joint states and frames as they are stored."""
+        """Yield joint states and stored frames."""
         return by_stamp(self.states, self._frames())
 
     def _frames(self) -> Iterator[StoredFrame]:
@@ -251,22 +249,21 @@ class Recording:
 
 
 def is_kept(data: bytes | None) -> bool:
-    """Whether an image file's bytes are of a kind that captures hold: JPEG or PNG."""
+    """True for JPEG or PNG, which captures keep."""
     return data is not None and data.startswith((JPEG, PNG))
 
 
 def is_png(data: bytes | None) -> bool:
-    """Whether these are the bytes of a PNG file."""
+    """True for PNG."""
     return data is not None and data.startswith(PNG)
 
 
 def decoded(items: Iterable[StoredFrame | JointState]) -> Iterator[Record]:
-    """The same records, their frames decoded."""
     return (item.frame if isinstance(item, StoredFrame) else item for item in items)
 
 
 def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:
-    """(H, W) uint8, 1 where an image file or message is not 0. Raises InputError unless 8-bit grey, (H, W)."""
+    """(H, W) uint8, 1 where not 0. Raises InputError unless 8-bit grey of that size."""
     if pixels.dtype != np.uint8 or pixels.shape != (camera.height, camera.width):
         size = "x".join(map(str, reversed(pixels.shape[:2])))
         channels = pixels.shape[2] if pixels.ndim == 3 else 1
@@ -279,9 +276,9 @@ def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:
 
 
 def check_depth(depth: Float32, where: str, scale: float) -> bool:
-    """Whether a depth image [m] holds any depth; raises InputError when its median is implausible.
+    """True with any depth [m]. Raises InputError for an implausible median.
 
-    `scale` [m per count] is what turned counts into metres.
+    scale: metres per count it was read with.
     """
     valid = depth[depth > 0]
     if valid.size == 0:

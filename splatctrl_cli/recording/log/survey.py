@@ -1,7 +1,7 @@
-"""A first pass over a log: topics, stamps, frames, calibrations, joints; of images the first of each topic. And the
-robot's model that a log itself brings: a latched topic ``robot_description``, or that parameter of a node.
+"""A first pass over a log: topics, stamps, frames, calibrations, joints and first images.
 
-Images are paired by their stamps; those that came twice or not at all, and clocks that went back, are counted.
+Pairs images, counts repeats, gaps and clocks that went back, and finds ``robot_description``, latched or a node's
+parameter.
 """
 
 from array import array
@@ -43,9 +43,9 @@ _BLOCK = 1 << 14  # pairs that are Python's numbers at once
 
 
 def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.int64]:
-    """Index pairs (K, 2) of colour and depth at most `tolerance_ns` apart, each index once, the closest pairs first.
+    """Pair colour and depth by index (K, 2), at most `tolerance_ns` apart, closest pairs first.
 
-    Returned by colour stamp. Of equally close pairs the earlier one wins.
+    Each index is used once; of equally close pairs the earlier wins. Sorted by colour stamp.
     """
     color, depth = np.asarray(color_ns, dtype=np.int64), np.asarray(depth_ns, dtype=np.int64)
     order = np.argsort(depth, kind="stable")
@@ -68,10 +68,9 @@ def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.
 
 @dataclass(kw_only=True)
 class StampClock:
-    """Whether the clock of a topic's headers went back while the recording went on: a bag in a loop, a reset.
+    """A detector of header clocks that go back: a bag in a loop, a reset.
 
-    num_back: stamps more than a second behind one that was logged before them; back_ns: the first one's distance,
-    seen at log time back_log_ns.
+    num_back: stamps over a second behind an earlier one; back_ns: the first one's distance, at log time back_log_ns.
     """
 
     num_back: int = 0
@@ -81,7 +80,7 @@ class StampClock:
     _latest_log_ns: int = 0
 
     def see(self, stamp_ns: int, log_time_ns: int) -> None:
-        """The next message in the order of the file."""
+        """Take the next message in order."""
         if self._latest_ns is None or stamp_ns > self._latest_ns:
             self._latest_ns, self._latest_log_ns = stamp_ns, log_time_ns
         elif self._latest_ns - stamp_ns > IMAGES_BACK_NS and log_time_ns > self._latest_log_ns:
@@ -91,20 +90,19 @@ class StampClock:
 
     @property
     def went_back(self) -> bool:
-        """Whether it did: a stamp or two may be wrong by themselves."""
+        """True after several such stamps; single ones may err."""
         return self.num_back >= IMAGES_FEWEST_BACK
 
 
 def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
-    """Numbers (K,) of the images whose stamp none before them has."""
+    """Numbers (K,) of images with a new stamp."""
     return np.sort(np.unique(stamps_ns, return_index=True)[1]).astype(np.int64)
 
 
 def dropped(stamps_ns: Stamps) -> tuple[int, int, float]:
-    """Gaps between different stamps, the images that are missing in them, and the period [ns]; none where there are
-    few stamps, or most intervals differ.
+    """Number of gaps, missing images, and the period [ns]; 0 if unsteady or few.
 
-    The period is the median interval, and steady within a quarter of it must be three intervals of four.
+    The period is the median interval; three of four must be within a quarter of it.
     """
     intervals = np.diff(np.unique(stamps_ns)).astype(np.float64)
     if len(intervals) < IMAGES_FEWEST:
@@ -123,12 +121,14 @@ _MOST_BYTES = 64 << 20  # of chunks that are unpacked
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """What a CameraInfo says: size [px], K (3, 3) of the raw image with its distortion, projection (3, 3) of the
-    rectified image (the left part of P; zero where unset), rotation (3, 3) from the raw camera's axes to those of the
-    rectified (zero where unset), frame. valid (H, W): of a rectified image, False where the lens did not see a pixel.
+    """A CameraInfo's contents.
 
-    Of images that are binned or cut out, these are theirs and sensor_K (3, 3) is that of the whole sensor; cut says
-    how in words ("" where they are whole), is_possible whether the region lies inside the sensor.
+    size [px]; K (3, 3) of the raw image with its distortion; projection (3, 3) of the rectified image (left part of
+    P); rotation (3, 3) from the raw axes to the rectified; both zero if unset. valid (H, W): False where the lens did
+    not see a rectified pixel.
+
+    They fit binned or cropped images, sensor_K (3, 3) the whole sensor; cut says how ("" if whole), is_possible if
+    the region is inside.
     """
 
     width: int
@@ -147,7 +147,7 @@ class Calibration:
 
 @dataclass(kw_only=True)
 class TopicSurvey:
-    """What a log holds of one topic; stamps_ns and clock (image topics only) are of the headers in file order."""
+    """A topic; stamps_ns and clock (images only) are headers' in file order."""
 
     topic: Topic
     count: int = 0
@@ -161,14 +161,14 @@ class TopicSurvey:
 
     @property
     def image(self) -> ImageMessage:
-        """The first image, of a topic that is known to have one."""
+        """The first image, required."""
         assert self.first_image is not None
         return self.first_image
 
 
 @dataclass(kw_only=True)
 class Survey:
-    """Everything of a log but its images; by_log_time: stamps are the times of logging, not those of headers."""
+    """A log without images; by_log_time: stamps are log times."""
 
     by_log_time: bool = False
     topics: dict[str, TopicSurvey] = field(default_factory=dict)
@@ -182,15 +182,15 @@ class Survey:
         return sum(topic.count for topic in self.topics.values())
 
     def of_type(self, *types: str) -> list[TopicSurvey]:
-        """Topics of these types that hold messages, by name."""
+        """Non-empty topics, by name."""
         found = [t for t in self.topics.values() if t.topic.type_name in types and t.count and is_ros(t.topic)]
         return sorted(found, key=lambda t: t.topic.name)
 
 
 def survey(log: RawLog, *, by_log_time: bool = False) -> Survey:
-    """Read `log` once; a message that does not decode is counted as damage.
+    """Read `log` once; undecodable messages are damage.
 
-    by_log_time: take the times of logging for the stamps of images, transforms and joint states.
+    by_log_time: stamp images, transforms and joint states by log time.
     """
     result = Survey(by_log_time=by_log_time)
     decoder = MessageDecoder()
@@ -202,7 +202,6 @@ def survey(log: RawLog, *, by_log_time: bool = False) -> Survey:
 
 
 def add_message(result: Survey, decoder: MessageDecoder, message: RawMessage) -> None:
-    """Count one message, and take from it what a survey keeps."""
     entry = result.topics.setdefault(message.topic.name, TopicSurvey(topic=message.topic))
     if entry.count == 0:
         entry.topic = message.topic
@@ -299,7 +298,7 @@ def _calibration(message: Any) -> Calibration | None:
 
 
 def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints]:
-    """Joint states; by log time all of a message move with its stamp."""
+    """Joint states; log time shifts all of a message."""
     states = read_states(decoded, message.topic.type_name, message.log_time_ns)
     if not result.by_log_time:
         return states
@@ -308,7 +307,7 @@ def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints
 
 
 def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
-    """A survey of the whole log; of a large MCAP one by its index, and notes that say so."""
+    """Survey a log; a large MCAP by its index, noted."""
     size = sum(file.stat().st_size for file in log.files)
     inner, video = (log.inner, log) if isinstance(log, VideoLog) else (log, None)
     if size < LARGE or not isinstance(inner, McapLog):
@@ -341,7 +340,6 @@ def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:
 
 
 def _first_chunks(index: LogIndex) -> list[ChunkIndex]:
-    """The first chunk of each channel, and the first ones of the file, within bounds."""
     wanted = {chunk.chunk_start_offset: chunk for chunk in index.chunks[:4]}
     for channel in sorted(index.counts):
         first = next((c for c in index.chunks if channel in c.message_index_offsets), None)
@@ -363,14 +361,14 @@ _TEXT = 4  # a parameter's type that is text (rcl_interfaces/ParameterType)
 
 @dataclass(frozen=True, kw_only=True)
 class RobotDescription:
-    """The text of a URDF, and the topic or node whose parameter it is."""
+    """A URDF and its topic or node."""
 
     where: str
     text: str
 
 
 def robot_descriptions(log: RawLog) -> list[RobotDescription]:
-    """Those of a log, each text once; of a topic the first message. The topics that have them are read, no others."""
+    """A log's URDFs, each once, from first messages; reads only their topics."""
     topics = log.topics()
     own = {t.name for t in topics if t.type_name == STRING and t.name.rpartition("/")[2] == NAME}
     wanted = own or {t.name for t in topics if t.type_name == EVENT}

@@ -1,10 +1,8 @@
-"""Compressed video in a log, decoded as its messages pass by: each image takes the place of its message; or in a file
-beside a log, with the stamps of its images in a file of its own, which is read as a log of one colour topic.
+"""Compressed video, decoded as a log with its images; in messages, or a file with stamps.
 
-Read are H.264 and H.265 of foxglove.CompressedVideo (Annex B, an image a message; docs.foxglove.dev, CompressedVideo)
-and of ffmpeg_image_transport's FFMPEGPacket. An image needs those before it, back to a key frame: what has no key
-frame before it, or follows an image that is missing, is left out up to the next key frame, and counted. FFmpeg itself
-would show such images, with wrong blocks in them; by what it says of a packet a missing one is told.
+Reads H.264 and H.265 of foxglove.CompressedVideo (Annex B, an image per message; docs.foxglove.dev, CompressedVideo)
+and ffmpeg_image_transport's FFMPEGPacket. Images without a prior key frame, or after a missing image, are dropped and
+counted until the next key frame: FFmpeg shows them with wrong blocks. Its log reveals a missing packet.
 """
 
 import re
@@ -38,14 +36,16 @@ _EARLY, _LATE = f"before its first {KEY_FRAME}", f"that follow missing or damage
 
 
 def is_video(topic: Topic) -> bool:
-    """Whether a topic's messages are packets of video."""
+    """True if messages are video packets."""
     return topic.type_name in FORMATS
 
 
 @dataclass(kw_only=True)
 class _Stream:
-    """One topic's decoder: how many packets it had, those that wait for their image (message without data, header) by
-    number, the last key frame, packets since then at which something was missing, images lost before and after it.
+    """A topic's decoder.
+
+    num: packets. waiting: (message without data, header) by packet. key: last key frame. broken: packets since then
+    with losses. num_early, num_late: images lost before and after it.
     """
 
     context: Any
@@ -58,22 +58,20 @@ class _Stream:
 
 
 class VideoLog:
-    """A log with the images of its video."""
+    """A log with video as images."""
 
     def __init__(self, log: RawLog) -> None:
         self.inner = log
         self.path, self.files, self.container = log.path, log.files, log.container
 
     def topics(self) -> tuple[Topic, ...]:
-        """Of the log, those of video as they are decoded."""
         return tuple(map(_decoded_topic, self.inner.topics()))
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the log's messages, images of video as they come out of the decoder."""
         return self.decoded(self.inner.messages(damage, names), damage)
 
     def decoded(self, messages: Iterable[RawMessage], damage: Damage) -> Iterator[RawMessage]:
-        """Some messages of the log, in its order."""
+        """Decode some of the log's messages, in order."""
         streams: dict[str, _Stream | None] = {}
         decoder = MessageDecoder()
         for message in messages:
@@ -115,9 +113,7 @@ def _decoded_topic(topic: Topic) -> Topic:
 
 
 def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[RawMessage]:
-    """Whole images as messages, by the number of the packet that they came in: the images that a packet lets out, its
-    own, or earlier ones of a stream that reorders; without data, the rest of them.
-    """
+    """Yield whole images that a packet releases, perhaps earlier ones; without data, the rest."""
     frames, is_broken = _decode(stream.context, data, number)
     if is_broken:
         stream.broken.append(number)
@@ -139,7 +135,6 @@ def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[Ra
 
 
 def _decode(context: Any, data: bytes | None, number: int) -> tuple[list[Any], bool]:
-    """What comes out of the decoder, and whether it said that something was missing or damaged."""
     av = of_extra(LIBRARY, EXTRA, "video topics")
     packet = None if data is None else av.Packet(data)
     if packet is not None:
@@ -167,7 +162,6 @@ def _lose(stream: _Stream, numbers: list[int]) -> None:
 
 
 def _count(topic: str, stream: _Stream, damage: Damage) -> None:
-    """Tell `damage` what became no image."""
     _lose(stream, list(stream.waiting))
     for num, where in ((stream.num_early, _EARLY), (stream.num_late, _LATE)):
         if num:
@@ -181,9 +175,9 @@ _TIME = re.compile("time|stamp", re.IGNORECASE)
 
 
 def open_log(path: Path) -> RawLog:
-    """A log, with the images of its video where the library is installed, or a video file with its stamps beside it.
+    """Open a log, or a video file with stamps. Raises InputError.
 
-    Raises InputError.
+    Video is decoded if the library is installed.
     """
     refuse_foreign(path)
     if path.suffix.lower() in SUFFIXES:
@@ -195,11 +189,10 @@ def open_log(path: Path) -> RawLog:
 
 
 class VideoFileLog:
-    """The images of ``X.mp4`` as topic ``/X``, stamped and logged at the times that ``X.csv`` or its kin has.
+    """The images of ``X.mp4`` as topic ``/X``, at the times in ``X.csv`` or its kin.
 
-    The file beside it has a line for each image: a stamp, or of a table the column whose name says time or stamp. Of
-    its digits before the point 10 are seconds since 1970, 13 milliseconds, 16 microseconds and 19 nanoseconds; fewer
-    than ten are seconds. The images name no frame.
+    That file has a stamp per line, or a column named time or stamp. Before the point, 10 digits are seconds since
+    1970, 13 milliseconds, 16 microseconds, 19 nanoseconds; fewer than ten are seconds. Images have no frame.
     """
 
     container = "video"
@@ -219,11 +212,10 @@ class VideoFileLog:
         self._topic = Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)
 
     def topics(self) -> tuple[Topic, ...]:
-        """The one."""
         return (self._topic,)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the images. Raises InputError where there are more, or fewer, than stamps."""
+        """Yield the images. Raises InputError if they and the stamps differ in number."""
         if names is not None and self._topic.name not in names:
             return
         num, found = 0, Damage()
@@ -240,7 +232,6 @@ class VideoFileLog:
             )
 
     def _frames(self, damage: Damage) -> Iterator[Any]:
-        """Images in the order in which they are shown, None for one that is damaged."""
         try:
             with self._av.open(str(self.path)) as container:
                 if not container.streams.video:
@@ -263,7 +254,6 @@ class VideoFileLog:
 
 
 def _read_stamps(path: Path) -> Stamps:
-    """The stamps [ns] of the images in their order. Raises InputError."""
     text = path.read_text(encoding="utf-8", errors="replace")
     lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     rows, column = [re.split(r"[,;\s]+", line) for line in lines], 0

@@ -1,1 +1,1 @@
-"""Joint states and twists that come in tables, and what opens any record of a motion."""
+"""Joint states and twists from tables, and any record of a motion."""

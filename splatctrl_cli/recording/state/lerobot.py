@@ -1,9 +1,8 @@
-"""LeRobot's datasets as a preset of a table of joint states: which file has an episode, and what its columns are.
+"""LeRobot datasets as a preset of [states]: an episode's file and its columns.
 
-Of LeRobot's datasets v2 and v3 (huggingface/lerobot, lerobot_dataset.py, utils.py): ``meta/info.json`` with the
-features, in v2 a file of each episode, ``data/chunk-000/episode_000000.parquet``, in v3 files of many,
-``data/chunk-000/file-000.parquet``, whose column ``episode_index`` says which; ``observation.state`` are the
-positions, ``timestamp`` seconds from the episode's begin.
+Versions 2 and 3 (huggingface/lerobot, lerobot_dataset.py, utils.py) list features in ``meta/info.json``. v2 has
+``data/chunk-000/episode_000000.parquet`` per episode; v3 shares ``data/chunk-000/file-000.parquet`` by column
+``episode_index``. ``observation.state`` is position, ``timestamp`` seconds of the episode.
 """
 
 from collections.abc import Mapping
@@ -22,7 +21,7 @@ def is_lerobot(path: Path) -> bool:
 
 
 def preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
-    """The keys of [states] for an episode of a dataset, by default its only one. Raises InputError."""
+    """An episode's keys of [states], by default the only one. Raises InputError."""
     info = read_json(folder / INFO)
     try:
         feature, num = info["features"][POSITION], int(info["total_episodes"])
@@ -47,7 +46,6 @@ def preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
 
 
 def _file(folder: Path, episode: int) -> Path:
-    """The file with an episode. Raises InputError where none has it."""
     files = sorted((folder / "data").glob("*/*.parquet"))
     of_one = [file for file in files if file.stem == f"episode_{episode:06d}"]
     shared = (file for file in files if file.stem.startswith("file") and len(ParquetFile(file, (EPISODE, episode))))

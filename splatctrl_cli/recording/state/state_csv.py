@@ -1,4 +1,4 @@
-"""Numbers of a CSV file by column, and the logs that libfranka writes."""
+"""CSV numbers by column, and libfranka's logs."""
 
 import csv
 from array import array
@@ -21,13 +21,13 @@ _DESCRIBE = "describe the columns in a .toml (splatctrl help replay, Logs)"
 
 @dataclass(frozen=True, kw_only=True)
 class CsvTable:
-    """A CSV file: the column names of its first line, stripped; its other lines are read a block at a time."""
+    """A CSV file: stripped column names, lines read in blocks."""
 
     path: Path
     names: list[str]
 
     def index(self, name: str | int) -> int:
-        """The first column of that name; a number is one already. Raises InputError."""
+        """The first column so named; a number is unchanged. Raises InputError."""
         if isinstance(name, int):
             return name
         if name not in self.names:
@@ -37,10 +37,10 @@ class CsvTable:
     def read(
         self, time: str | int, unit_ns: int, groups: Mapping[str, Sequence[str | int]], epoch_ns: int = 0
     ) -> tuple[Stamps, dict[str, Rows]]:
-        """Stamps (T,) [ns] of a column of times in units of `unit_ns`, every digit kept, and of each group of columns
-        their numbers (T, K), NaN for an empty cell; columns by name or number.
+        """Read stamps (T,) [ns] and each group's numbers (T, K), NaN for an empty cell.
 
-        Raises InputError naming line and column, for a line of another length than the first, and without any.
+        Times are in `unit_ns`, every digit kept; columns are names or numbers. Raises InputError naming line and
+        column, for a line of another length, and without states.
         """
         chosen = {name: [self.index(column) for column in columns] for name, columns in groups.items()}
         at, stamps = self.index(time), array("q")
@@ -54,7 +54,7 @@ class CsvTable:
         return np.array(stamps, dtype=np.int64), {name: Rows(file) for name, file in files.items()}
 
     def _blocks(self) -> Iterator[tuple[int, list[list[str]]]]:
-        """Lines of cells, and the number of the first; lines without any are not counted."""
+        """Yield a first line's number and rows; empty lines do not count."""
         with self.path.open(newline="", encoding="utf-8-sig") as stream:
             lines = (line for line in csv.reader(stream) if line)
             next(lines, None)
@@ -100,7 +100,7 @@ class CsvTable:
 
 
 def read_csv(path: Path) -> CsvTable:
-    """Raises InputError for a file without states."""
+    """Open a CSV. Raises InputError without states."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             lines = list(islice((line for line in csv.reader(stream) if line), 2))
@@ -116,17 +116,17 @@ def _unreadable(path: Path, error: Exception) -> InputError:
 
 
 def is_libfranka(table: CsvTable) -> bool:
-    """Whether the columns are those of franka::logToCSV."""
+    """True for the columns of franka::logToCSV."""
     return table.names[0] in {"time", "duration"} and _first(table, "q", 0) is not None
 
 
 def libfranka_track(table: CsvTable) -> RawTrack:
     """The states of a log by franka::logToCSV, joints named joint1 ... joint7.
 
-    Its first column counts milliseconds since the robot was switched on. Measured positions are ``q[0]`` to ``q[6]``,
-    velocities ``dq[0]``..., since libfranka 0.14 with ``state.`` before them; what the control loop asked for is
-    ``cmd.dq_d``, before that the second columns named ``dq_d`` (libfranka, src/log.cpp and
-    src/logging/robot_state_log.cpp). Where a program added O_T_EE it is the end effector's pose, column by column.
+    The first column counts milliseconds since power-on. Positions are ``q[0]`` to ``q[6]``, velocities ``dq[0]``...,
+    prefixed with ``state.`` since libfranka 0.14. Commands are ``cmd.dq_d``, earlier the second columns ``dq_d``
+    (libfranka, src/log.cpp and src/logging/robot_state_log.cpp). An added O_T_EE is the end effector's pose by
+    columns.
     """
     num = len(NAMELESS)
     position = _block(table, "q", num)
@@ -155,7 +155,7 @@ def libfranka_track(table: CsvTable) -> RawTrack:
 
 
 def poses_of(rows: Table, read: Callable[[Float64], Float64 | None]) -> Rows:
-    """(T, 4, 4) of rows (T, K) by a function of one row, NaN where that gives None."""
+    """(T, 4, 4) of rows (T, K); NaN where `read` gives None."""
     nothing = np.full((4, 4), np.nan)
     blocks = (np.array([nothing if T is None else T for T in map(read, block)]) for block in blocks_of(rows))
     return Rows(RowFile((4, 4), blocks))
@@ -172,7 +172,6 @@ def _block(table: CsvTable, name: str, num: int) -> list[int] | None:
 
 
 def _sent(table: CsvTable, num: int) -> list[int] | None:
-    """The command of velocities; the desired velocities of the state stand in where none was sent."""
     sent = [table.names.index(n) for i in range(num) if (n := f"cmd.dq_d[{i}]") in table.names]
     if not sent:
         sent = [_last(table.names, n) for i in range(num) if table.names.count(n := f"dq_d[{i}]") == 2]

@@ -1,4 +1,4 @@
-"""Opens what holds a robot's motion: any recorded input, a log without cameras, libfranka's and other tables."""
+"""A robot's motion from recordings, logs without cameras, and tables."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,7 +34,7 @@ _NOT_FOR_TABLES = (*_FOR_CAMERAS, "joint_topic", "root", "holdout")
 
 
 class StateSource(Recording):
-    """Joint states without any frames: of a log, or of a table of states."""
+    """Joint states without frames."""
 
     cameras: tuple[str, ...] = ()
     has_clock = True
@@ -57,9 +57,9 @@ class StateSource(Recording):
 
 
 def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> FrameSource | StateSource:
-    """A recorded input with the states of `joints` (a robot's), as far as it has them, and its frames if it has any.
+    """Open an input's states of `joints` (a robot's) and its frames, where it has them.
 
-    Raises InputError where there is nothing, or nothing with joint states that can be used.
+    Raises InputError if missing, or without usable states.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="check the path")
@@ -87,7 +87,7 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
 
 
 def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]) -> FrameSource | StateSource:
-    """With frames where the log's cameras can be used; else the states alone, with a note that says why."""
+    """Open with frames if possible; else the states, with a note."""
     default = SourceOptions()
     try:
         return calibrated(RosLogSource(log, options, joints), options)

@@ -1,4 +1,4 @@
-"""Joint states in a CSV, NPZ, HDF5 or Parquet file whose columns a TOML file describes (docs/replay.md, Logs)."""
+"""Joint states in CSV, NPZ, HDF5 or Parquet, described in TOML (docs/replay.md, Logs)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -31,10 +31,10 @@ _SEE = "see splatctrl help replay, Logs"
 
 @dataclass(frozen=True, kw_only=True)
 class StatesTable:
-    """``[states]``: a file and its columns; in a file of arrays, those (T, K) give K columns each.
+    """``[states]``: a file and its columns; an array (T, K) gives K columns.
 
-    epoch_ns: the Unix time of time 0; pose: x, y, z, qx, qy, qz, qw, or the 16 numbers of a matrix by pose_order;
-    preset: one of `PRESETS`, which fills in what is not given of the dataset `file`; episode: of such a dataset.
+    epoch_ns: Unix time of time 0. pose: x, y, z, qx, qy, qz, qw, or a matrix's 16 numbers by pose_order. preset: one
+    of `PRESETS`, which fills missing keys for the dataset `file`; episode: of it.
     """
 
     file: str
@@ -54,10 +54,7 @@ class StatesTable:
 
 
 def described_track(path: Path) -> tuple[RawTrack, Path]:
-    """The states that a TOML file describes, and the file that holds them.
-
-    Raises InputError, naming the key or column.
-    """
+    """Read described states, and their file. Raises InputError naming key or column."""
     table = read_table(StatesTable, path, "states", beside=("twists",), fill=lambda given: with_preset(path, given))
     choices: Mapping[str, tuple[str, ...]] = {
         "unit": tuple(UNITS),
@@ -79,7 +76,7 @@ def described_track(path: Path) -> tuple[RawTrack, Path]:
 
 
 def dataset_track(folder: Path) -> tuple[RawTrack, Path]:
-    """The states of a LeRobot dataset's only episode, and the file that holds them. Raises InputError."""
+    """A LeRobot dataset's only episode, and its file. Raises InputError."""
     found = dict(lerobot.preset(folder, None))
     if "joints" not in found:
         raise InputError(
@@ -95,7 +92,7 @@ def _of_episode(table: StatesTable, episode: int, path: Path) -> tuple[RawTrack,
 
 
 def with_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The table [states] of a TOML file `path`, with what its preset fills in."""
+    """Fill [states] of TOML file `path` by its preset."""
     name = given.get("preset", "")
     if not name:
         return given
@@ -106,7 +103,7 @@ def with_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def columns_of(path: Path, table: str, name: str) -> CsvTable | ArrayFile:
-    """The columns of a file that a table of the TOML file `path` names. Raises InputError."""
+    """Columns that a table of TOML file `path` names. Raises InputError."""
     file = path.parent / name
     if not file.is_file():
         raise InputError(f"{path}: {table}.file: {file}: no such file", remedy="give it relative to the .toml")

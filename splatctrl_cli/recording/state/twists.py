@@ -1,4 +1,4 @@
-"""Twists that somebody commanded: of a log's topic, or of the columns that a TOML file's table [twists] names."""
+"""Commanded twists of a log's topic, or of a TOML file's [twists]."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +20,9 @@ _SEE = "see splatctrl help replay, Twists"
 
 @dataclass(frozen=True, kw_only=True)
 class LoggedTwists:
-    """N twists by time: stamp_ns (N,) that rise, twist (N, 6) [m/s, rad/s], linear first, in the axes of `frame`.
+    """N twists: stamp_ns (N,) rising, twist (N, 6) [m/s, rad/s], linear first, in `frame`.
 
-    frame: as the log names it, "" where it does not; notes: what was left out, and whose times the stamps are.
+    frame: the log's name, or "". notes: dropped twists and the stamps' clock.
     """
 
     where: str
@@ -46,10 +46,10 @@ class TwistsTable:
 
 
 def read_twists(path: Path, topic: str) -> LoggedTwists:
-    """The twists of a topic of a log, or of the table `topic` (always ``twists``) of a TOML file.
+    """Read the twists of a log's topic, or of a TOML file's table (always ``twists``).
 
-    Headers' stamps count, the times of logging where no header has one. Twists that are not finite are left out with
-    a note; of those with one stamp the last is kept. Raises InputError where there are none, or in several frames.
+    Stamps are headers', or log times if no header has one. Non-finite twists are dropped with a note; of equal stamps
+    the last is kept. Raises InputError without twists, or in several frames.
     """
     if path.suffix == ".toml":
         return _of_table(path, topic)
@@ -111,7 +111,6 @@ def _of_table(path: Path, name: str) -> LoggedTwists:
 
 
 def _checked(where: str, stamps: Stamps, twists: Float64, frames: list[str], notes: list[str]) -> LoggedTwists:
-    """Finite, by stamp, each stamp once, in one frame."""
     if len(set(frames)) > 1:
         raise InputError(
             f"{where}: expected twists in one frame, got {', '.join(sorted(set(frames)))}",
