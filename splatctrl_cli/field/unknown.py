@@ -1,6 +1,4 @@
-"""What a field of a scene is made of, its splats and balls around occupied voxels without one; and what never-seen
-space counts as: nothing, an obstacle, or no distance at all.
-"""
+"""Content of a scene's field: splats, balls at occupied voxels without one, and never-seen space."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
@@ -22,21 +20,21 @@ NO_SPLAT = -1
 
 @dataclass(frozen=True, kw_only=True)
 class ObstacleSpheres:
-    """The N spheres of a field, balls last, as splats; index (N,) in the scene's splats, NO_SPLAT of a ball."""
+    """The N spheres of a field, balls last; index (N,) in the scene's splats, NO_SPLAT for a ball."""
 
     splats: SplatSet
     index: Index
 
     @property
     def num_unrepresented(self) -> int:
-        """How many are balls."""
+        """Number of balls."""
         return int(np.count_nonzero(self.index == NO_SPLAT))
 
 
 def obstacle_spheres(
     splats: SplatSet, balls: Balls | None, labels: Collection[Label] = DEFAULT_LABELS
 ) -> ObstacleSpheres:
-    """The splats and the balls with one of `labels`. Raises as `field_splats`, where there is no such ball either."""
+    """Return the splats and balls with one of `labels`. Raises as `field_splats` if there is no such ball."""
     values = [int(label) for label in labels]
     is_chosen = np.isin(splats.labels, values)
     kept = np.zeros(0, bool) if balls is None else np.isin(balls.labels, values)
@@ -57,9 +55,9 @@ def obstacle_spheres(
 
 
 def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -> SplatSet:
-    """The splats with one of `labels`, in order: the robot is left out unless asked for.
+    """Return the splats with one of `labels`, in order; by default without the robot.
 
-    Raises NotEvaluableError where none is left, InputError for a label that is none of ours.
+    Raises NotEvaluableError if none is left, InputError for an unknown label.
     """
     check_labels(splats)
     kept = splats.select(np.isin(splats.labels, [int(label) for label in labels]))
@@ -73,7 +71,7 @@ def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -
 
 
 def check_labels(splats: SplatSet) -> None:
-    """Raise InputError for a label that is none of ours."""
+    """Raise InputError for an unknown label."""
     unknown = ~np.isin(splats.labels, [int(label) for label in Label])
     if unknown.any():
         i = int(np.argmax(unknown))
@@ -81,7 +79,7 @@ def check_labels(splats: SplatSet) -> None:
 
 
 def label_counts(splats: SplatSet) -> dict[str, int]:
-    """Number of splats by label name."""
+    """Return the number of splats by label name."""
     return {label.name.lower(): int(np.count_nonzero(splats.labels == label)) for label in Label}
 
 
@@ -96,15 +94,14 @@ Channels = dict[str, NDArray[np.generic]]
 
 
 def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
-    """The grid with its never-seen cells treated by `policy`, and what that changed in its header.
+    """Return the grid with never-seen cells treated by `policy`, and its header updated.
 
-    ``free``: distances from the splats alone. ``nan``: no sdf, gradient or probability at a never-seen cell.
-    ``obstacle``: never-seen cells are solid cubes; sdf, its gradient and bound are those of the nearer of splats
-    and cubes, the probability at a never-seen cell is 1, and bound holds for splats and cubes. A cell that only the
-    robot was in is known (`VoxelState.SWEPT_BY_ROBOT`); what lies outside the grid is not looked at.
+    ``free``: distances from splats alone. ``nan``: no sdf, gradient or probability at never-seen cells.
+    ``obstacle``: these cells are solid cubes; sdf, gradient and bound are of the nearer of splats and cubes; their
+    probability is 1. Cells that only the robot swept are known (`VoxelState.SWEPT_BY_ROBOT`); space outside the
+    grid does not count.
 
-    Raises UsageError for another policy, InputError for a grid without `observed`, NotEvaluableError where nothing
-    was ever seen.
+    Raises UsageError for another policy, InputError without `observed`, NotEvaluableError if nothing was seen.
     """
     declared = FieldConfig.declared["unknown"]
     check(declared.holds(policy), "field.unknown", declared.expected, policy)
@@ -137,7 +134,7 @@ def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
 
 
 def blank(channels: Mapping[str, NDArray[np.generic]], is_unknown: Bool) -> Channels:
-    """Channels (X, Y, Z) with NaN for a distance, gradient and probability where `is_unknown`."""
+    """Set distance, gradient and probability to NaN where `is_unknown` (X, Y, Z)."""
     blanked = dict(channels)
     for name in BLANKED:
         if name in channels:
@@ -150,8 +147,8 @@ def blank(channels: Mapping[str, NDArray[np.generic]], is_unknown: Bool) -> Chan
 class Cubes:
     """The never-seen cells (X, Y, Z) of a grid as solid cubes.
 
-    distance: a lower bound [m] of the signed distance to them from each cell's centre; away (..., 3): unit vectors
-    in which it grows.
+    distance: lower bound [m] of the signed distance from each cell's centre; away (..., 3): unit vectors of its
+    growth.
     """
 
     is_unknown: Bool
@@ -160,11 +157,11 @@ class Cubes:
 
     @classmethod
     def of(cls, is_unknown: Bool, voxel: float) -> "Cubes":
-        """Of a grid of which some cells are unknown, and some not.
+        """Bound the distances in a grid with both known and unknown cells.
 
-        Outside, no cube is nearer than the nearest one's centre less half a diagonal, nor than the least over cubes
-        of the largest difference of a coordinate less half a cell. Inside it is minus the distance to the nearest
-        known centre, less half a cell, which the depth does not exceed.
+        Outside: the larger of the nearest centre's distance minus half a diagonal, and the least chessboard
+        distance minus half a cell. Inside: half a cell minus the distance to the nearest known centre, which the
+        depth does not exceed.
         """
         here = np.indices(is_unknown.shape, dtype=np.int32)
         distance, nearest = distance_transform_edt(~is_unknown, return_indices=True)
@@ -181,7 +178,7 @@ class Cubes:
         )
 
     def planes(self, first: int, last: int) -> "Cubes":
-        """The x-planes [first, last)."""
+        """Return the x-planes [first, last)."""
         return replace(
             self,
             is_unknown=self.is_unknown[first:last],
@@ -190,7 +187,7 @@ class Cubes:
         )
 
     def joined(self, channels: Mapping[str, NDArray[np.generic]], bound_margin: float) -> tuple[Channels, int]:
-        """Channels of the nearer of what they hold and the cubes, and the number of cells whose sdf changed."""
+        """Return channels of the nearer of field and cubes, and the number of changed sdf cells."""
         joined = dict(channels)
         is_nearer = np.asarray(self.distance < np.asarray(channels["sdf"], dtype=np.float32))
         joined["sdf"] = np.where(is_nearer, self.distance, channels["sdf"])

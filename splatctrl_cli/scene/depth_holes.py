@@ -1,11 +1,9 @@
-"""Space that cameras looked into and got no depth from: a dark, shiny or clear thing in full view leaves only a hole.
+"""Space where cameras got no depth: dark, shiny or clear objects in full view.
 
-A hole is a group of pixels without depth that has depth all around it. What is in it stands somewhere on its rays,
-before what is seen beside it. Other cameras and later images that see through these rays clear them; what is left is
-where the thing may be.
+A hole is a group of pixels without depth, surrounded by depth. Its content stands on its rays, before what is seen
+around it. Rays of other cameras and later images clear them.
 
-Depth is also lost on both sides of a step of depth: what lies in such a pixel is as likely the edge of the nearer
-surface, which goes on there, as what is behind it.
+Depth is also lost on both sides of a depth edge: the nearer surface may extend there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,12 +27,11 @@ MOST_POINTS = 1 << 18  # at a time: fine voxels and a large hole come to a hundr
 
 
 def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Iterator[Float64]:
-    """Points (K, 3) [m], world, on the rays of a frame's holes, half a voxel [m] apart along each; some at a time,
-    some of them twice. The holes are found at once, the points when they are asked for.
+    """Yield points (K, 3) [m], world, half a voxel [m] apart on rays of a frame's holes.
 
-    From `min_range` before the camera to the depth that is seen nearest to the pixel, on rays about a voxel apart;
-    holes up to `NARROW_HOLE` voxels wide do not count. robot_depth (H, W) [m]: of the rendered robot, 0 = none;
-    beside it what is far behind may show, so that it bounds none.
+    Some repeat. Rays lie about a voxel apart, from `min_range` to the depth seen nearest. Holes up to `NARROW_HOLE`
+    voxels wide do not count. robot_depth (H, W) [m]: rendered, 0 = none; near it the far background may show, so it
+    bounds no hole. Holes are found at once, points lazily.
     """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
@@ -52,12 +49,12 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
 
 
 def _voxel_width(frame: RgbdFrame, depths: Float32, config: OccupancyConfig) -> float:
-    """How many pixels wide a voxel is at the median of depths (K,) [m]."""
+    """Return a voxel's width in pixels at the median of depths (K,) [m]."""
     return config.voxel * frame.intrinsics.fx / float(np.median(depths))
 
 
 def _wide(pixels: Bool, width: float) -> Bool:
-    """Those of pixels (H, W) that lie in a square of them of this width."""
+    """Return pixels (H, W) in a full square of this width."""
     side = int(width) | 1  # OpenCV shifts an even window
     opened = cv2.morphologyEx(pixels.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     return np.asarray(opened.view(bool))
@@ -66,7 +63,6 @@ def _wide(pixels: Bool, width: float) -> Bool:
 def _on_rays(
     frame: RgbdFrame, pixels: Bool, behind: Float32, apart: int, config: OccupancyConfig
 ) -> Iterator[Float64]:
-    """Points (K, 3) [m], world, before the depth behind (H, W) [m] of every pixel that is `apart` from the last."""
     v, u = np.nonzero(pixels[::apart, ::apart])
     v, u = v * apart, u * apart
     depths = np.arange(config.min_range, behind[v, u].max(initial=config.min_range), 0.5 * config.voxel)
@@ -78,14 +74,14 @@ def _on_rays(
 
 
 def _holes(is_blank: Bool, is_end: Bool) -> Bool:
-    """Pixels (H, W) without depth in groups that meet neither the image's border nor an end."""
+    """Return groups of pixels (H, W) without depth that meet neither border nor `is_end`."""
     _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
     return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
 
 
 def _nearest_depth(depth: Float32) -> Float32:
-    """For each pixel (H, W) the depth [m] of the nearest pixel that has one."""
+    """Return the depth [m] of the nearest pixel with depth (H, W)."""
     is_blank = (depth <= 0).view(np.uint8)
     _, which = cv2.distanceTransformWithLabels(is_blank, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     of_label = np.zeros(int(which.max()) + 1, np.float32)
@@ -101,12 +97,11 @@ NEAR_ROBOT = np.ones((5, 5), np.uint8)  # its outline is lost, too, and is its o
 def lost_edges(
     seen: Sequence[tuple[RgbdFrame, SelfMask]], robot: RobotPosture | None, config: OccupancyConfig
 ) -> dict[str, LostEdges]:
-    """By camera, of the frames of one time step with their self-masks, a ball for each pixel without depth beside one
-    that shows an object, at the depth of the nearest object beside it. Its radius is a pixel: a surface that the
-    pixel shows ends before the next pixel's centre.
+    """Return, by camera, a ball for each pixel without depth next to an object pixel.
 
-    One object pixel by itself is noise. Without what another frame sees through by `see_through`, and without what is
-    as near to the robot: that is its own outline.
+    It has the nearest such object's depth and a pixel's radius: a surface that the pixel shows ends before the next
+    centre. A lone object pixel is noise. Left out are balls that another frame sees through by `see_through`, or as
+    near to the robot: its own outline.
     """
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
     surely = [

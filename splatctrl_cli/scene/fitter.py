@@ -1,4 +1,4 @@
-"""`SceneFitter.step`: one time step of the paper's Fig. 2, from RGB-D frames to an up-to-date splat set."""
+"""`SceneFitter.step`: one time step of the paper's Fig. 2, from RGB-D frames to splats."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -69,9 +69,9 @@ from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
 
 
 class SceneFitter:
-    """Fits a fixed budget of isotropic splats to a stream of RGB-D frames.
+    """Fits a fixed budget of isotropic splats to RGB-D frames.
 
-    The whole state is in `checkpoint.fitter_state`; the same frames and seed give the same bytes at any thread count.
+    `checkpoint.fitter_state` has the whole state. The same frames and seed give the same bytes at any thread count.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class SceneFitter:
         self.objects: dict[str, Bool] = {}  # by camera, pixels (H, W) of its newest frame that show objects
 
     def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
-        """Take in the frames of one time step: integrate, remove, add or relocate, optimise, label."""
+        """Take in one time step's frames: integrate, remove, add or relocate, optimise, label."""
         rng = np.random.default_rng([self.seed, self.num_steps])
         robot = robot and replace(robot, num_threads=self.num_threads)
         self._find_mounted(frames)
@@ -177,7 +177,7 @@ class SceneFitter:
         return replace(self._audit(views, filled, removed, terms), **audited(masks))
 
     def plant(self, cloud: PointCloud) -> Filled:
-        """Start from coloured points instead of depth: seeds so dense that they use a share `fill` of the budget."""
+        """Start from coloured points: seeds dense enough to use a share `fill` of the budget."""
         source = Candidates(points=cloud.points, colors=cloud.colors, pixels=np.zeros(len(cloud), np.float32))
         count = max(int(self.config.fill * self.config.max_splats), 1)
         self.density = density_for([source], count, self.config)
@@ -185,10 +185,10 @@ class SceneFitter:
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def refine(self, num_iterations: int, progress: Callable[[int], None] = lambda _: None) -> AuditRow:
-        """Optimise over the window with learning rates that fall to `final_rate`; for scenes that do not move.
+        """Optimise a static scene over the window, with learning rates that fall to `final_rate`.
 
-        `progress` is called with the number of iterations done, after each of ten blocks; a restored fitter goes on
-        with the block after the last one done.
+        `progress` gets the iterations done after each of ten blocks; a restored fitter continues with the next
+        block.
         """
         views = [self.view(view.frame) for view in (*self.window.newest, *self.window.keyframes)]
         for block in range(self.refined.num_blocks, REFINE_BLOCKS):
@@ -221,16 +221,15 @@ class SceneFitter:
         )
 
     def splats(self) -> SplatSet:
-        """The live splats."""
         return self.buffer.splats(self.num_threads)
 
     def shell_splats(self) -> SplatSet | None:
-        """What lies beyond the workspace, for pictures alone; None without a shell."""
+        """Return splats beyond the workspace, for pictures only; None without a shell."""
         return None if self.shell is None else self.shell.splats()
 
     @property
     def unrepresented(self) -> Balls:
-        """What is occupied, not the robot, and has no splat, since the last time step or refining."""
+        """Occupied voxels without a splat, after the last step."""
         if self._unrepresented is None:
             seen = [view.frame.depth[::8, ::8] for view in self.window.newest]
             depth = np.concatenate([image[image > 0] for image in seen]) if seen else np.zeros(0, np.float32)
@@ -248,11 +247,11 @@ class SceneFitter:
         self._unrepresented = balls
 
     def known_voxels(self) -> KnownVoxels:
-        """What is known of space as it is now."""
+        """Return the present knowledge of space."""
         return self.occupancy.known(self.unrepresented)
 
     def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
-        """A frame as the optimiser takes it; mask: of a robot that is in it."""
+        """Return a frame as the optimiser takes it."""
         min_range = self.occupancy.config.min_range
         mappable = inside_workspace(frame, world_points(frame), self.workspace, min_range)
         reach = NEAREST_REACH * (self.config.scale or 1.0)
@@ -260,7 +259,7 @@ class SceneFitter:
         return make_view(frame, mappable, self.mounted.get(frame.camera), is_robot=is_robot, reach=reach)
 
     def _find_mounted(self, frames: Sequence[RgbdFrame]) -> None:
-        """Tell apart what a camera carries, once it has been in enough places."""
+        """Find pixels of what a camera carries, once it has enough views."""
         for camera in sorted({frame.camera for frame in frames} - set(self.mounted)):
             known = [view.frame for view in self.window.keyframes]
             seen = spread_views([frame for frame in [*known, *frames] if frame.camera == camera])
@@ -271,7 +270,9 @@ class SceneFitter:
                 self.window.newest = [self.view(view.frame) for view in self.window.newest]
 
     def _behind(self, views: Sequence[View]) -> Color:
-        """The background: pixels without depth; if no view has depth, pixels that no planted splat covers."""
+        """Return the background's colour: of pixels without depth, or, without any depth, those that no planted
+        splat covers.
+        """
         if self.config.background == "black":
             return BLACK
         counted = [view.target.counted > 0 for view in views]
@@ -281,7 +282,7 @@ class SceneFitter:
         return background_color([view.frame for view in views], counted)
 
     def _carry(self, robot: RobotPosture | None) -> None:
-        """Move the robot's splats with the link of the sphere they are nearest to."""
+        """Move the robot's splats with the nearest sphere's link."""
         before, self.posture = self.posture, robot
         if before is None or robot is None:
             return
@@ -289,7 +290,7 @@ class SceneFitter:
         self.buffer.centers[slots] = carried(self.buffer.centers[slots], before, robot)
 
     def _floating(self, views: Sequence[View]) -> Bool:
-        """Slots (M,) of splats that some view sees through."""
+        """Return slots (M,) of splats that some view sees through."""
         is_floating = np.zeros(len(self.buffer.centers), bool)
         for label in (Label.OBJECT, Label.ROBOT):
             slots = np.flatnonzero(self._standing_for(label))
@@ -297,11 +298,11 @@ class SceneFitter:
         return is_floating
 
     def _relabel(self, robot: RobotPosture | None, seen: Seen) -> Bool:
-        """Label all splats anew; returns trails (M,). One that turns from robot to object gets the least radius."""
+        """Relabel all splats; return trails (M,). One that turns from robot to object gets the least radius."""
         return relabel(self.buffer, self.occupancy, robot, seen, 0.5 * self.config.contact_radius)
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
-        """Remove what the optimiser moved off the robot, into the air or out, or made faint; counts in `removed`."""
+        """Remove splats that the optimiser moved off the robot, into air or out, or made faint."""
         drifted = self._relabel(robot, seen)
         self.buffer.kill(drifted)
         floating = self._floating(views)
@@ -329,7 +330,7 @@ class SceneFitter:
         return {reason: int(mask.sum()) for reason, mask in reasons.items()}
 
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
-        """Fill dead slots at the pixels of M_add, as densely as uses `fill` of the budget on the first full view."""
+        """Fill dead slots at pixels of M_add, as dense as uses `fill` of the budget on the first full view."""
         found: dict[Label, list[Candidates]] = {Label.OBJECT: [], Label.ROBOT: []}
         added = [add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config) for view in views]
         every = thinning(added)
@@ -369,10 +370,10 @@ class SceneFitter:
     def _fill_gaps(
         self, views: Sequence[View], masks: Sequence[SelfMask], removed: dict[str, int], half: int | None = None
     ) -> Filled:
-        """Put splats where a measured surface is far from every sphere: in one half of it a time step, by turns.
+        """Add splats where a measured surface is far from every sphere, one half per time step in turn.
 
-        The robot's surface and everything else have spheres of their own. Where slots are missing, splats are evicted
-        for the latter every EVICT_EVERY time steps; counts in `removed`.
+        The robot and everything else have spheres of their own. For the latter, missing slots are evicted every
+        EVICT_EVERY steps.
         """
         filled = Filled()
         for label in (Label.OBJECT, Label.ROBOT):
@@ -401,17 +402,16 @@ class SceneFitter:
         return filled
 
     def _standing_for(self, label: Label) -> Bool:
-        """Slots (M,) of live splats that stand for the robot's surface, or for everything else."""
+        """Return slots (M,) of live splats of the robot, or of everything else."""
         is_robot: Bool = self.buffer.labels == Label.ROBOT
         return self.buffer.is_alive & (is_robot if label == Label.ROBOT else ~is_robot)
 
     def _show_contact(
         self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, steady: Sequence[Bool]
     ) -> Filled:
-        """Give objects beside the robot's moving links splats of half `contact_radius`, no farther apart than it.
+        """Give objects near moving links dense splats of half `contact_radius`.
 
-        They come from the steady pixels (H, W) of each frame alone. A single measurement may be noise, and stays in
-        the map for as long as the arm hides its place.
+        Only steady pixels (H, W) seed: a single measurement may be noise, and stays while the arm hides it.
         """
         if robot is None:
             return Filled()
@@ -428,8 +428,9 @@ class SceneFitter:
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _keep_to_surface(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> None:
-        """Put objects' splats near the robot on what depth shows, and shrink them until they stay within it, down to
-        half of `contact_radius`; splats that no pixel shows get that radius at once.
+        """Move object splats near the robot onto measured depth, and shrink those that stand out of it.
+
+        The least radius is half of `contact_radius`; hidden splats get it at once.
         """
         if robot is None:
             return
@@ -445,7 +446,7 @@ class SceneFitter:
         self.buffer.set_radius(slots, np.where(is_hidden, np.minimum(radii, np.float32(least)), radii))
 
     def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
-        """Use dead slots that no seed needs, but for the reserve for gaps; counts in `removed`."""
+        """Use dead slots that no seed needs, except the reserve for gaps."""
         filled, num_weak = use_idle(self.buffer, lambda: self.descent.misfits(views), self.config, rng)
         removed["weak"] += num_weak
         return filled
@@ -453,9 +454,7 @@ class SceneFitter:
     def _is_grounded(
         self, points: Float32, views: Sequence[View], label: Label = Label.OBJECT, *, least: float = np.inf
     ) -> Bool:
-        """Points (K,) of a label behind which no view sees by the smaller of `see_through` and `least` [m]: what one
-        sensor measured and another looks past was noise.
-        """
+        """Return points (K,) that no view sees through by min(`see_through`, `least`) [m]: such are noise."""
         gap = min(self.occupancy.config.see_through, least or np.inf)
         return ~seen_through(points, views, gap, self.num_threads, label)
 

@@ -1,6 +1,4 @@
-"""What is known to be occupied and has no splat: no distance to the splats says anything of it. By the same measure,
-whether splats and an occupancy grid are of the same scene.
-"""
+"""Occupied voxels without a splat, and the agreement of splats with an occupancy grid."""
 
 import itertools
 import math
@@ -21,11 +19,10 @@ from splatctrl_cli.voxels import SWEPT, Balls, KnownVoxels, VoxelState
 
 
 def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: SceneConfig, error: float = 0.0) -> Balls:
-    """The occupied voxels (`OccupancyMap.occupied_voxels`) that no splat stands for, as balls.
+    """Return the occupied voxels that no splat represents, as balls with label human or object.
 
-    A splat of an object or a person stands for a voxel whose centre is at most `representing_reach` from its sphere
-    (of eight splats with the nearest centres), with the sensor's error [m]. The robot's splats stand for nothing:
-    fields leave them out. A ball has the label human where its voxel does.
+    A splat represents voxels with centres within `representing_reach` of its sphere, among the eight splats with
+    nearest centres. error [m]: of the sensor. The robot's splats represent nothing: fields leave them out.
     """
     others = splats.select(splats.labels != Label.ROBOT)
     reach = representing_reach(config, occupancy.config.voxel, error)
@@ -39,10 +36,9 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
 
 
 def confirmed(found: Balls, before: Balls | None) -> Balls:
-    """The balls that touch at least `BARE_GROUP` - 1 others, directly or by others, or that are where one was before.
+    """Return balls in groups of `BARE_GROUP` or more that touch, or found before in their place.
 
-    Fewer are often noise that is gone with the next time step, or that gap filling has not come to. A thing that
-    moves in a map without splats to spare shows more at once. before: of the last time step, None in the first.
+    Smaller groups are often noise, or gaps not yet filled. before: balls of the last time step, None in the first.
     """
     voxel = 2.0 * found.radius / 3**0.5
     if before is None or not len(found):
@@ -57,9 +53,9 @@ def confirmed(found: Balls, before: Balls | None) -> Balls:
 
 
 def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) -> float:
-    """How far [m] a voxel's centre may be from a splat's sphere that stands for it.
+    """Return how far [m] a voxel's centre may be from the sphere of its splat.
 
-    `max_gap` and half a voxel, beyond which gap filling adds a splat, and the sensor's error [m]; at most a voxel's
+    That is `max_gap` and half a voxel, where gap filling begins, plus the sensor's error [m]; at most a voxel's
     diagonal.
     """
     return min(config.max_gap + 0.5 * voxel + error, 3**0.5 * voxel)
@@ -68,8 +64,9 @@ def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) ->
 def bare_voxels(
     occupancy: OccupancyMap, splats: SplatSet, workspace: Box, config: SceneConfig, half: int | None = None
 ) -> Float32:
-    """Centres (K, 3) [m] of occupied voxels in the workspace that gap filling has to look at: all but those surely
-    near a splat. With `half` 0 or 1 of every second voxel: the other half waits.
+    """Centres (K, 3) [m] of occupied voxels that gap filling must check, without those surely near a splat.
+
+    `half` 0 or 1 takes every second voxel.
     """
     voxels = occupancy.occupied_voxels()
     voxels = voxels[workspace.contains(occupancy.centers_of(voxels))]
@@ -79,9 +76,9 @@ def bare_voxels(
 
 
 def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Bool:
-    """Voxels (X, Y, Z) whose centres are within `reach` [m] of a sphere wherever in its voxel that has its centre.
+    """Voxels (X, Y, Z) within `reach` [m] of a sphere, wherever its centre is in its voxel.
 
-    Most of what is occupied, at a tenth of the cost of looking for the nearest splat.
+    This settles most voxels at a tenth of the cost of a nearest-splat search.
     """
     voxel, shape = occupancy.config.voxel, occupancy.log_odds.shape
     cells = np.floor((splats.centers - occupancy.origin) / voxel + 0.5).astype(np.int64)
@@ -97,9 +94,10 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
 
 @dataclass(frozen=True, kw_only=True)
 class GridAgreement:
-    """on_surface: share of the splats of objects and people that are in or next to a voxel that is not free, of
-    those that are outside the grid, or in or next to a voxel that was seen; represented: share of the num_voxels
-    occupied voxels that a splat or a ball stands for. NaN of none. num_splats: all of objects and people.
+    """Agreement of splats with a grid, as two shares; NaN without any.
+
+    on_surface: of object and human splats outside the grid or near a seen voxel, those near a voxel that is not
+    free; near: in or next to it. represented: of num_voxels occupied voxels, those with a splat or ball.
     """
 
     on_surface: float
@@ -109,17 +107,17 @@ class GridAgreement:
 
     @property
     def holds(self) -> bool:
-        """Whether both shares are what a reconstruction leaves; False where there is nothing to compare."""
+        """True if both shares reach a reconstruction's."""
         return self.on_surface >= SPLATS_ON_SURFACE and self.represented >= OCCUPIED_WITH_SPLATS
 
 
 def agreement_with_grid(
     splats: SplatSet, known: KnownVoxels, scene: SceneConfig, occupancy: OccupancyConfig
 ) -> GridAgreement:
-    """How far splats and what is known of voxels agree: for the final map, or a snapshot and its splats.
+    """Return how well splats agree with the voxels of their map or snapshot.
 
-    Voxels that the robot was in are left out. Either share finds splats in other units or moved; `represented` finds
-    splats that were taken away, as balls are only where there were none when the map was written.
+    Voxels that the robot swept are left out. Either share detects wrong units or moved splats; `represented`
+    detects removed splats.
     """
     grid = known.grid
     states = grid.states(occupancy.free_below, occupancy.occupied_above)
