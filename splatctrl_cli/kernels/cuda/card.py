@@ -1,4 +1,4 @@
-"""A CUDA card: memory over the driver, kernels and graphs over cuda-core."""
+"""A CUDA card: memory by the driver, kernels and graphs by cuda-core."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ MANY = 20  # replays in a graph: to launch one costs the host as much as a small
 
 
 def _check(result: tuple[Any, ...]) -> Any:
-    """The values of a driver call, or its error by name."""
+    """Return a driver call's values, or raise its error."""
     status, *values = result
     if status == driver.CUresult.CUDA_SUCCESS:
         return values if len(values) > 1 else values[0] if values else None
@@ -30,7 +30,7 @@ def _fault(what: str) -> DeviceError:
 
 @contextmanager
 def _named_faults() -> Iterator[None]:
-    """Turns what cuda-core raises, which has no public class, into DeviceError."""
+    """Turn errors of cuda-core, without a public class, into DeviceError."""
     try:
         yield
     except DeviceError:
@@ -40,13 +40,10 @@ def _named_faults() -> Iterator[None]:
 
 
 class CudaDevice:
-    """A card, the first by default, as `Memory`; everything is queued on one stream.
-
-    Raises DeviceError where it cannot be used.
-    """
+    """A card as `Memory`, the first by default, with one stream. Raises DeviceError if unusable."""
 
     def __init__(self, card: Card | None = None, *, source: str = FIT) -> None:
-        """source: the kernels that are launched, of which others are compiled when they are."""
+        """source: kernels to compile now; others compile at first launch."""
         card = card or usable_card()
         self.name, self.capability = card.name, card.capability
         with _named_faults():
@@ -57,18 +54,16 @@ class CudaDevice:
         self._handle = int(self._stream.handle)
 
     def available(self) -> int:
-        """Bytes that are free."""
         free, _ = _check(driver.cuMemGetInfo())
         return int(free)
 
     def allocate(self, num_bytes: int) -> int:
-        """Memory of zeros."""
         address = int(_check(driver.cuMemAlloc(max(num_bytes, 1))))
         _check(driver.cuMemsetD8Async(address, 0, max(num_bytes, 1), self._handle))
         return address
 
     def free(self, address: int) -> None:
-        """Give it back, after what is queued."""
+        """Free memory, after what is queued."""
         self.wait()
         _check(driver.cuMemFree(address))
 
@@ -88,11 +83,11 @@ class CudaDevice:
         _check(driver.cuMemcpyDtoDAsync(target, source, num_bytes, self._handle))
 
     def wait(self) -> None:
-        """Until what is queued is done."""
+        """Wait for what is queued."""
         _check(driver.cuStreamSynchronize(self._handle))
 
     def record(self, launches: Sequence[Launch]) -> "CudaGraph":
-        """The launches as graphs: of one replay, and of MANY."""
+        """Record graphs of one replay and of MANY."""
         graphs = {}
         with _named_faults():
             for count in (1, MANY):
@@ -103,7 +98,7 @@ class CudaDevice:
         return CudaGraph(graphs, self._stream)
 
     def queue(self, launches: Sequence[Launch]) -> None:
-        """The launches one by one, for tools that look at each."""
+        """Queue launches singly, for tools that inspect each."""
         self._queue(self._stream, launches)
 
     def _queue(self, target: Any, launches: Sequence[Launch]) -> None:
@@ -114,7 +109,7 @@ class CudaDevice:
             launch(target, config, self._codes[one.source].get_kernel(one.kernel), *one.arguments)
 
     def seconds(self, graph: Graph, num_times: int) -> float:
-        """Mean time of a replay, measured on the device."""
+        """Return a replay's mean time, measured on the device."""
         before, after = (self._device.create_event({"timing_enabled": True}) for _ in range(2))
         self._stream.record(before)
         graph.run(num_times)
@@ -124,13 +119,11 @@ class CudaDevice:
 
 
 class CudaGraph:
-    """Launches on the device's stream."""
-
     def __init__(self, graphs: dict[int, Any], stream: Any) -> None:
         self._graphs, self._stream = graphs, stream
 
     def run(self, num_times: int = 1) -> None:
-        """Queue them, so many times."""
+        """Queue the launches `num_times`."""
         with _named_faults():
             for _ in range(num_times // MANY):
                 self._graphs[MANY].launch(self._stream)
