@@ -1,4 +1,4 @@
-"""Layout of a distance grid, its memory, and what cameras saw in its cells."""
+"""Cells of a distance grid, their memory, and their observation."""
 
 import math
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ Shape = tuple[int, int, int]
 
 @dataclass(frozen=True, kw_only=True)
 class GridLayout:
-    """Cells (i, j, k) of size `voxel` [m], centred at ``origin + voxel (i, j, k)``, world [m]."""
+    """Cells of `voxel` [m], centred at ``origin + voxel (i, j, k)``, world [m]."""
 
     origin: Float64
     voxel: float
@@ -30,7 +30,7 @@ class GridLayout:
 
     @classmethod
     def over(cls, box: Box, voxel: float) -> "GridLayout":
-        """Cover a box with cell centres from its lower corner up, at least two per axis.
+        """Cover a box with centres from its lower corner on, at least two per axis.
 
         Raises UsageError for a voxel or box without size.
         """
@@ -56,7 +56,7 @@ class GridLayout:
 
 
 def bounding_box(splats: SplatSet, padding: float) -> Box:
-    """Return the box of the splats' spheres, widened by `padding` [m] per side."""
+    """Return the box of the spheres, widened by `padding` [m] per side."""
     lower = (splats.centers - splats.radii[:, None]).min(axis=0).astype(np.float64)
     upper = (splats.centers + splats.radii[:, None]).max(axis=0).astype(np.float64)
     return Box(lower=lower - padding, upper=upper + padding)
@@ -65,10 +65,9 @@ def bounding_box(splats: SplatSet, padding: float) -> Box:
 def check_loss(voxel: float, max_loss: float) -> None:
     """Raise UsageError if cells of `voxel` [m] may lose more than max_loss [m] of distance.
 
-    The certified distance is ``max_c (hard(c) - |x - c|)`` over eight centres c around x. The nearest is within
-    half a diagonal, and hard is 1-Lipschitz, ``hard(c) >= hard(x) - |x - c|``. So it reads at most a diagonal,
-    ``sqrt(3) voxel``, below ``hard(x)``, as between eight balls around the centres. Interpolating the exact
-    distance errs by at most half of that.
+    The certified distance is ``max_c (hard(c) - |x - c|)`` over eight centres c around x. One is within half a
+    diagonal, and hard is 1-Lipschitz, ``hard(c) >= hard(x) - |x - c|``: the loss is at most a diagonal, ``sqrt(3)
+    voxel``, as between eight balls around the centres. Interpolation errs by at most half of that.
     """
     loss = LOSS * voxel
     if loss > max_loss:
@@ -101,7 +100,7 @@ def check_room(what: str, needed: int, remedy: str) -> None:
 
 
 def available_memory() -> int:
-    """Return the bytes free without swapping, within the control group's limit."""
+    """Return bytes free without swapping, within the control group's limit."""
     for line in (PROC / "meminfo").read_text(encoding="ascii").splitlines():
         if line.startswith("MemAvailable:"):
             return min([int(line.split()[1]) * 1024, *_group_room()])
@@ -120,9 +119,9 @@ def _group_room() -> list[int]:
 def observed_planes(
     occupancy: OccupancyGrid | None, layout: GridLayout, thresholds: OccupancyConfig, first: int, last: int
 ) -> UInt8:
-    """Return the `VoxelState` (last - first, Y, Z) at cell centres of x-planes [first, last).
+    """Return the `VoxelState` (last - first, Y, Z) at centres of x-planes [first, last).
 
-    Never seen outside the occupancy grid, or without one.
+    Never seen outside the occupancy grid.
     """
     observed = np.full((last - first, *layout.shape[1:]), VoxelState.NEVER_SEEN, dtype=np.uint8)
     if occupancy is None:

@@ -1,4 +1,4 @@
-"""Content of a scene's field: splats, balls at occupied voxels without one, and never-seen space."""
+"""Spheres of a scene's field, and the treatment of never-seen space."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ NO_SPLAT = -1
 
 @dataclass(frozen=True, kw_only=True)
 class ObstacleSpheres:
-    """The N spheres of a field, balls last; index (N,) in the scene's splats, NO_SPLAT for a ball."""
+    """N spheres of a field, balls last; index (N,) of splats, NO_SPLAT for balls."""
 
     splats: SplatSet
     index: Index
@@ -34,7 +34,7 @@ class ObstacleSpheres:
 def obstacle_spheres(
     splats: SplatSet, balls: Balls | None, labels: Collection[Label] = DEFAULT_LABELS
 ) -> ObstacleSpheres:
-    """Return the splats and balls with one of `labels`. Raises as `field_splats` if there is no such ball."""
+    """Return splats and balls with one of `labels`. Raises as `field_splats` without such balls."""
     values = [int(label) for label in labels]
     is_chosen = np.isin(splats.labels, values)
     kept = np.zeros(0, bool) if balls is None else np.isin(balls.labels, values)
@@ -55,9 +55,9 @@ def obstacle_spheres(
 
 
 def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -> SplatSet:
-    """Return the splats with one of `labels`, in order; by default without the robot.
+    """Return splats with one of `labels`, in order; by default without the robot.
 
-    Raises NotEvaluableError if none is left, InputError for an unknown label.
+    Raises NotEvaluableError without any, InputError for an unknown label.
     """
     check_labels(splats)
     kept = splats.select(np.isin(splats.labels, [int(label) for label in labels]))
@@ -96,10 +96,9 @@ Channels = dict[str, NDArray[np.generic]]
 def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
     """Return the grid with never-seen cells treated by `policy`, and its header updated.
 
-    ``free``: distances from splats alone. ``nan``: no sdf, gradient or probability at never-seen cells.
-    ``obstacle``: these cells are solid cubes; sdf, gradient and bound are of the nearer of splats and cubes; their
-    probability is 1. Cells that only the robot swept are known (`VoxelState.SWEPT_BY_ROBOT`); space outside the
-    grid does not count.
+    ``free``: distances from splats alone. ``nan``: no sdf, gradient or probability there. ``obstacle``: solid
+    cubes; sdf, gradient and bound are of the nearer of splats and cubes, their probability is 1. Cells that only
+    the robot swept are known (`VoxelState.SWEPT_BY_ROBOT`); space outside is ignored.
 
     Raises UsageError for another policy, InputError without `observed`, NotEvaluableError if nothing was seen.
     """
@@ -147,8 +146,7 @@ def blank(channels: Mapping[str, NDArray[np.generic]], is_unknown: Bool) -> Chan
 class Cubes:
     """The never-seen cells (X, Y, Z) of a grid as solid cubes.
 
-    distance: lower bound [m] of the signed distance from each cell's centre; away (..., 3): unit vectors of its
-    growth.
+    distance: lower bound [m] of the signed distance from cell centres; away (..., 3): unit vectors of its growth.
     """
 
     is_unknown: Bool
@@ -157,11 +155,10 @@ class Cubes:
 
     @classmethod
     def of(cls, is_unknown: Bool, voxel: float) -> "Cubes":
-        """Bound the distances in a grid with both known and unknown cells.
+        """Bound the distances in a grid with known and unknown cells.
 
-        Outside: the larger of the nearest centre's distance minus half a diagonal, and the least chessboard
-        distance minus half a cell. Inside: half a cell minus the distance to the nearest known centre, which the
-        depth does not exceed.
+        Outside: the larger of nearest centre minus half a diagonal, and chessboard distance minus half a cell.
+        Inside: half a cell minus the nearest known centre, which the depth does not exceed.
         """
         here = np.indices(is_unknown.shape, dtype=np.int32)
         distance, nearest = distance_transform_edt(~is_unknown, return_indices=True)
@@ -187,7 +184,7 @@ class Cubes:
         )
 
     def joined(self, channels: Mapping[str, NDArray[np.generic]], bound_margin: float) -> tuple[Channels, int]:
-        """Return channels of the nearer of field and cubes, and the number of changed sdf cells."""
+        """Return channels of the nearer of field and cubes, and the number of changed cells."""
         joined = dict(channels)
         is_nearer = np.asarray(self.distance < np.asarray(channels["sdf"], dtype=np.float32))
         joined["sdf"] = np.where(is_nearer, self.distance, channels["sdf"])

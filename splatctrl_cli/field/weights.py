@@ -1,4 +1,4 @@
-"""Kernels of the distance field, and its weights by row sums, voxels or the full process (III-D)."""
+"""Kernels of the distance field, and its weights (III-D)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -35,10 +35,9 @@ MAX_BLOCKS = 2000
 def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Float64:
     """``sum_j k(|p_i - p_j|)`` (N,) of centres (N, 3) [m], j = i included, in linear time.
 
-    Each centre spreads one unit over its eight nodes (trilinear), the nodes are convolved, and each centre reads
-    back. Its own term is replaced by k(0) = 1. Spreading and reading blur by h^2 / 3 per axis; convolving with ``2
-    k - (mean of k at the six neighbours)`` undoes that to second order. Raises UsageError for more than
-    `MAX_BLOCKS` blocks.
+    Each centre spreads one unit over eight nodes (trilinear), these are convolved, and it reads them back, with its
+    own term replaced by k(0) = 1. That blurs by h^2 / 3 per axis; convolving with ``2 k - (mean of k at the six
+    neighbours)`` undoes it to second order. Raises UsageError for more than `MAX_BLOCKS` blocks.
     """
     voxel, reach = length / VOXELS_PER_LENGTH, KERNEL_REACH * VOXELS_PER_LENGTH
     nodes = (centers - centers.min(axis=0)) / voxel
@@ -94,7 +93,6 @@ def _sampled_kernel(kernel: KernelValue, voxel: float, reach: int) -> Float64:
 
 
 def _own_terms(share: Float64, kernel: Float64) -> Float64:
-    """Return what each centre (N,) reads back of its own unit."""
     same = share**2 + (1.0 - share) ** 2  # of an axis, that the mass and the reading fall on the same node
     pair = np.stack([same, 1.0 - same])
     return np.asarray(
@@ -115,7 +113,6 @@ def _convolved(mass: Float64, transformed: NDArray[np.complex128]) -> Float64:
 
 
 def _corners(cells: Index, share: Float64) -> list[tuple[Index, Float64]]:
-    """Return index (N, 3) and share (N,) for each of eight nodes."""
     return [
         (cells + np.array(step), np.asarray(np.prod(np.where(step, share, 1.0 - share), axis=1)))
         for step in product((0, 1), repeat=3)
@@ -140,7 +137,7 @@ BYTES_PER_PAIR = 44  # of the matrix and of the pairs that it is made of; 40 wer
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """M of eq. 12 (N,) as ``scaled exp(log_scale)``; residual: the largest, relative to the group's largest y."""
+    """M of eq. 12 (N,) as ``scaled exp(log_scale)``; residual: relative to its group's largest y."""
 
     scaled: Float64
     log_scale: Float64
@@ -153,9 +150,8 @@ def solve_process(
 ) -> Solution:
     """``(K(P, P) + noise I)^-1 y`` (eq. 8, 12) for centres (N, 3) [m], y = exp(log_values) (N,).
 
-    The kernel is cut off at 8 l. Groups of splats that it does not join are each scaled by their largest y: a
-    Matern y is ``e^(r / l)``, which overflows. Raises UsageError for too little memory or too wide a spread of y,
-    NotEvaluableError without convergence.
+    The kernel is cut off at 8 l. Groups that it does not join are scaled by their largest y: Matern's ``e^(r / l)``
+    overflows. Raises UsageError for little memory or a wide spread of y, NotEvaluableError without convergence.
     """
     matrix = _kernel_matrix(centers, length, kernel, noise)
     num_groups, group = connected_components(matrix, directed=False)
@@ -177,7 +173,7 @@ def solve_process(
 def conjugate_gradients(matrix: "csr_array", values: Float64, tolerance: float) -> tuple[Float64, int, float]:
     """x (N,) with ``max |A x - y| <= tolerance``, the iterations, and that residual.
 
-    A has a unit diagonal: no preconditioner. Raises NotEvaluableError if A is not positive definite or after
+    A unit diagonal needs no preconditioner. Raises NotEvaluableError if A is not positive definite or after
     `CG_ITERATIONS`.
     """
     x = np.zeros(len(values))
@@ -283,8 +279,8 @@ NO_LOG = -1e4  # of a weight that is exactly zero: too small to matter, and fini
 class Weights:
     """w (N,) as ``sign exp(log_size)``: the occupancy is ``o(x) = sum_i w_i k_d(-r_i) k(x, p_i)``.
 
-    The Gaussian kernel has no ``k_d(-r_i)``: radii enter by the terms' shares. sign (N,) +-1, None if all are
-    positive; num_iterations, residual: None without a solver.
+    The Gaussian kernel has no ``k_d(-r_i)``: radii enter by the terms' shares. sign (N,) +-1, None if all positive;
+    num_iterations, residual: of a solver.
     """
 
     log_size: Float64

@@ -1,4 +1,4 @@
-"""Straight edges in joint space proved free of solids and self-collision: typed wrappers.
+"""Straight edges in joint space proved free of solids and self-collision.
 
 Shapes: E edges, J joints, R rows (M moving spheres, then P pairs).
 """
@@ -17,11 +17,11 @@ PART = 10  # spheres that are passed over together, at most
 class EdgeRoom:
     """An arm among solids; made by `of`.
 
-    chain: its last K spheres are middles of body parts, whose balls of radius (K,) [m] contain each part's centres.
-    moving (M,), pairs (P, 2) spheres, ordered by part; taken (R,) [m] off each row; levers (R, J) [m/rad]. groups
-    (G, 4): first part, second part (-1: solids), first row, one past the last; group_taken (G,), group_levers (G,
-    J): their rows' largest. balls (., 4): center, radius; boxes (., 15): rotation and shift from world to their
-    axes, half sizes; rods (., 15): the same with radius, half length along z, and what is added all about.
+    chain: its last K spheres are centres of body parts; balls of radius (K,) [m] around them contain the parts'
+    spheres' centres. moving (M,), pairs (P, 2) spheres, ordered by part; taken (R,) [m] off each row; levers (R, J)
+    [m/rad]. groups (G, 4): first part, second part (-1: solids), first row, one past the last; group_taken (G,),
+    group_levers (G, J): largest of their rows. balls (., 4): center, radius; boxes (., 15): rotation and shift from
+    world to box, half sizes; rods (., 15): likewise, with radius, half length along z, padding.
     """
 
     chain: Chain
@@ -39,7 +39,7 @@ class EdgeRoom:
 
     @classmethod
     def of(cls, chain: Chain, moving: Int64, pairs: Int64, taken: Float64, levers: Float64) -> "EdgeRoom":
-        """Make an arm without solids; moving (M,), pairs (P, 2), taken (R,), levers (R, J) in any order."""
+        """Make an arm without solids from rows in any order."""
         part, part_body, middles, radius = _parts(chain)
         between = np.concatenate(
             [np.stack([part[moving], np.full(len(moving), -1)], axis=1), part[pairs].reshape(-1, 2)]
@@ -84,11 +84,10 @@ class EdgeRoom:
         only_whole: bool,
         threads: int = 1,
     ) -> tuple[Float64, Int64]:
-        """Return the share (E,) of edges start (E, J) to end (E, J) proved free, and checks (E,) made.
+        """Return the share (E,) of edges start (E, J) to end (E, J) proved free, and checks (E,).
 
-        A row minus `rounding` below `contact` [m] is in collision; one that an edge does not move loses `still` [m]
-        over it. Within `give_up` [rad] before a collision the proof stops. With only_whole, an edge not all free
-        has share 0.
+        A row collides if less `rounding` it is below `contact` [m]; one that an edge does not move loses `still`
+        [m]. The proof stops `give_up` [rad] before a collision. With only_whole, an edge not all free has share 0.
         """
         share, num_checks = np.empty(len(start)), np.empty(len(start), np.int64)
         native.advance_edges(
@@ -124,7 +123,7 @@ class EdgeRoom:
 
 
 def _parts(chain: Chain) -> tuple[Int64, Int64, Float64, Float64]:
-    """Return the part (S,) of each sphere; body (K,), middle (K, 3) and radius (K,) [m] of each part."""
+    """Return the part (S,) of each sphere; body (K,), middle (K, 3), radius (K,) [m] of each part."""
     part = np.empty(len(chain.sphere_body), np.int64)
     bodies: list[int] = []
     middles: list[Float64] = []

@@ -1,4 +1,7 @@
-"""Rays that cross a surface measured by another camera: shiny objects read too far, or dark ones without depth."""
+"""Rays through a surface that another camera measures: shiny or dark objects.
+
+They are measured far behind their place, or return no depth.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -30,8 +33,8 @@ BESIDE = np.ones((3, 3), np.uint8)  # a block and its neighbours
 class Contradicted:
     """Blocks of `side` pixels (h, w) of a frame that another frame contradicts.
 
-    until (h, w) [m]: depth where its rays cross another's surface, 0 = nowhere; is_blank (h, w): no depth there;
-    through (h, w) [m]: depth of its own surface where another's rays cross it, 0 = nowhere.
+    until (h, w) [m]: where its rays cross another's surface, 0 = nowhere; is_blank (h, w): no depth there; through
+    (h, w) [m]: its own surface where another's rays cross it, 0 = nowhere.
     """
 
     side: int
@@ -44,12 +47,12 @@ class Contradicted:
         return self._spread((self.until > 0) & ~self.is_blank, shape)
 
     def unproven(self, frame: RgbdFrame) -> RgbdFrame:
-        """Return the frame without depth that another's rays cross: it proves no free space."""
+        """Return the frame without depth that another's rays cross."""
         is_through = self._spread(self.through > 0, frame.depth.shape)
         return replace(frame, depth=np.where(is_through, np.float32(0.0), frame.depth)) if is_through.any() else frame
 
     def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Float64:
-        """Return points (K, 3) [m], world, half a voxel apart on its rays before the disputed surface."""
+        """Return points (K, 3) [m], world, half a voxel apart, on its rays before that surface."""
         end = np.maximum(self.until, self.through)
         v, u = np.nonzero((end > 0) & (self.is_blank == is_blank))
         depths = np.arange(config.min_range, end.max(initial=config.min_range), 0.5 * config.voxel)
@@ -67,9 +70,7 @@ class Contradicted:
 
 @dataclass(frozen=True, kw_only=True)
 class _Surface:
-    """Object points (K, 3) [m], world, with their blocks' rows and columns (K,) and depth (K,) [m]; none at depth
-    steps.
-    """
+    """Object points (K, 3) [m], world, off depth edges, with block indices (K,) and depth (K,) [m]."""
 
     points: Float64
     v: Index
@@ -78,12 +79,12 @@ class _Surface:
 
 
 def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
-    """Yield what the other frames of one time step, or the drawn robot, contradict in each.
+    """Yield, for each frame of one time step, what other frames or the drawn robot contradict.
 
-    All rays of a block and its neighbours cross a surface of another frame. They end more than `CONTRADICTED` [m]
-    behind it, or return no depth although in range and outside stereo shadows. Rays to a drawn robot without a
-    return count too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Either frame may be wrong: where
-    others cross `SEEN_THROUGH_PIXELS` blocks of a ray's surface, it proves no free space either.
+    Rays of a block and its neighbours all cross another frame's surface, and end more than `CONTRADICTED` [m]
+    behind it or return no depth, in range and outside stereo shadows. No return from the drawn robot counts, too.
+    Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Either frame may be wrong: a ray to
+    `SEEN_THROUGH_PIXELS` crossed blocks proves no free space either.
     """
     surfaces = [_surface(*one) for one in seen]
     through = [np.zeros([size // _side(frame) for size in frame.depth.shape], np.float32) for frame, _ in seen]
@@ -117,7 +118,7 @@ def _side(frame: RgbdFrame) -> int:
 
 
 def _blocks(image: NDArray[T], side: int) -> NDArray[T]:
-    """Return pixels (h, w, side^2) of an image's blocks, without the remainder."""
+    """Return the pixels (h, w, side^2) of an image's blocks."""
     h, w = (size // side for size in image.shape)
     parts = image[: h * side, : w * side].reshape(h, side, w, side)
     return parts.swapaxes(1, 2).reshape(h, w, side * side)
@@ -137,7 +138,7 @@ def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class _Rays:
-    """Depth [m] that rays of blocks (h, w) surely reach, and blocks that unexpectedly return nothing."""
+    """Least depth [m] of rays by block (h, w), and blocks that unexpectedly return none."""
 
     frame: RgbdFrame
     side: int
@@ -155,9 +156,7 @@ class _Rays:
         return cls(frame=frame, side=side, surely=surely, is_blank=np.asarray(is_blank))
 
     def run_through(self, surface: _Surface, until: Float32) -> Index:
-        """Write depths of a surface that the rays cross into `until` (h, w); return its points with measured depth
-        behind.
-        """
+        """Write crossed surface depths into `until` (h, w); return points with depth measured behind."""
         pixel, z = pixels_at(self.frame, surface.points)
         width = self.frame.intrinsics.width
         v, u = pixel // width // self.side, pixel % width // self.side
@@ -170,7 +169,7 @@ class _Rays:
 
 
 def _side_by_side(depths: Float32, least: int) -> Float32:
-    """Return depths (h, w) [m] of blocks and neighbours, in groups of `least` or more."""
+    """Return depths (h, w) [m] of blocks and neighbours, in groups of at least `least`."""
     wide = cv2.dilate(depths, BESIDE)
     num, piece = cv2.connectedComponents((wide > 0).view(np.uint8), connectivity=8)
     counts = np.bincount(piece[depths > 0], minlength=num)

@@ -1,9 +1,7 @@
-"""Space where cameras got no depth: dark, shiny or clear objects in full view.
+"""Holes without depth, which may contain dark, shiny or clear objects.
 
-A hole is a group of pixels without depth, surrounded by depth. Its content stands on its rays, before what is seen
-around it. Rays of other cameras and later images clear them.
-
-Depth is also lost on both sides of a depth edge: the nearer surface may extend there.
+A hole is surrounded by depth; its content is on its rays, before what is seen around. Rays of other cameras and
+later images clear it. Depth is also lost at depth edges: the nearer surface may extend there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,11 +25,11 @@ MOST_POINTS = 1 << 18  # at a time: fine voxels and a large hole come to a hundr
 
 
 def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Iterator[Float64]:
-    """Yield points (K, 3) [m], world, half a voxel [m] apart on rays of a frame's holes.
+    """Yield points (K, 3) [m], world, half a voxel apart on rays of a frame's holes.
 
-    Some repeat. Rays lie about a voxel apart, from `min_range` to the depth seen nearest. Holes up to `NARROW_HOLE`
-    voxels wide do not count. robot_depth (H, W) [m]: rendered, 0 = none; near it the far background may show, so it
-    bounds no hole. Holes are found at once, points lazily.
+    Some repeat. Rays are about a voxel apart, from `min_range` to the nearest depth seen. Holes up to `NARROW_HOLE`
+    voxels wide do not count, nor those near the robot (robot_depth (H, W) [m], 0 = none): background may show
+    there.
     """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
@@ -49,12 +47,10 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
 
 
 def _voxel_width(frame: RgbdFrame, depths: Float32, config: OccupancyConfig) -> float:
-    """Return a voxel's width in pixels at the median of depths (K,) [m]."""
     return config.voxel * frame.intrinsics.fx / float(np.median(depths))
 
 
 def _wide(pixels: Bool, width: float) -> Bool:
-    """Return pixels (H, W) in a full square of this width."""
     side = int(width) | 1  # OpenCV shifts an even window
     opened = cv2.morphologyEx(pixels.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     return np.asarray(opened.view(bool))
@@ -74,14 +70,13 @@ def _on_rays(
 
 
 def _holes(is_blank: Bool, is_end: Bool) -> Bool:
-    """Return groups of pixels (H, W) without depth that meet neither border nor `is_end`."""
+    """Return pixels (H, W) without depth, in groups off border and `is_end`."""
     _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
     return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
 
 
 def _nearest_depth(depth: Float32) -> Float32:
-    """Return the depth [m] of the nearest pixel with depth (H, W)."""
     is_blank = (depth <= 0).view(np.uint8)
     _, which = cv2.distanceTransformWithLabels(is_blank, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     of_label = np.zeros(int(which.max()) + 1, np.float32)
@@ -99,9 +94,9 @@ def lost_edges(
 ) -> dict[str, LostEdges]:
     """Return, by camera, a ball for each pixel without depth next to an object pixel.
 
-    It has the nearest such object's depth and a pixel's radius: a surface that the pixel shows ends before the next
-    centre. A lone object pixel is noise. Left out are balls that another frame sees through by `see_through`, or as
-    near to the robot: its own outline.
+    It has the nearest such depth and a pixel's radius: a surface shown there ends before the next centre. Left out
+    are lone object pixels, which are noise, and balls that a frame sees through by `see_through`, or as near to the
+    robot: its own outline.
     """
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
     surely = [

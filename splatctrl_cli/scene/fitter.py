@@ -1,4 +1,4 @@
-"""`SceneFitter.step`: one time step of the paper's Fig. 2, from RGB-D frames to splats."""
+"""`SceneFitter.step`: one time step of the paper's Fig. 2."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -71,7 +71,7 @@ from splatctrl_cli.voxels import Balls, KnownVoxels, Unseen
 class SceneFitter:
     """Fits a fixed budget of isotropic splats to RGB-D frames.
 
-    `checkpoint.fitter_state` has the whole state. The same frames and seed give the same bytes at any thread count.
+    The same frames and seed give the same bytes at any thread count; `checkpoint.fitter_state` is the whole state.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class SceneFitter:
         self.objects: dict[str, Bool] = {}  # by camera, pixels (H, W) of its newest frame that show objects
 
     def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
-        """Take in one time step's frames: integrate, remove, add or relocate, optimise, label."""
+        """Take in the frames of one time step: integrate, remove, seed, optimise, label."""
         rng = np.random.default_rng([self.seed, self.num_steps])
         robot = robot and replace(robot, num_threads=self.num_threads)
         self._find_mounted(frames)
@@ -177,7 +177,7 @@ class SceneFitter:
         return replace(self._audit(views, filled, removed, terms), **audited(masks))
 
     def plant(self, cloud: PointCloud) -> Filled:
-        """Start from coloured points: seeds dense enough to use a share `fill` of the budget."""
+        """Start from coloured points, seeded with a share `fill` of the budget."""
         source = Candidates(points=cloud.points, colors=cloud.colors, pixels=np.zeros(len(cloud), np.float32))
         count = max(int(self.config.fill * self.config.max_splats), 1)
         self.density = density_for([source], count, self.config)
@@ -185,10 +185,9 @@ class SceneFitter:
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def refine(self, num_iterations: int, progress: Callable[[int], None] = lambda _: None) -> AuditRow:
-        """Optimise a static scene over the window, with learning rates that fall to `final_rate`.
+        """Optimise a static scene over the window, with rates that fall to `final_rate`.
 
-        `progress` gets the iterations done after each of ten blocks; a restored fitter continues with the next
-        block.
+        `progress` gets the iterations done after each of ten blocks; a restored fitter continues with the next.
         """
         views = [self.view(view.frame) for view in (*self.window.newest, *self.window.keyframes)]
         for block in range(self.refined.num_blocks, REFINE_BLOCKS):
@@ -224,7 +223,7 @@ class SceneFitter:
         return self.buffer.splats(self.num_threads)
 
     def shell_splats(self) -> SplatSet | None:
-        """Return splats beyond the workspace, for pictures only; None without a shell."""
+        """Return splats beyond the workspace, for pictures only."""
         return None if self.shell is None else self.shell.splats()
 
     @property
@@ -259,7 +258,6 @@ class SceneFitter:
         return make_view(frame, mappable, self.mounted.get(frame.camera), is_robot=is_robot, reach=reach)
 
     def _find_mounted(self, frames: Sequence[RgbdFrame]) -> None:
-        """Find pixels of what a camera carries, once it has enough views."""
         for camera in sorted({frame.camera for frame in frames} - set(self.mounted)):
             known = [view.frame for view in self.window.keyframes]
             seen = spread_views([frame for frame in [*known, *frames] if frame.camera == camera])
@@ -270,9 +268,7 @@ class SceneFitter:
                 self.window.newest = [self.view(view.frame) for view in self.window.newest]
 
     def _behind(self, views: Sequence[View]) -> Color:
-        """Return the background's colour: of pixels without depth, or, without any depth, those that no planted
-        splat covers.
-        """
+        """Return the background colour, of pixels without depth, or without any depth, of uncovered ones."""
         if self.config.background == "black":
             return BLACK
         counted = [view.target.counted > 0 for view in views]
@@ -282,7 +278,6 @@ class SceneFitter:
         return background_color([view.frame for view in views], counted)
 
     def _carry(self, robot: RobotPosture | None) -> None:
-        """Move the robot's splats with the nearest sphere's link."""
         before, self.posture = self.posture, robot
         if before is None or robot is None:
             return
@@ -290,7 +285,6 @@ class SceneFitter:
         self.buffer.centers[slots] = carried(self.buffer.centers[slots], before, robot)
 
     def _floating(self, views: Sequence[View]) -> Bool:
-        """Return slots (M,) of splats that some view sees through."""
         is_floating = np.zeros(len(self.buffer.centers), bool)
         for label in (Label.OBJECT, Label.ROBOT):
             slots = np.flatnonzero(self._standing_for(label))
@@ -298,11 +292,10 @@ class SceneFitter:
         return is_floating
 
     def _relabel(self, robot: RobotPosture | None, seen: Seen) -> Bool:
-        """Relabel all splats; return trails (M,). One that turns from robot to object gets the least radius."""
         return relabel(self.buffer, self.occupancy, robot, seen, 0.5 * self.config.contact_radius)
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
-        """Remove splats that the optimiser moved off the robot, into air or out, or made faint."""
+        """Remove what the optimiser moved off the robot, into air or out, or made faint."""
         drifted = self._relabel(robot, seen)
         self.buffer.kill(drifted)
         floating = self._floating(views)
@@ -330,7 +323,7 @@ class SceneFitter:
         return {reason: int(mask.sum()) for reason, mask in reasons.items()}
 
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
-        """Fill dead slots at pixels of M_add, as dense as uses `fill` of the budget on the first full view."""
+        """Fill dead slots at pixels of M_add; the first full view sets the density."""
         found: dict[Label, list[Candidates]] = {Label.OBJECT: [], Label.ROBOT: []}
         added = [add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config) for view in views]
         every = thinning(added)
@@ -370,10 +363,9 @@ class SceneFitter:
     def _fill_gaps(
         self, views: Sequence[View], masks: Sequence[SelfMask], removed: dict[str, int], half: int | None = None
     ) -> Filled:
-        """Add splats where a measured surface is far from every sphere, one half per time step in turn.
+        """Add splats where measured surfaces are far from all spheres, alternate halves per step.
 
-        The robot and everything else have spheres of their own. For the latter, missing slots are evicted every
-        EVICT_EVERY steps.
+        The robot's surface has spheres of its own. For other surfaces, slots are evicted every EVICT_EVERY steps.
         """
         filled = Filled()
         for label in (Label.OBJECT, Label.ROBOT):
@@ -402,7 +394,6 @@ class SceneFitter:
         return filled
 
     def _standing_for(self, label: Label) -> Bool:
-        """Return slots (M,) of live splats of the robot, or of everything else."""
         is_robot: Bool = self.buffer.labels == Label.ROBOT
         return self.buffer.is_alive & (is_robot if label == Label.ROBOT else ~is_robot)
 
@@ -411,7 +402,7 @@ class SceneFitter:
     ) -> Filled:
         """Give objects near moving links dense splats of half `contact_radius`.
 
-        Only steady pixels (H, W) seed: a single measurement may be noise, and stays while the arm hides it.
+        Only steady pixels count: noise would stay while the arm hides it.
         """
         if robot is None:
             return Filled()
@@ -428,9 +419,9 @@ class SceneFitter:
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _keep_to_surface(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> None:
-        """Move object splats near the robot onto measured depth, and shrink those that stand out of it.
+        """Put object splats near the robot on measured depth, and shrink those that stand out.
 
-        The least radius is half of `contact_radius`; hidden splats get it at once.
+        The least radius is half of `contact_radius`, at once for hidden splats.
         """
         if robot is None:
             return
@@ -446,7 +437,6 @@ class SceneFitter:
         self.buffer.set_radius(slots, np.where(is_hidden, np.minimum(radii, np.float32(least)), radii))
 
     def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
-        """Use dead slots that no seed needs, except the reserve for gaps."""
         filled, num_weak = use_idle(self.buffer, lambda: self.descent.misfits(views), self.config, rng)
         removed["weak"] += num_weak
         return filled
@@ -454,7 +444,7 @@ class SceneFitter:
     def _is_grounded(
         self, points: Float32, views: Sequence[View], label: Label = Label.OBJECT, *, least: float = np.inf
     ) -> Bool:
-        """Return points (K,) that no view sees through by min(`see_through`, `least`) [m]: such are noise."""
+        """Points (K,) that no view sees through by `see_through` or `least` [m]: others are noise."""
         gap = min(self.occupancy.config.see_through, least or np.inf)
         return ~seen_through(points, views, gap, self.num_threads, label)
 

@@ -1,4 +1,4 @@
-"""Views of the optimiser: each camera's newest frame, and keyframes of moving cameras."""
+"""Views of the optimiser: newest frames, and keyframes of moving cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,10 @@ DIRECTIONS = _STEPS / np.linalg.norm(_STEPS, axis=1, keepdims=True)  # (26, 3), 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A frame for the optimiser; `nearest` (H, W) [m]: `nearest_depth`; `nearest_object`: with robot pixels apart."""
+    """A frame for the optimiser, with its `nearest_depth` (H, W) [m].
+
+    nearest_object: likewise, with robot pixels apart.
+    """
 
     frame: RgbdFrame
     camera: Float64
@@ -43,10 +46,9 @@ def make_view(
     is_robot: Bool | None = None,
     reach: float = NEAREST_REACH,
 ) -> View:
-    """Return a view of `frame`; `mappable` (H, W): its pixels with depth in the workspace.
+    """Return a view of `frame`; `mappable` (H, W): pixels with depth in the workspace.
 
-    Pixels without depth count in the colour loss. Invalid pixels, and those with depth outside or `mounted` on the
-    camera, do not count.
+    Pixels without depth count in the colour loss; invalid, `mounted` and outside ones do not.
     """
     counted = mappable | (frame.depth <= 0)
     if frame.valid is not None:
@@ -67,10 +69,10 @@ def make_view(
 def seen_through(
     centers: Float32, views: Sequence[View], tolerance: float, num_threads: int = 1, label: Label = Label.OBJECT
 ) -> Bool:
-    """Return splats (N,) that float: nearer than every valid depth around their pixel in some view.
+    """Splats (N,) that float: nearer than every valid depth around their pixel in some view.
 
-    "Around" is as in `nearest_depth`, "nearer" by more than `tolerance` [m]: neither silhouettes nor noise remove
-    surface splats. This is finer than voxels, which stay occupied if they contain a surface and the air before it.
+    "Around" is as in `nearest_depth`, "nearer" by `tolerance` [m]: silhouettes and noise remove none. This is finer
+    than voxels: one with a surface and the air before it stays occupied.
     """
     cameras = [view.camera for view in views]
     nearest = [view.nearest if label == Label.ROBOT else view.nearest_object for view in views]
@@ -78,10 +80,10 @@ def seen_through(
 
 
 def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
-    """Return centres (N, 3) [m], world, with those that float up to `most` [m] put on the surface.
+    """Return centres (N, 3) [m], world, those that float up to `most` [m] put on the surface.
 
-    A centre floats if all views that see its place measure more depth at its pixel and neighbours. It moves along
-    the ray of the view with the smallest step. A view with depth more than `most` before the centre is occluded.
+    A centre floats if all views that see it measure more depth around its pixel. It moves along the ray with the
+    smallest step. A view that measures less depth by `most` does not see it.
     """
     least, towards = np.full(len(centers), np.inf, np.float32), np.zeros_like(centers)
     for view in views:
@@ -99,10 +101,10 @@ def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
 def kept_radii(
     centers: Float32, radii: Float32, views: Sequence[View], tolerance: float, least: float, num_threads: int = 1
 ) -> Float32:
-    """Return radii (N,) [m] with which spheres stay within measured depth, at least `least` [m].
+    """Return radii (N,) [m] that keep spheres within measured depth, at least `least` [m].
 
-    A sphere shrinks while a point of its edge floats by more than `tolerance` [m] before the depth of nearby
-    pixels, or its point nearest to a camera before that of the centre's pixel.
+    A sphere shrinks while some view sees a point of its edge float by `tolerance` [m] before depth around it, or
+    its nearest point before the centre pixel's depth.
     """
     cameras = [view.camera for view in views]
     depths = [np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)) for view in views]
@@ -134,7 +136,7 @@ class Window:
         self.keyframes: list[View] = []
 
     def advance(self, views: Sequence[View]) -> None:
-        """Make `views` the newest; replaced ones become keyframes if their camera has moved."""
+        """Make `views` the newest; replaced ones of moved cameras become keyframes."""
         fresh = {view.frame.camera for view in views}
         for old in self.newest:
             if old.frame.camera not in fresh:
@@ -150,7 +152,7 @@ class Window:
         return metres > self.config.keyframe_distance or degrees > self.config.keyframe_angle
 
     def schedule(self, num_iterations: int, rng: np.random.Generator) -> list[View]:
-        """Return each iteration's view: rounds of all newest views and as many keyframes, shuffled."""
+        """Return each iteration's view, in shuffled rounds of newest views and as many keyframes."""
         views: list[View] = []
         while len(views) < num_iterations:
             count = min(len(self.keyframes), max(len(self.newest), 1))

@@ -1,4 +1,4 @@
-"""Labels of splats: robot, human or object, and trails of what was robot or human (III-C)."""
+"""Labels of splats, and trails of the robot and people (III-C)."""
 
 from collections.abc import Sequence
 
@@ -19,10 +19,10 @@ Seen = Sequence[tuple[RgbdFrame, SelfMask]]
 def relabel(
     buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture | None, seen: Seen = (), least: float = np.inf
 ) -> Bool:
-    """Relabel the splats; return trails (M,): those robot or human before, and object now.
+    """Relabel the splats; return trails (M,): robot or human before, object now.
 
     Without a posture, robot splats keep their label. Robot pixels overrule human masks. A robot splat that depth
-    shows to be an object stays, with at most radius `least` [m]: no object's depth has bounded it.
+    shows to be an object is no trail; its radius becomes at most `least` [m], as no object's depth has bounded it.
     """
     labels = np.where(human_splats(buffer, occupancy), np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
     if robot is None:
@@ -42,9 +42,8 @@ def relabel(
 def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture, seen: Seen) -> tuple[Bool, Bool]:
     """Return splats (M,) of the robot, and those that a pixel shows to be an object.
 
-    The pixel that a splat explains best decides. Splats that no pixel shows keep their label: what the robot
-    occludes is still there. Its own must be within `see_through` of its body. Others well inside the body become
-    robot unless in a solid voxel; if the robot is fully drawn, there too.
+    The pixel with the nearest depth decides. Without one, labels stay, as the robot occludes objects: its own
+    within `see_through` of its body. Others well inside become robot, in solid voxels only if all of it is drawn.
     """
     alive, config = buffer.is_alive, occupancy.config
     kind = shown_kinds(buffer.centers, seen, config)
@@ -60,10 +59,10 @@ def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPostu
 
 
 def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
-    """Return the `PixelKind` (N,) of the pixel with depth nearest to each centre (N, 3) [m], world.
+    """Return the `PixelKind` (N,) of the pixel with depth nearest to centers (N, 3) [m], world.
 
-    OBJECT within `see_through` of its depth, unless nearer to the rendered robot; ROBOT within the tolerance, which
-    excludes what it occludes; else NOTHING.
+    OBJECT within `see_through`, unless nearer to the rendered robot; ROBOT within its tolerance, without what it
+    occludes; else NOTHING.
     """
     best = np.full(len(centers), np.inf, np.float32)
     kinds = np.full(len(centers), PixelKind.NOTHING, np.uint8)
@@ -84,8 +83,7 @@ def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
 def human_splats(buffer: SplatBuffer, occupancy: OccupancyMap) -> Bool:
     """Return splats (M,) in voxels that human pixels hit.
 
-    A human splat stays so while any of the eight nearest voxels is: the surface is one voxel thick, and the
-    optimiser moves splats.
+    They stay human while one of the eight nearest voxels is: the surface is a voxel thick, and splats move.
     """
     is_in = occupancy.entity_at(buffer.centers) & Label.HUMAN > 0
     was_human = buffer.is_alive & (buffer.labels == Label.HUMAN)

@@ -1,7 +1,7 @@
-"""Pixels of what is mounted on a moving camera: a gripper, a bracket, a housing's rim.
+"""Pixels of what is mounted on a moving camera, such as a gripper.
 
-They stay the same while the world moves past: they are neither seeded nor compared. A known robot's model separates
-it instead (`labels`).
+They stay the same while the world moves past: they are neither seeded nor compared. A known robot has a model
+instead (`labels`).
 """
 
 from collections.abc import Sequence
@@ -26,9 +26,9 @@ def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
 
 
 def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None:
-    """Pixels (H, W) of what moves with one camera, by its `spread_views`; None for fewer than six.
+    """Pixels (H, W) of what moves with one camera, by `spread_views`; None for fewer than six.
 
-    They keep their colour, are not flat, and rarely have depth from `min_range` [m] on.
+    They keep their colour, are not flat, and rarely have depth of `min_range` [m].
     """
     if len(frames) < fixed.MOUNTED_MIN_VIEWS:
         return None
@@ -44,9 +44,9 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
 
 
 def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tuple[float, float, float]:
-    """Median colour in [0, 1] of counted pixels (H, W) far from any depth; black if too few.
+    """Median colour in [0, 1] of counted pixels (H, W) away from depth; black if too few.
 
-    What is out of range, dark or bright has no depth in a whole area; a hole has depth around it.
+    Surroundings out of range, dark or bright lose depth in whole areas; a hole has depth around it.
     """
     parts = []
     for frame, mask in zip(frames, counted, strict=True):
@@ -61,7 +61,6 @@ def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tu
 
 
 def _entering(mask: Bool) -> Bool:
-    """Return connected parts (H, W) that touch the border, without specks."""
     parts, _ = label(mask)
     border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
     area = np.bincount(parts.ravel())

@@ -40,10 +40,9 @@ class OccupancyMap:
         self._packed = pack_grid(self.origin, config.voxel, shape)
 
     def take_in(self, frames: Sequence[RgbdFrame]) -> None:
-        """Add the depth images of one time step; human pixels that hit set the human bit.
+        """Add the depth images of one time step; human pixels set the human bit.
 
-        Rays that pass clear it and the solid bit; so do hits of masked images' other pixels. Otherwise it stays: an
-        occluded person is still there.
+        Passing rays clear it, with the solid bit; so do other pixels of masked images. Occluded people stay.
         """
         self._begin_step(frames)
         masked = [(frame, frame.human) for frame in frames if frame.human is not None]
@@ -59,7 +58,7 @@ class OccupancyMap:
             self._label_hits(frame, mask != 0, set_bits=Label.HUMAN)
 
     def _begin_step(self, frames: Sequence[RgbdFrame]) -> None:
-        """Count a time step; beyond `MAX_STEPS`, every second one merges into the one before."""
+        """Count a time step; beyond `MAX_STEPS`, every second one merges into its predecessor."""
         if len(self.step_stamps_ns) == MAX_STEPS:
             self.step_stamps_ns = self.step_stamps_ns[::2]
             is_step = self.last_seen < min(Unseen)
@@ -104,7 +103,7 @@ class OccupancyMap:
         self.last_seen[i[is_never], j[is_never], k[is_never]] = reason
 
     def unexplained(self, centers: Float64, radii: Float64) -> NDArray[np.intp]:
-        """Return flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m] whose reason may change."""
+        """Flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m], with open reason."""
         is_near = np.zeros_like(self.entity)
         mark_spheres(self._packed, is_near, centers, radii, 1, self.num_threads)
         voxels = np.flatnonzero(is_near)
@@ -125,9 +124,9 @@ class OccupancyMap:
     def label_robot(self, centers: Float64, radii: Float64, seen: Sequence[tuple[RgbdFrame, Bool, Bool]]) -> None:
         """Set the robot bit only where spheres (S, 3), (S,) [m] or pixels show the robot.
 
-        seen: frames of one time step, pixels (H, W) of the robot and of objects. A voxel that an object's pixel
-        hits is solid, not robot, until a ray passes or only robot pixels hit. When a swept voxel becomes solid, its
-        log-odds fall to one hit: the robot's own pixels do not count for an object.
+        seen: frames of one time step, pixels (H, W) of robot and objects. A voxel that an object pixel hits is
+        solid, not robot, until rays pass or robot pixels alone hit. A swept voxel that becomes solid falls to the
+        log-odds of one hit: robot pixels do not count for an object.
         """
         was_solid = self.entity & SOLID > 0
         self.mark_robot(centers, radii)
@@ -143,8 +142,8 @@ class OccupancyMap:
     def forget_hidden(self, centers: Float64, radii: Float64, distance: Callable[[Float32], Float64]) -> None:
         """Clear solid voxels within the robot that connect to none outside.
 
-        Their object left while the robot hid the contact. Spheres (S, 3), (S,) [m] contain the robot; distance:
-        points (Q, 3) -> signed distance (Q,) [m] to it.
+        Their object left while the contact was hidden. Spheres (S, 3), (S,) [m] contain the robot; distance: points
+        (Q, 3) -> signed (Q,) [m].
         """
         reach = radii.max() + 2.0 * self.config.voxel
         low, high = ((f - self.origin) / self.config.voxel for f in (centers.min(axis=0), centers.max(axis=0)))
@@ -161,7 +160,7 @@ class OccupancyMap:
         crop[tuple(cells[is_forgotten].T)] &= np.uint8(~SOLID & 0xFF)
 
     def mark_robot(self, centers: Float64, radii: Float64) -> None:
-        """Set the robot bit only where spheres (S, 3), (S,) [m] meet; mark these voxels swept."""
+        """Set the robot bit in voxels that spheres (S, 3), (S,) [m] meet only; mark these swept."""
         self.entity &= np.uint8(~Label.ROBOT & 0xFF)
         mark_spheres(self._packed, self.entity, centers, radii, Label.ROBOT | SWEPT, self.num_threads)
 
@@ -192,10 +191,10 @@ class OccupancyMap:
         return bits
 
     def occupancy_around(self, points_world: Float32) -> tuple[Float32, Bool]:
-        """Return the largest occupancy (N,) of the eight nearest voxels; True if any was seen.
+        """Return the largest occupancy (N,) of the eight nearest voxels; True if one was seen.
 
-        The eight reach half a voxel on every side, so that a surface there supports a splat. Never-seen voxels
-        count only if all are (one half).
+        They reach half a voxel to all sides, as far as a surface supports a splat. Unless all are never seen (one
+        half), those do not count.
         """
         base = np.floor((points_world - self.origin) / self.config.voxel).astype(np.int64)
         limit = np.array(self.log_odds.shape) - 1
@@ -209,14 +208,14 @@ class OccupancyMap:
         return (1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32), is_observed
 
     def occupied_voxels(self) -> NDArray[np.intp]:
-        """Flat indices (K,) of voxels hit more than once (one may be noise), without the robot's."""
+        """Flat indices (K,) of voxels hit more than once, as one may be noise, except the robot's."""
         config = self.config
         threshold = float(np.log(config.occupied_above / (1.0 - config.occupied_above)))
         voxels = np.flatnonzero(self.log_odds > max(threshold, 1.5 * config.log_odds_hit))
         return voxels[~self._may_be_robot(voxels)]
 
     def _may_be_robot(self, voxels: NDArray[np.intp]) -> Bool:
-        """True for voxels (K,) that the robot swept, without an object since: they stay occupied a while."""
+        """True for voxels (K,) swept, without an object since: they stay occupied a while."""
         return np.asarray(self.entity.reshape(-1)[voxels] & (SWEPT | SOLID) == SWEPT)
 
     def swept_box(self) -> Box | None:
@@ -261,8 +260,7 @@ class OccupancyMap:
 class PeopleMemory:
     """Flat indices `voxels` (K,) of people, and `stamps_ns` (K,) of their last observation.
 
-    Free or other observations clear them (`OccupancyMap.take_in`); unobserved for longer than `memory` [s], they
-    become never seen.
+    `OccupancyMap.take_in` clears them; unobserved for `memory` [s], they become never seen.
     """
 
     def __init__(self, memory: float) -> None:

@@ -1,4 +1,4 @@
-"""The robot's surface and spheres in the scene, and the motion of its splats."""
+"""The robot's surface and spheres in the scene, and its splats' motion."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,10 +14,10 @@ from splatctrl_cli.robot.surface import RobotSurface
 
 @dataclass(frozen=True, kw_only=True)
 class RobotPosture:
-    """The robot's spheres, centers (S, 3) [m], world, radii (S,) [m], T_world_link (S, 4, 4), and surface.
+    """The robot's spheres and surface.
 
-    surface: collision geometry, None if only spheres are known; surfaces: by frame stamp [ns], where they differ;
-    T_world_surface: by stamp, poses (L, 4, 4) of its links.
+    centers (S, 3) [m], world; radii (S,) [m]; T_world_link (S, 4, 4); surface: None if only spheres are known;
+    surfaces: by frame stamp [ns], where different; T_world_surface: by stamp, poses (L, 4, 4) of its links.
     """
 
     centers: Float64
@@ -29,7 +29,7 @@ class RobotPosture:
     num_threads: int = 1
 
     def seen_at(self, stamp_ns: int) -> tuple[RobotSurface, Float64]:
-        """Return the surface and its links' poses (L, 4, 4) at a frame's stamp; else of the spheres."""
+        """Return the surface and its links' poses (L, 4, 4) at a stamp, else of the spheres."""
         if self.surface is None:
             return RobotSurface.of_balls(self.centers, self.radii), np.eye(4)[None]
         return self.surfaces.get(stamp_ns, self.surface), self.T_world_surface[stamp_ns]
@@ -37,13 +37,13 @@ class RobotPosture:
     def distance(self, points_world: NDArray[np.floating], without: Sequence[str] = ()) -> Float64:
         """Signed distance (N,) [m] of points (N, 3) to the robot at the newest stamp, negative inside.
 
-        It is exact up to `ROBOT_REACH`. The links `without` do not count.
+        Exact up to `ROBOT_REACH`, except from the links `without`.
         """
         surface, T = self.seen_at(max(self.T_world_surface, default=0))
         return surface.distance(T, points_world, without=without, within=ROBOT_REACH, num_threads=self.num_threads)
 
     def holds(self, points_world: NDArray[np.floating], depth: float) -> Bool:
-        """Points (N, 3) [m] more than `depth` [m] inside a fully drawn robot: no object is there."""
+        """Points (N, 3) [m] over `depth` [m] inside a fully drawn robot: no object is there."""
         if self.surface is None or not self.surface.is_drawn:
             return np.zeros(len(points_world), bool)
         return np.asarray(self.distance(points_world) < -depth)
@@ -56,9 +56,9 @@ class RobotPosture:
 def posture_of(
     robot: RobotModel, q: Float64, at_frames: Mapping[int, Float64], carried: Sequence[tuple[str, Box]] = ()
 ) -> RobotPosture:
-    """Return the robot at joint positions q (J,), and at those of each frame's stamp [ns].
+    """Return the robot at joint positions q (J,), and at those of frame stamps [ns].
 
-    carried: boxes in link frames, which count as its own surface.
+    carried: boxes in link frames, part of its surface.
     """
     spheres, surface = robot.sphere_set, robot.surface.with_boxes(carried) if carried else robot.surface
     surfaces = {stamp: robot.surface_at(stamp) for stamp in at_frames} if robot.changes else {}
@@ -80,9 +80,9 @@ POSTURE_NAMES = ("centers", "radii", "T_world_link")  # what the next time step 
 
 
 def carried(points: Float32, before: RobotPosture, after: RobotPosture) -> Float32:
-    """Move points (N, 3) [m], world, rigidly with the link of the sphere surface nearest to each.
+    """Move points (N, 3) [m], world, with the link of the nearest sphere surface.
 
-    Otherwise splats would become trails, and the arm be re-seeded every frame. The paper does not move them.
+    Otherwise each frame would trail and re-seed the arm. The paper does not move them.
     """
     gap = np.linalg.norm(points[:, None] - before.centers[None], axis=2) - before.radii
     sphere = np.argmin(np.abs(gap), axis=1)

@@ -1,4 +1,4 @@
-"""Consistency of a recording: cameras agree on surfaces, and each camera's poses form a path."""
+"""Consistency of a recording: cameras agree on surfaces, poses form a path."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ from splatctrl_cli.scene.seeding import world_points_at
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Distance between the surfaces that two cameras measure, |dz| [m].
+    """Distance |dz| [m] of surfaces that two cameras see: median and lower quartile.
 
-    depth [m]: where they see them; detour [m]: least sum of medians by way of a third camera.
+    depth [m]: theirs; detour [m]: least sum of medians by way of a third camera.
     """
 
     cameras: tuple[str, str]
@@ -29,15 +29,15 @@ class Agreement:
 
     @property
     def limit(self) -> float:
-        """Limit for good cameras [m]: 3 cm, beyond 1 m 3 % of the depth (2 % each, independent)."""
+        """Limit of good cameras [m]: 3 cm, 3 % beyond 1 m (2 % each)."""
         return fixed.PAIR_LIMIT * max(1.0, self.depth)
 
     @property
     def holds(self) -> bool:
         """False if median and detour exceed the limit, and the quartile half of it.
 
-        Both sides of a thin object look like one surface: there, a share of pixels or a third camera still agrees.
-        With wrong poses neither does.
+        Both sides of a thin object look like one surface, but then a share of pixels or a third camera agrees; with
+        wrong poses neither.
         """
         return min(self.median, self.detour) <= self.limit or self.quartile <= 0.5 * self.limit
 
@@ -49,7 +49,7 @@ CAUSES = (
 
 
 def agreements(frames: Sequence[RgbdFrame], min_range: float, max_range: float) -> list[Agreement]:
-    """Return the agreement of each camera pair with enough common pixels, in one still scene.
+    """Return the agreement of camera pairs with enough common pixels, in a still scene.
 
     Views of one camera are paired, too. Depth counts from `min_range` to `max_range` [m].
     """
@@ -82,7 +82,7 @@ def _agreement(cameras: tuple[str, str], rows: Float64) -> Agreement:
 
 
 def differences(a: RgbdFrame, b: RgbdFrame, min_range: float, max_range: float) -> Float64:
-    """|dz| and depth (K, 2) [m] in view b, at points of view a within `PAIR_SAME_SURFACE` of b's depth."""
+    """|dz| and depth (K, 2) [m] in view b, of view a's points within `PAIR_SAME_SURFACE`."""
     stride = max(1, a.intrinsics.height // fixed.PAIR_ROWS)
     is_used = np.zeros(a.depth.shape, bool)
     is_used[::stride, ::stride] = True
@@ -109,9 +109,9 @@ class PoseJump:
 
 
 def largest_jump(poses: Iterable[tuple[int, str, Float64]]) -> PoseJump | None:
-    """Return a camera's longest move between frames at most a second apart; None without any.
+    """Return a camera's longest move between frames within a second; None without any.
 
-    poses: stamp [ns], camera and T_world_camera of each frame, by stamp.
+    poses: stamp [ns], camera and T_world_camera, by stamp.
     """
     last: dict[str, tuple[int, Float64]] = {}
     largest: PoseJump | None = None

@@ -1,4 +1,4 @@
-"""Use of idle slots: clones of opaque splats (3DGS-MCMC), or detail where colours are wrong."""
+"""Use of idle slots: clones (3DGS-MCMC), or detail where colours are wrong."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from splatctrl_cli.scene.seeding import NO_SEEDS, candidates, thinned, thinning
 
 
 def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> tuple[Float64, Float64]:
-    """Return opacity (N,) and radius (N,) [m] of each of `count` (N,) coinciding copies of a splat.
+    """Return opacity (N,) and radius (N,) [m] of each of `count` (N,) coinciding copies.
 
     The peak is conserved, `a = 1 - (1 - alpha)^(1/N)`, and the blended opacity over the screen, `r' = r sqrt(alpha
     / sum_{i=1..N} (1 - (1 - a)^i) / i)`: the 2-D rule. The 1-D rule of 3DGS-MCMC (Kheradmand et al. 2024, eq. 9)
@@ -48,7 +48,7 @@ def clone(buffer: SplatBuffer, num_clones: int, rng: np.random.Generator) -> Fil
 
 @dataclass(frozen=True, kw_only=True)
 class Misfit:
-    """A view's mean absolute colour error (H, W), 0 in pixels that do not count."""
+    """A view's mean absolute colour error (H, W), 0 in uncounted pixels."""
 
     frame: RgbdFrame
     error: Float32
@@ -60,9 +60,9 @@ def use_idle(
     config: SceneConfig,
     rng: np.random.Generator,
 ) -> tuple[Filled, int]:
-    """Use dead slots beyond the reserve as `when_idle` says; also return the number of weak splats removed.
+    """Use dead slots beyond the reserve as `when_idle` says; return also the weak splats' number.
 
-    misfits: the views', and how much each slot (M,) shows.
+    misfits: of views, and how much each slot (M,) shows.
     """
     is_alive, reserve = buffer.is_alive, int(config.gap_reserve * config.max_splats)
     if config.when_idle == "leave" or not is_alive.any():
@@ -81,8 +81,8 @@ def use_idle(
 def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:
     """Return at most `num_seeds` pixel-sized seeds on measured surfaces, drawn by squared colour error.
 
-    The error is a mean over 3 x 3 pixels, weighted by the surface area of a pixel. Seeds keep their diameters
-    apart, so that views do not seed a spot twice.
+    The error is a 3 x 3 mean, weighted by a pixel's area of surface. Seeds keep their diameters apart: views share
+    spots.
     """
     every = thinning(misfit.error > 0 for misfit in misfits)
     masks = [thinned(misfit.error > 0, every) for misfit in misfits]
@@ -101,10 +101,9 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
 
 
 def drawn(weight: Float64, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Draw `count` different indices in proportion to weight (K,), at least `count` of them above 0.
+    """Draw `count` different indices in proportion to weight (K,), at least `count` of them positive.
 
-    The result is that of ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, without its checks of
-    millions.
+    As ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, without its slow checks.
     """
     left = weight / weight.sum()
     found = np.zeros(0, np.intp)
@@ -119,7 +118,6 @@ def drawn(weight: Float64, count: int, rng: np.random.Generator) -> NDArray[np.i
 
 
 def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: NDArray[np.intp]) -> Seeds:
-    """Return the chosen (K,) pixels of masks (H, W), counted over all frames, as seeds."""
     order = np.argsort(chosen, kind="stable")
     parts, first = [], 0
     for frame, mask in zip(frames, masks, strict=True):
@@ -138,7 +136,7 @@ def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: NDArray[
 
 
 def _apart(points: Float32, distances: Float32) -> NDArray[np.intp]:
-    """Return indices of points (K, 3) outside the distance (K,) of every earlier kept one."""
+    """Return indices of points (K, 3) not within the distance (K,) of earlier kept ones."""
     is_taken = np.zeros(len(points), bool)
     neighbours = cKDTree(points).query_ball_point(points, distances)
     kept = []

@@ -17,8 +17,8 @@ REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain"
 def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH, is_robot: Bool | None = None) -> Float32:
     """Return the least valid depth (H, W) [m] within `reach` [m] of each pixel; inf without any.
 
-    `reach` counts at the median depth. Robot pixels count only for themselves and their neighbours: near the robot,
-    nearer splats float.
+    `reach` is at the median depth. Robot pixels count only for themselves and neighbours: nearer splats beside it
+    float.
     """
     depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
     valid = frame.depth[frame.depth > 0]
@@ -49,12 +49,10 @@ def removals(
     """Return masks (M,) of live splats to remove, each under its first reason in `REASONS`.
 
     broken: not finite. workspace: outside. opacity: below alpha_min. free: all voxels around observed free.
-    seen_through: floats before measured depth. uncertain: occupancy between 0.3 and 0.7 beyond the patience. trail:
-    was robot or human. Empty here: robot (moved off it by the optimiser), evicted (for bare surface), weak (for
-    detail, in refining).
+    seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 beyond the patience. trail: was
+    robot or human. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail).
 
-    Splats in never-seen surroundings stay, unless the rule is "literal". `counts_time` updates the buffer's count
-    of uncertain steps.
+    Splats in never-seen surroundings stay, unless the rule is "literal". `counts_time` counts uncertain steps.
     """
     config = occupancy.config
     centers = buffer.centers
@@ -98,10 +96,10 @@ def _verdict(value: Float32, is_observed: Bool, config: OccupancyConfig) -> tupl
 def room_for(
     seeds: Seeds, num: int, buffer: SplatBuffer, occupancy: OccupancyMap, shown: Float64, tolerance: float
 ) -> tuple[Bool, Seeds]:
-    """Return slots (M,) of at most `num` splats to evict, and the seeds in order of service.
+    """Return slots (M,) of at most `num` splats to evict, and seeds in order.
 
-    Only object splats go: redundant ones first, by how little they show, then those far from the robot's path.
-    shown (M,): how much each slot shows; tolerance [m]: as in `redundant`.
+    Redundant object splats go first, by how little they show (M,), then those far from the robot's path. tolerance
+    [m]: as in `redundant`.
     """
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_alive)
     stands = splats.labels != Label.ROBOT
@@ -131,8 +129,8 @@ def redundant(
     """Return at most `num_wanted` splats of `order` that others can replace.
 
     splats: N of objects and people; voxels (K, 3) [m]: occupied centres. A splat represents voxels within
-    `tolerance` [m] of its sphere, among the eight nearest centres. It is redundant if each of its voxels keeps
-    another: no surface becomes bare, to be seeded again.
+    `tolerance` [m] of its sphere, among the eight nearest centres. If each keeps another splat, its removal bares
+    no surface.
     """
     if not len(order) or not len(voxels) or num_wanted < 1:
         return np.zeros(0, np.intp)
@@ -154,10 +152,9 @@ def redundant(
 
 
 def far_away(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> NDArray[np.intp]:
-    """Return at most `num_wanted` splats (N, 3), farthest first, each EVICT_NEARER farther from the path than its
-    seed (K, 3).
+    """Return at most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
 
-    That margin keeps two surfaces from taking each other's slots in turn.
+    Each is EVICT_NEARER farther from the path than its seed: no two surfaces exchange slots in turn.
     """
     to_splat = distance_to_box(centers, path)
     farthest = np.argsort(-to_splat, kind="stable")[:num_wanted]

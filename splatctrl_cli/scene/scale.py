@@ -1,4 +1,4 @@
-"""Scale of a map's lengths, from recorded depth: defaults suit a table at arm's length."""
+"""Scale of a map's lengths from recorded depth; defaults suit a table at arm's length."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -62,17 +62,16 @@ class RecordedDepth:
 def depth_noise(images: Sequence[Float32]) -> float:
     """Return the standard deviation [1/m] of one camera's inverse depth (H, W); 0 if unknown.
 
-    A depth z has this times z^2, as in disparity sensors (Khoshelham and Elberink 2012: 1.425e-3 of a Kinect). A
-    plane's inverse depth is linear in the pixel: residuals of linear fits to blocks on one surface are noise, so a
-    low quantile over blocks is taken. A fit absorbs noise that neighbours share; blocks two or three times as wide
-    show up to twice as much, beyond that shape.
+    At depth z, that is times z^2, as in disparity sensors (Khoshelham and Elberink 2012: 1.425e-3 of a Kinect).
+    Inverse depth of a plane is linear in the pixel: residuals of linear fits to blocks are noise, at a low
+    quantile. A fit absorbs noise that neighbours share: blocks two or three times as wide count up to twice as
+    much; more is shape.
     """
     narrow, *wider = (_linear_noise(images, times) for times in (1, *NOISE_WIDER))
     return max(narrow, min(max(wider), 2 * narrow))
 
 
 def _linear_noise(images: Sequence[Float32], times: int) -> float:
-    """Return `depth_noise` from blocks of `times` the usual side."""
     left: list[Float64] = []
     for depth in images:
         side = times * _block_side(depth)
@@ -89,16 +88,16 @@ def _linear_noise(images: Sequence[Float32], times: int) -> float:
 
 
 def _block_side(depth: Float32) -> int:
-    """Return a block's side: 24 of 640 pixels, since neighbours share noise."""
+    """Return a block's side: wide enough for noise that neighbours share."""
     return int(max(depth.shape[1] // NOISE_BLOCKS, NOISE_LEAST_SIDE))
 
 
 def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) -> Config:
     """Return `config` with defaults fitted to the recording; the same object if nothing changes.
 
-    Lengths scale by `scene.scale`, or if 0, by the median depth relative to a table at arm's length. The depth
-    range spans at least half the nearest to the farthest. With a robot the scale stays, and the sensor's error
-    grows to the recording's.
+    Lengths scale by `scene.scale`, or if 0, by the median depth over a table's at arm's length. min_range becomes
+    at most half the nearest depth, not below its default, max_range at least the farthest. With a robot, scale 0
+    scales nothing, and a larger recorded error replaces the default.
     """
     least = OccupancyConfig().depth_error
     if has_robot and depth.noise > least == config.occupancy.depth_error:

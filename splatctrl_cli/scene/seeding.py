@@ -1,4 +1,4 @@
-"""Seeds of new splats: first frames, and pixels that the map does not explain (M_add, eq. 5)."""
+"""Seeds of new splats, from first frames and unexplained pixels (M_add, eq. 5)."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -40,7 +40,7 @@ def _placed(frame: RgbdFrame) -> Float64:
 
 
 def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, min_range: float = 0.0) -> Bool:
-    """Pixels (H, W) with depth from `min_range` [m] on, in the workspace."""
+    """Pixels (H, W) in the workspace with depth of at least `min_range` [m]."""
     is_valid = (frame.depth > 0) & (frame.depth >= min_range)
     return np.asarray(is_valid & workspace.contains(points_world))
 
@@ -48,9 +48,9 @@ def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, mi
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:
     """M_add (H, W): pixels to seed, eq. 5 with a term for holes.
 
-    A mappable pixel is seeded if it is a hole (opacity below `hole_opacity`), or closer than the map by more than
-    lambda_MDE times the median depth error. The median is of explained mappable pixels, clipped at both ends; the
-    map's depth is normalised by its opacity.
+    A mappable pixel is a hole (opacity below `hole_opacity`), or closer than the map by more than lambda_MDE times
+    the median depth error. The median is of explained mappable pixels, clipped at both ends; the map's depth is
+    normalised by opacity.
     """
     is_hole = rendering.opacity < config.hole_opacity
     error = rendering.normalised_depth() - frame.depth
@@ -70,7 +70,7 @@ class Candidates(Columns):
 
 
 def thinning(masks: Iterable[Bool]) -> int:
-    """Return n: every n-th pixel of the masks (H, W) is within `SEED_MOST_PIXELS`."""
+    """Return n: every n-th pixel of the masks (H, W) fits `SEED_MOST_PIXELS`."""
     return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / SEED_MOST_PIXELS))
 
 
@@ -84,7 +84,7 @@ def thinned(mask: Bool, every: int) -> Bool:
 
 
 def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Candidates:
-    """Return the candidates of the pixels of a mask (H, W)."""
+    """Return the candidates in a mask (H, W)."""
     focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
     colors = frame.color[mask].astype(np.float32) / 255.0
     return Candidates(
@@ -96,9 +96,7 @@ def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Candidates
 
 @dataclass(frozen=True, kw_only=True)
 class SeedDensity:
-    """Density of seeds: the coarsest cubes' edge [m], the detail from which a cube splits, and the number of
-    candidates that chose both.
-    """
+    """Density of seeds: coarsest edge [m], detail at which a cube splits, candidates it was chosen on."""
 
     edge: float
     tolerance: float
@@ -108,8 +106,8 @@ class SeedDensity:
 def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig, num_threads: int = 1) -> SeedDensity:
     """Return the density that spends at most `count` seeds on the candidates.
 
-    Cubes start at the edge that splats of the largest radius still cover. If they are too many, the edge grows (by
-    5 %) until they fit, up to the cloud's extent.
+    The edge starts at what the largest splats cover, and grows by 5 % while cubes are too many, up to the cloud's
+    extent.
     """
     points, colors, _ = _joined(sources)
     extent = float(np.max(np.ptp(points, axis=0))) if len(points) else 0.0
@@ -129,9 +127,9 @@ def seeds_at(
 ) -> Seeds:
     """Return one seed per standing cube over the candidates, finest cubes first.
 
-    None lies within 0.7 edges of a live splat (L, 3): blended depth at silhouettes would ask for new splats
-    forever. The paper's radius min(D/f, r_max) is one pixel. Far fewer splats than pixels need that of their cube:
-    r = min(max(radius_per_edge * edge, D/f), r_max).
+    None is within 0.7 edges of a live splat (L, 3): blended depth at silhouettes would ask for seeds forever. The
+    paper's radius min(D/f, r_max) is one pixel. For a smaller budget, r = min(max(radius_per_edge * edge, D/f),
+    r_max).
     """
     points, colors, pixel = _joined(sources)
     levels = cube_levels(points, colors, density.edge, SEED_LEVELS, num_threads)
@@ -152,12 +150,11 @@ def gap_seeds(
     num_threads: int = 1,
     each: Each = map,
 ) -> Seeds:
-    """Return seeds where a measured surface lies further than `max_gap` [m] from every splat's sphere.
+    """Return seeds where a measured surface is further than `max_gap` [m] from every sphere.
 
-    Splats far from a surface can cover its pixels by blending; a distance field sees the gap. Checked are every
-    `stride`-th pixel and row of the views (default: third or fewer, half of `max_gap` apart), and occupied centres
-    (K, 3), which keep surfaces out of view and may be half a voxel off. `half` 0 or 1 checks every second row only.
-    `each`: a `map` over views.
+    Blending covers pixels from distant splats; a distance field does not. Checked are every `stride`-th pixel and
+    row of the views (by default third or fewer, half of `max_gap`), and occupied centres (K, 3), up to half a voxel
+    off surfaces now out of view. `half` 0 or 1: only every second row. `each`: a `map` over views.
     """
     spheres = SplatTree(splats.centers, splats.radii, num_threads)
 
@@ -189,7 +186,6 @@ def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
 
 
 def _of_voxels(centers: Float32, splats: SplatSet) -> Candidates:
-    """Return voxel centres (K, 3) in the colour of the nearest splat, else grey."""
     colors = np.full((len(centers), 3), 0.5, np.float32)
     if len(splats):
         colors = splats.colors[cKDTree(splats.centers).query(centers)[1]]

@@ -52,9 +52,8 @@ class SelfMask:
     """The self-mask of a frame.
 
     kinds (H, W): `PixelKind`; robot_depth (H, W) [m]: rendered, 0 = none; residuals: by link, measured minus
-    rendered depth (K,) [m] inside the outline, up to `MASK_FAR_OFF`; num_inside: by link, points inside its body
-    that its surface does not explain; reach [m]: how far before the robot an object counts as robot, at its median
-    depth.
+    rendered depth (K,) [m] inside the outline, up to `MASK_FAR_OFF`; num_inside: by link, unexplained points inside
+    its body; reach [m]: an object this close before the robot, at its median depth, counts as robot.
     """
 
     kinds: UInt8
@@ -67,10 +66,10 @@ class SelfMask:
 def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
     """Return the self-mask of a frame, with the robot as at its stamp.
 
-    A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths nearby.
-    "Nearby" spans the tolerance in pixels: surfaces slant, and calibration shifts outlines. So is a point this near
-    to any triangle, or inside: a slit shows it. Balls and carried boxes enclose the true surface: points inside
-    them are robot. Other depth is object, if `_judge` agrees.
+    A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths nearby:
+    as many pixels as the tolerance spans, as surfaces slant and calibration shifts outlines. So is a point this
+    near to a triangle, or inside: slits show it. Points inside balls and carried boxes, which enclose the true
+    surface, are robot. Other depth is object, if `_judge` agrees.
 
     The image is widened by 1 / `MASK_BORDER`: an outline just outside fattens edges inside.
     """
@@ -154,9 +153,8 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
 def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Float32) -> None:
     """Mark object pixels beside the robot that are too few to believe, in place.
 
-    A piece joins neighbours whose depths differ by less than both `steps` [m]. One that extends away from the robot
-    is object. Others are mixed below `MASK_SPECK`, doubted below `MASK_ALONE`, by the `area` [m^2] that neither
-    sensor error nor outline explains.
+    A piece joins neighbours that differ by less than both `steps` [m]. It is an object if it extends away from the
+    robot. Otherwise the unexplained `area` [m^2] decides: mixed below `MASK_SPECK`, doubted below `MASK_ALONE`.
     """
     is_object, shown = kinds == PixelKind.OBJECT, np.empty(depth.shape)
     asked = is_object & beside
@@ -170,8 +168,8 @@ def settled(
 ) -> SelfMask:
     """Return the mask with each doubted piece decided: object or mixed.
 
-    It is object if one of `others` measured half of it, or if there are none. others: other cameras' frames, and
-    settled ones of the last time step.
+    Object if one of `others` measured half of it, or without others. others: other cameras' frames, and settled
+    ones of the last time step.
     """
     is_doubted = mask.kinds == PixelKind.DOUBTED
     if not is_doubted.any():
@@ -194,8 +192,8 @@ def settled(
 def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: float) -> list[SelfMask]:
     """Return the masks of one time step without object pixels that robot pixels outvote.
 
-    All frames vote in voxels of a grid with its first centre at `origin` (3,) [m]. Object pixels fewer than
-    `VOTE_SHARE` of a voxel's robot pixels are outline or noise, and become mixed.
+    All frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
+    object pixels are outline or noise, and become mixed.
     """
     parts = []
     for number, (frame, mask) in enumerate(seen):
@@ -265,7 +263,7 @@ def object_mask(frame: RgbdFrame) -> SelfMask:
 
 @lru_cache
 def _nothing_rendered(shape: tuple[int, int]) -> Float32:
-    """Return one image shared by the hundreds of masks without a robot."""
+    """One image, shared by all masks without a robot."""
     image = np.zeros(shape, np.float32)
     image.flags.writeable = False
     return image
@@ -283,7 +281,7 @@ def without(frame: RgbdFrame, mask: SelfMask, kind: PixelKind) -> RgbdFrame:
 
 
 def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_SIGMAS) -> Float32:
-    """Return how far [m] measured depth of the robot may be from rendered depth."""
+    """Return how far [m] depth of the robot may differ from rendered depth."""
     return np.asarray(config.self_mask_tolerance + sigmas * config.depth_error * depth * depth, np.float32)
 
 
@@ -291,8 +289,7 @@ def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_S
 class LinkResidual:
     """The residual of one link over several masks.
 
-    median [m]: of measured minus rendered depth; num_inside: unexplained points inside; reach [m]: the least
-    `SelfMask.reach`.
+    median [m]: of measured minus rendered depth; reach [m]: the least `SelfMask.reach`.
     """
 
     median: float | None
@@ -342,8 +339,8 @@ def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -
     """Return the self-mask's part of ``run.json``, over all time steps.
 
     `self_mask`: by link, median residual and reach [mm], and pixels; `self_mask_residual_mm`: the largest of judged
-    links, None without any; `inside_robot_points`, with the first step and link. A link is judged from
-    `MASK_PIXELS` pixels. Links in `holding` are not if others are: their surface was itself learned.
+    links, None without any; `inside_robot_points`, with the first step and link. Links with `MASK_PIXELS` are
+    judged, those in `holding` only if no others are: their surface was itself learned.
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
     pixels = {link: sum(row.self_mask[link]["num_pixels"] for row in rows if link in row.self_mask) for link in links}

@@ -1,7 +1,6 @@
 """The shell: coarse splats beyond the workspace, for rendering only.
 
-It is fitted to pixels that the map leaves out, with its own budget and no occupancy; the map's bytes do not depend
-on it.
+It fits pixels that the map leaves out, with its own budget; the map's bytes do not depend on it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +32,7 @@ Masked = Sequence[tuple[View, Bool]]
 
 
 def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
-    """Pixels (H, W) with depth from `min_range` [m] on outside the workspace, valid and not `mounted`."""
+    """Valid pixels (H, W) whose depth of at least `min_range` [m] is outside the workspace."""
     depth = view.target.depth
     left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0)
     left_out &= True if view.frame.valid is None else view.frame.valid
@@ -41,9 +40,9 @@ def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
 
 
 class Shell:
-    """A share `scene.shell` of `scene.max_splats`, in addition, for views beyond the workspace.
+    """Extra splats, `scene.shell` of `scene.max_splats`, for views beyond the workspace.
 
-    Its lengths suit the median depth of the first such pixels (`scale`).
+    Lengths scale by the median depth of the first such pixels.
     """
 
     def __init__(
@@ -57,7 +56,6 @@ class Shell:
         self._begin(0.0, None)
 
     def _begin(self, depth: float, density: SeedDensity | None, num_iterations: int = 0) -> None:
-        """Choose lengths by the median depth [m], 0 = nothing seen, and the seeds' density."""
         self._depth, self._density, config = depth, density, self.config
         if density is not None:
             config = scaled(config, depth / SCALE_DEPTH).derived(radius_depth=depth)
@@ -70,7 +68,7 @@ class Shell:
         self._descent.num_iterations = num_iterations
 
     def step(self, views: Window, mounted: Mapping[str, Bool], background: Color | None) -> None:
-        """Take in a time step's views, unchanged: remove, add, optimise."""
+        """Take in a time step's views: remove, seed, optimise."""
         rng = np.random.default_rng([self._seed, self.num_steps])
         self.num_steps += 1
         self._remove(views.newest)
@@ -93,9 +91,9 @@ class Shell:
         return self.buffer.splats(self._num_threads)
 
     def _add(self, shown: Masked) -> None:
-        """Seed what the shell does not explain; if too many seeds are unmet, restart coarser.
+        """Seed what the shell does not explain; restart coarser if too many seeds are unmet.
 
-        A restart covers all in view and the shell's splats of what no longer is.
+        A restart keeps its splats that are out of view.
         """
         asked = [(view, add_mask(view.frame, self._descent.rendering(view), m, self._scaled)) for view, m in shown]
         most = SHELL_UNMET * self.config.max_splats
@@ -115,14 +113,12 @@ class Shell:
         self._fill(sources, density)
 
     def _fill(self, sources: Sequence[Candidates], density: SeedDensity) -> int:
-        """Seed the sources; return the number of unmet seeds."""
         if not any(len(source) for source in sources):
             return 0
         seeds = seeds_at(sources, self.buffer.centers[self.buffer.is_alive], density, self._scaled, self._num_threads)
         return self.buffer.fill(seeds, self.config.initial_opacity).unmet
 
     def _remove(self, views: Sequence[View]) -> None:
-        """Remove splats in the workspace, faint, or seen through."""
         gone = self.workspace.contains(self.buffer.centers) | (self.buffer.opacities < self.config.min_opacity)
         gone |= seen_through(self.buffer.centers, views, self._see_through, self._num_threads)
         self.buffer.kill(self.buffer.is_alive & gone)

@@ -16,11 +16,11 @@ def steadied(
     """Return the frame with a running mean of its depth, and its steady pixels (H, W).
 
     An object pixel is steady if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2, and depths
-    around it by at most `STEADY_MOVED` `depth_error` z^2 on average: a moving surface lags no more. Its depth is
-    averaged if it was an object's before: a mean with the robot's surface lies in mid-air.
+    around it by at most `STEADY_MOVED` `depth_error` z^2 on average, the lag of a moving surface. Only what was an
+    object before is averaged: a mean with the robot's surface is in mid-air.
 
-    before: the camera's last averaged frame and its object pixels; without it none is steady. After a camera motion
-    depth stays, and all are.
+    before: the camera's last averaged frame and object pixels; None: no pixel is steady. If the camera moved, depth
+    stays, and all pixels are steady.
     """
     if before is None or before[1].shape != frame.depth.shape:
         return frame, np.zeros(frame.depth.shape, bool)

@@ -1,4 +1,4 @@
-"""Stereo shadows: places without depth, since only one imager sees them."""
+"""Stereo shadows: places without depth that only one imager sees."""
 
 import cv2
 import numpy as np
@@ -10,9 +10,9 @@ from splatctrl_cli.records import Bool, Float32, Float64, Index
 def shadowed(depth: Float32, focal: float) -> Bool:
     """Pixels (H, W) without depth in the shadow of something nearer in their row.
 
-    depth (H, W) [m], 0 = none; focal [px]. From the other imager at baseline B, an object at z hides B focal (1/z -
-    1/z_behind) pixels behind it, on one side. The image shows side and baseline (`_baseline`); z_behind is the
-    largest depth around the connected pixels without depth.
+    depth (H, W) [m], 0 = none; focal [px]. With baseline B, an object at z hides B focal (1/z - 1/z_behind) pixels
+    behind it, on one side. The image shows side and baseline; z_behind is the largest depth around connected pixels
+    without depth.
     """
     is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / MASK_EDGE, 1.0)
     for turn in (1, -1):  # what is nearer is at the right of its shadow, then at the left
@@ -31,11 +31,10 @@ def shadowed(depth: Float32, focal: float) -> Bool:
 
 
 def _baseline(depth: Float32, following: Index, focal: float) -> float:
-    """Return the baseline [m] that shadows left of nearer objects show; 0 without shadows.
+    """Return the baseline [m] of shadows left of nearer objects; 0 without any.
 
-    following (H, W): column of the first depth from each pixel on, W = none. Each step nearer by `SHADOW_STEP`
-    gives a baseline by its lost pixels. The median is over the higher half, weighted by height: fattened outlines
-    cover most of a low step's shadow.
+    following (H, W): column of the next depth, W = none. Each step nearer by `SHADOW_STEP` gives a baseline by its
+    lost pixels. The median is of the higher half, weighted by height: fattened outlines cover low steps' shadows.
     """
     following = following[:, 1:]
     before = depth[:, :-1]
@@ -51,14 +50,13 @@ def _baseline(depth: Float32, following: Index, focal: float) -> float:
 
 
 def _median(values: Float64, weights: Float64) -> float:
-    """Weighted median of values (N,)."""
     order = np.argsort(values)
     share = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
 
 
 def _behind(depth: Float32) -> Float32:
-    """Return the largest depth [m] around connected pixels (H, W) without depth, 0 elsewhere."""
+    """Largest depth (H, W) [m] around connected pixels without depth; 0 elsewhere."""
     is_blank = depth <= 0
     num, group = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     around = np.where(is_blank, cv2.dilate(depth, np.ones((3, 3), np.uint8)), np.float32(0.0))

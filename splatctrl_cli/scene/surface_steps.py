@@ -12,13 +12,12 @@ def surface_steps(
 ) -> Float32:
     """Return the largest depth step (H, W) [m] from each pixel to a neighbour on its surface.
 
-    It is `MASK_STEP`, except in the robot's outline (is_edge), `edge` pixels wide: a sensor measures mixed pixels
-    there, which lead from robot to background in small steps. So an object pixel more than its `tolerance` (H, W)
-    [m] off the plane gets half that distance, if less.
+    It is `MASK_STEP`, except in the robot's outline (is_edge), `edge` pixels wide: mixed pixels there would lead
+    from robot to background in small steps. An object pixel off its plane by more than `tolerance` (H, W) [m] gets
+    half that distance, if less.
 
-    The plane is a least-squares fit of 1 / depth to object pixels beyond the outline, within each of `MASK_PLANES`
-    widths. It counts if its residuals match the sensor's (`depth_error` [m] at 1 m) and it is well determined
-    (`MASK_UNSURE`).
+    The plane fits 1 / depth of object pixels beyond the outline, within each of `MASK_PLANES` widths. Its residuals
+    must match the sensor (`depth_error` [m] at 1 m), its variance `MASK_UNSURE`.
     """
     steps = np.full(depth.shape, MASK_STEP, np.float32)
     beyond, asked = is_object & ~is_edge, is_object & is_edge

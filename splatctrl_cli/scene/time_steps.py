@@ -1,4 +1,4 @@
-"""Time steps from a stream of records, the workspace's box, and the report of a step."""
+"""Time steps from records, the workspace's box, and a step's report."""
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -52,13 +52,13 @@ class TimeStep:
 
 @dataclass(frozen=True, kw_only=True)
 class AuditRow:
-    """Result of one time step: splat counts, loss (eq. 4) and PSNR [dB] over the newest frames, at their last
+    """Result of one time step; counts are of splats, loss (eq. 4) and PSNR [dB] of the newest frames, at their last
     iteration.
 
-    dead: reusable slots. unmet: seeds without a slot. evicted: splats that gave slots to bare surface.
-    unrepresented: occupied voxels without a splat. without_depth: frames without valid depth. loss, psnr: None if
-    no view shows the workspace. self_mask: by link, measured minus rendered depth: `median_mm`, its `sign`,
-    `num_pixels`. inside_robot: by link, unexplained points inside. blind: cameras without valid depth.
+    dead: reusable slots. unmet: seeds without a slot. evicted: slots given to bare surface. unrepresented: occupied
+    voxels without a splat. without_depth: frames without any. loss, psnr: None if no view shows the workspace.
+    self_mask: by link, measured minus rendered depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link,
+    unexplained points inside. blind: cameras without depth.
     """
 
     stamp_ns: int
@@ -99,10 +99,10 @@ def time_steps(
     observe: Callable[[Record], None] = lambda record: None,
     repeats: Counter[str] | None = None,
 ) -> Iterator[TimeStep]:
-    """Group frames of `cameras` by stamp, or without a clock, up to FRAMES_PER_STEP at a time.
+    """Group frames of `cameras` by stamp, or without a clock, FRAMES_PER_STEP at a time.
 
-    With a clock, a frame with its camera's last depth, bit by bit, is skipped and counted in `repeats`. `observe`
-    gets every record, so that one pass serves both.
+    With a clock, a frame that repeats its camera's depth is skipped, and counted in `repeats`. `observe` gets every
+    record: one pass serves both.
     """
     last_depth: dict[str, Float32] = {}
     frames: list[RgbdFrame] = []
@@ -131,7 +131,7 @@ def time_steps(
 
 
 def planar(frame: RgbdFrame) -> RgbdFrame:
-    """Return the frame with colour stored by plane, as the optimiser takes it: views are kept once."""
+    """Return the frame with colour stored by plane, as the optimiser takes it: without copies."""
     planes = np.ascontiguousarray(np.moveaxis(frame.color, 2, 0))
     return replace(frame, color=np.moveaxis(planes, 0, 2))
 
@@ -153,7 +153,7 @@ def _time_step(frames: Sequence[RgbdFrame], joints: JointState | None) -> TimeSt
 
 
 def cloud_box(cloud: PointCloud) -> Box:
-    """Return the box of a point cloud, widened by 5 % and 5 cm per side."""
+    """Return the box of a cloud, widened by 5 % and 5 cm per side."""
     lower, upper = cloud.points.min(axis=0).astype(np.float64), cloud.points.max(axis=0).astype(np.float64)
     margin = 0.05 * (upper - lower) + 0.05
     return Box(lower=lower - margin, upper=upper + margin)

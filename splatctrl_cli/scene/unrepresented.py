@@ -1,4 +1,4 @@
-"""Occupied voxels without a splat, and the agreement of splats with an occupancy grid."""
+"""Occupied voxels without a splat, and agreement of splats with a grid."""
 
 import itertools
 import math
@@ -19,10 +19,10 @@ from splatctrl_cli.voxels import SWEPT, Balls, KnownVoxels, VoxelState
 
 
 def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: SceneConfig, error: float = 0.0) -> Balls:
-    """Return the occupied voxels that no splat represents, as balls with label human or object.
+    """Return the occupied voxels that no splat represents, as balls labelled human or object.
 
-    A splat represents voxels with centres within `representing_reach` of its sphere, among the eight splats with
-    nearest centres. error [m]: of the sensor. The robot's splats represent nothing: fields leave them out.
+    A splat represents voxels with centres within `representing_reach` of its sphere, among the eight nearest. error
+    [m]: of the sensor. Robot splats do not count: fields leave them out.
     """
     others = splats.select(splats.labels != Label.ROBOT)
     reach = representing_reach(config, occupancy.config.voxel, error)
@@ -36,9 +36,9 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
 
 
 def confirmed(found: Balls, before: Balls | None) -> Balls:
-    """Return balls in groups of `BARE_GROUP` or more that touch, or found before in their place.
+    """Return balls that touch in groups of `BARE_GROUP` or more, or that were found before.
 
-    Smaller groups are often noise, or gaps not yet filled. before: balls of the last time step, None in the first.
+    Smaller groups are often noise or gaps not yet filled. before: of the last time step, None in the first.
     """
     voxel = 2.0 * found.radius / 3**0.5
     if before is None or not len(found):
@@ -53,10 +53,9 @@ def confirmed(found: Balls, before: Balls | None) -> Balls:
 
 
 def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) -> float:
-    """Return how far [m] a voxel's centre may be from the sphere of its splat.
+    """Return how far [m] a voxel's centre may be from a sphere that represents it.
 
-    That is `max_gap` and half a voxel, where gap filling begins, plus the sensor's error [m]; at most a voxel's
-    diagonal.
+    That is `max_gap` and half a voxel, as in gap filling, plus the sensor's error [m]; at most a voxel's diagonal.
     """
     return min(config.max_gap + 0.5 * voxel + error, 3**0.5 * voxel)
 
@@ -64,7 +63,7 @@ def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) ->
 def bare_voxels(
     occupancy: OccupancyMap, splats: SplatSet, workspace: Box, config: SceneConfig, half: int | None = None
 ) -> Float32:
-    """Centres (K, 3) [m] of occupied voxels that gap filling must check, without those surely near a splat.
+    """Centres (K, 3) [m] of occupied voxels for gap filling, except those surely near a splat.
 
     `half` 0 or 1 takes every second voxel.
     """
@@ -78,7 +77,7 @@ def bare_voxels(
 def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Bool:
     """Voxels (X, Y, Z) within `reach` [m] of a sphere, wherever its centre is in its voxel.
 
-    This settles most voxels at a tenth of the cost of a nearest-splat search.
+    Most are, at a tenth of the cost of a search.
     """
     voxel, shape = occupancy.config.voxel, occupancy.log_odds.shape
     cells = np.floor((splats.centers - occupancy.origin) / voxel + 0.5).astype(np.int64)
@@ -94,10 +93,10 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
 
 @dataclass(frozen=True, kw_only=True)
 class GridAgreement:
-    """Agreement of splats with a grid, as two shares; NaN without any.
+    """Agreement of splats with a grid; NaN without any.
 
-    on_surface: of object and human splats outside the grid or near a seen voxel, those near a voxel that is not
-    free; near: in or next to it. represented: of num_voxels occupied voxels, those with a splat or ball.
+    on_surface: share of object and human splats in or next to a voxel that is not free, of those outside the grid
+    or by a seen voxel. represented: share of num_voxels occupied voxels with a splat or ball.
     """
 
     on_surface: float
@@ -116,8 +115,7 @@ def agreement_with_grid(
 ) -> GridAgreement:
     """Return how well splats agree with the voxels of their map or snapshot.
 
-    Voxels that the robot swept are left out. Either share detects wrong units or moved splats; `represented`
-    detects removed splats.
+    Swept voxels are left out. Both shares detect wrong units or moved splats, `represented` missing ones.
     """
     grid = known.grid
     states = grid.states(occupancy.free_below, occupancy.occupied_above)
