@@ -1,4 +1,4 @@
-"""The baker of a distance field: a few planes of a grid at a time."""
+"""The baker of a distance field, a few planes at a time."""
 
 from collections.abc import Collection, Mapping
 from typing import TypeVar
@@ -40,9 +40,8 @@ T = TypeVar("T", bound=np.generic)
 class Baker:
     """Channels of a field over splats at the cells of `layout`.
 
-    Cutting and thread count change no bit. counts: ``se_without_value``, cells where the exact distance replaces
-    the kernel's; ``se_over_estimates``, those where it exceeds the exact one by more than `RESOLUTION`; likewise
-    gpdf.
+    Cut and thread count change no bit. counts: ``se_without_value``, cells with exact distance instead of the
+    kernel's; ``se_over_estimates``, those where it exceeds the exact one by `RESOLUTION`; likewise gpdf.
     """
 
     def __init__(
@@ -57,7 +56,7 @@ class Baker:
         threads: int = 0,
         device: Memory | None = None,
     ) -> None:
-        """device: a card instead of the processor, without masks.
+        """device: a card to use, without masks.
 
         Raises as `Spheres.of`; UsageError for unknown channels, or without sdf.
         """
@@ -90,8 +89,7 @@ class Baker:
     def bound_margin(self) -> float:
         """Exact distance at a cell's centre minus `bound` [m].
 
-        Half a cell's diagonal (the exact distance is 1-Lipschitz), plus float32 rounding of coordinates and
-        distance.
+        Half a cell's diagonal (hard is 1-Lipschitz), plus float32 rounding.
         """
         box = self.layout.box
         reach = np.abs(self.spheres.points.clusters.centers[:, self.spheres.points.is_point.view(np.bool_)]).max()
@@ -108,9 +106,9 @@ class Baker:
         return shape if CHANNELS[channel][1] == 1 else (*shape, CHANNELS[channel][1])
 
     def bake(self, first: int, last: int, out: Planes, mask: UInt8 | None = None) -> None:
-        """Fill `out` (last - first, Y, Z) with the x-planes [first, last), whole blocks of 8 cells.
+        """Fill `out` with x-planes [first, last), whole blocks of 8 cells.
 
-        mask (blocks of the grid): zero where a block of `out` keeps its values.
+        mask (blocks of the grid): zero where `out` keeps its values.
         """
         per_plane = 40 * self.layout.shape[1] * self.layout.shape[2]
         step = BLOCK * max(1, (64 << 20) // (BLOCK * per_plane))  # bytes beside the channels
@@ -136,7 +134,6 @@ class Baker:
             out[name][... if where is None else where] = made[name]
 
     def _made(self, span: GridSpan, where: Bool | None) -> dict[str, NDArray[np.generic]]:
-        """Return the span's channels, in one row if only `where`."""
         cells = None if where is None else np.flatnonzero(where)
         made, entry = self._by_processor(span, cells) if self.on_device is None else self._by_device(span)
         if self.probability is not None:
@@ -151,7 +148,6 @@ class Baker:
         return made
 
     def _by_processor(self, span: GridSpan, cells: NDArray[np.int64] | None) -> _Made:
-        """Return distances, and nearest entries if needed."""
         exact, exact_gradient, entry = self._hard(span)
         hard = _picked(exact, cells)
         gradient = None if exact_gradient is None else _picked(exact_gradient, cells)
@@ -172,7 +168,6 @@ class Baker:
         return made, None if entry is None else _picked(entry, cells)
 
     def _by_device(self, span: GridSpan) -> _Made:
-        """Do as `_by_processor`, for whole spans."""
         assert self.on_device is not None
         wanted = {*self.channels, "entry"} if "label" in self.channels else set(self.channels)
         found = self.on_device.bake(span, wanted, margin=self.bound_margin)
@@ -204,7 +199,6 @@ class Baker:
     def _chosen(
         self, hard: Float32, gradient: Float32 | None, kernels: Mapping[str, tuple[Float32, Float32 | None]]
     ) -> tuple[Float32, Float32 | None]:
-        """Return the configured distance and its gradient."""
         if self.kernel_name is None:
             return hard, gradient
         smooth, smooth_gradient = kernels[self.kernel_name]
@@ -216,7 +210,7 @@ class Baker:
 
 
 def _picked(values: NDArray[T], cells: NDArray[np.int64] | None) -> NDArray[T]:
-    """Return values of all cells, or of some in one row."""
+    """Values of all cells, or of some in one row."""
     return values if cells is None else values.reshape(-1, *values.shape[3:])[cells]
 
 

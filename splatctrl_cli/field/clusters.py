@@ -1,6 +1,6 @@
-"""Splats of a field as spheres, checked, and clustered once for every distance.
+"""Splats of a field as spheres, checked and clustered once.
 
-A space-filling curve sorts points into clusters of 16, and these into groups of 16, boxed.
+A space-filling curve sorts points into clusters of 16, these into groups of 16, boxed.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ _GROUPS = 8  # their number is a multiple of this
 
 @dataclass(frozen=True, kw_only=True)
 class ClusteredPoints:
-    """N points as C clusters, relative to a near anchor (float32 keeps 0.1 um within a metre or two).
+    """N points as C clusters, relative to an anchor (float32 keeps 0.1 um within a metre or two).
 
-    anchor (3,) [m], world; source (16 C,): point of each entry, 0 if spare; is_point (16 C,): 0 if spare.
+    anchor (3,) [m], world; source (16 C,): point of each entry; is_point (16 C,): 0 if spare.
     """
 
     anchor: Float64
@@ -60,8 +60,8 @@ class ClusteredPoints:
 def cluster_points(points_world: NDArray[np.floating], frame: Box | None = None) -> ClusteredPoints:
     """Cluster points (N, 3) [m], N > 0.
 
-    Anchor and curve follow `frame`, or the points' own box if None. With one frame, points in two sets keep order
-    and coordinates, bit by bit.
+    Anchor and curve follow `frame`, by default the points' box. In one frame, points of two sets keep order and
+    coordinates to the bit.
     """
     points = np.asarray(points_world, dtype=np.float64)
     lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
@@ -82,7 +82,6 @@ def cluster_points(points_world: NDArray[np.floating], frame: Box | None = None)
 
 
 def _boxes(relative: Float32, num_points: int) -> Float32:
-    """Return boxes (6, C + G) of clusters, then groups; spare ones are far away."""
     num_clusters = len(relative) // LANES
     num_groups = num_clusters // LANES
     boxes = np.full((6, num_clusters + _padded(num_groups, _GROUPS)), SPARE_PLACE, dtype=np.float32)
@@ -100,7 +99,7 @@ def _padded(count: int, multiple: int) -> int:
 
 
 def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> NDArray[np.int64]:
-    """Return places (N,) along a Hilbert curve, where neighbours are near in space.
+    """Places (N,) along a Hilbert curve, near if near in space.
 
     Skilling, "Programming the Hilbert curve" (AIP Conf. Proc. 707, 2004).
     """
@@ -135,7 +134,7 @@ class Spheres:
 
     @classmethod
     def of(cls, centers: ArrayLike, radii: ArrayLike, frame: Box | None = None) -> "Spheres":
-        """Cluster centers (N, 3) [m], world, and radii (N,) [m], 0 allowed; frame as in `cluster_points`.
+        """Cluster centers (N, 3) [m], world, and radii (N,) [m], 0 allowed.
 
         Raises NotEvaluableError without any, InputError for a wrong shape, a value not finite, or a negative
         radius.
@@ -145,7 +144,7 @@ class Spheres:
 
 
 def checked_points(points: NDArray[np.floating]) -> Float64:
-    """Return points (Q, 3) as float64. Raises InputError for another shape or a value not finite."""
+    """Return finite points (Q, 3). Raises InputError for others."""
     array = shaped_points(points)
     if not np.isfinite(array).all():
         raise not_finite(array)
@@ -153,7 +152,7 @@ def checked_points(points: NDArray[np.floating]) -> Float64:
 
 
 def shaped_points(points: NDArray[np.floating]) -> Float64:
-    """Return points (Q, 3) as float64. Raises InputError for another shape."""
+    """Return points (Q, 3). Raises InputError for another shape."""
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"query points: expected shape (Q, 3), got {array.shape}")
@@ -161,7 +160,7 @@ def shaped_points(points: NDArray[np.floating]) -> Float64:
 
 
 def not_finite(points: Float64) -> InputError:
-    """Return the error for the first point (Q, 3) that is not finite."""
+    """Return the error for the first point (Q, 3) not finite."""
     i = int(np.argmax(~np.isfinite(points).all(axis=1)))
     return InputError(f"query point {i}: expected finite coordinates, got {points[i].tolist()}")
 

@@ -1,4 +1,4 @@
-"""Distance fields over splats: exact, kernel, and the smaller of both. Positive outside."""
+"""Distance fields over splats: exact, kernel, and the smaller. Positive outside."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -19,13 +19,10 @@ from splatctrl_cli.records import DistanceField, Float32, Float64
 
 
 class SphereField:
-    """Exact distance to a union of spheres, ``hard(x) = min_i (|x - p_i| - r_i)`` (eq. 6); 1-Lipschitz.
-
-    Inside, it is minus the depth below the minimising sphere's surface.
-    """
+    """Exact distance to a union of spheres, ``hard(x) = min_i (|x - p_i| - r_i)`` (eq. 6); 1-Lipschitz."""
 
     def __init__(self, centers: ArrayLike, radii: ArrayLike, *, threads: int = 1) -> None:
-        """centers (N, 3) [m], world; radii (N,) [m], 0 allowed. Raises as `Spheres.of`."""
+        """centers (N, 3) [m], world; radii (N,) [m]. Raises as `Spheres.of`."""
         self._hold(Spheres.of(centers, radii), threads)
 
     @classmethod
@@ -41,20 +38,20 @@ class SphereField:
         self._threads = threads
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3), zero at a centre."""
+        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3), 0 at a centre."""
         local = self.spheres.points.relative(checked_points(points))
         score, gradient, _ = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)
         return score.astype(np.float64), gradient.astype(np.float64)
 
     def nearest(self, points: Float64) -> NDArray[np.int64]:
-        """points (Q, 3) [m] -> index (Q,) of the minimising sphere."""
+        """points (Q, 3) [m] -> index (Q,) of the sphere."""
         local = self.spheres.points.relative(checked_points(points))
         entry = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)[2]
         return self.spheres.points.source[entry]
 
 
 class LogSumExpField(ABC):
-    """A log-sum-exp over splats: the base of `GpdfField` and `SeField`."""
+    """A log-sum-exp over splats."""
 
     spheres: Spheres
 
@@ -69,7 +66,7 @@ class LogSumExpField(ABC):
         weights: str = FieldConfig.weights,
         threads: int = 1,
     ) -> None:
-        """centers (N, 3) [m], world; radii (N,) [m]; length_scale l and truncation [m]. Raises as `Spheres.of`."""
+        """centers (N, 3) [m], world; radii (N,), length_scale, truncation [m]. Raises as `Spheres.of`."""
         config = FieldConfig(length_scale=length_scale, noise=noise, truncation=truncation, weights=weights)
         self._hold(Spheres.of(centers, radii), config, threads)
 
@@ -89,10 +86,10 @@ class LogSumExpField(ABC):
 
     @abstractmethod
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN where undefined."""
+        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined."""
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """Return `query_raw`, and the exact field where that is NaN."""
+        """Return `query_raw`, exact where undefined."""
         return or_exact(self.query_raw(points), self.spheres, points)
 
 
@@ -100,8 +97,8 @@ class GpdfField(LogSumExpField):
     """The paper's field (eq. 7 to 10, 12, 15): a GP with a Matern-1/2 kernel, in the log domain.
 
     ``f(x) = -l log sum_i w_i exp((r_i - |x - p_i|) / l)``, shifted by the largest exponent: finite for every l and
-    mix of radii. Eq. 12 as printed, shifted by the nearest centre, overflows for r / l > 88 in float32. Weights of
-    either sign (cg) may give a sum that is not positive: no distance.
+    mix of radii. Eq. 12 as printed, shifted by the nearest centre, overflows for r / l > 88 in float32. It is
+    undefined where weights of either sign (cg) give no positive sum.
     """
 
     def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
@@ -119,10 +116,10 @@ class GpdfField(LogSumExpField):
         self._threads = threads
 
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN where the sum is not positive.
+        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); NaN if undefined.
 
-        ``grad f = sum_i pi_i (x - p_i) / |x - p_i|`` with pi the shares of the terms. Eq. 11 as printed is minus
-        this, normalised (see `normalised`).
+        ``grad f = sum_i pi_i (x - p_i) / |x - p_i|``, pi the terms' shares. Eq. 11 as printed is minus this,
+        normalised (`normalised`).
         """
         points_ = self.spheres.points
         score, gradient = native.matern(
@@ -149,7 +146,7 @@ class GpdfField(LogSumExpField):
         )
 
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
-        """Write `query_raw` at the cells of `span` to (X, Y, Z) and (X, Y, Z, 3)."""
+        """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
         native.bake_matern(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
 
 
@@ -157,8 +154,8 @@ class SeField(LogSumExpField):
     """The paper's Gaussian kernel in the log domain, with radii: unbiased over an evenly sampled plane.
 
     ``f(x) = sqrt(-2 l^2 L) - sum_i pi_i r_i`` with ``L = log sum_i w_i exp(-|x - p_i|^2 / (2 l^2))``, pi the terms'
-    shares. (As printed, ``k_d(-r) = k_d(r)`` loses the radius's sign.) No distance where L >= 0, near and inside
-    the surface.
+    shares. (As printed, ``k_d(-r) = k_d(r)`` loses the radius's sign.) Undefined where L >= 0, near and inside the
+    surface.
     """
 
     def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
@@ -223,12 +220,12 @@ class SeField(LogSumExpField):
         )
 
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
-        """Write `query_raw` at the cells of `span` to (X, Y, Z) and (X, Y, Z, 3)."""
+        """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
         native.bake_gaussian(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
 
 
 class SafeField:
-    """The smaller of the exact distance and a kernel field, with its gradient.
+    """The smaller of the exact distance and a kernel field.
 
     Row-sum lumping over-estimates the clearance to a sparse object before a dense one; the minimum never exceeds
     the exact distance.
@@ -240,7 +237,7 @@ class SafeField:
         self._both = kernel if isinstance(kernel, SeField) and are_of_one else None
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); exact in a tie."""
+        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); exact in ties."""
         if self._both is not None:
             return self._both.query_safe(points)
         distance, gradient = self._exact.query(points)
@@ -250,7 +247,7 @@ class SafeField:
 
 
 def or_exact(raw: tuple[Float64, Float64], spheres: Spheres, points: Float64) -> tuple[Float64, Float64]:
-    """Replace NaN distances (Q,) and their gradients (Q, 3) by the exact field's."""
+    """Replace NaN distances (Q,) and their gradients (Q, 3) by exact ones."""
     distance, gradient = raw
     has_none = np.isnan(distance)
     if has_none.any():
@@ -265,7 +262,7 @@ def laid_out_sign(spheres: Spheres, sign: Float32 | None) -> Float32 | None:
 
 
 def normalised(gradient: Float64) -> Float64:
-    """Return unit gradients (Q, 3), eq. 11 with its sign corrected; zero stays zero."""
+    """Return unit gradients (Q, 3), eq. 11 with its sign corrected; 0 stays 0."""
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
     return np.asarray(np.divide(gradient, length, out=np.zeros_like(gradient), where=length > 0))
 
@@ -297,7 +294,7 @@ def field_over(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> Di
 
 
 def make_field(centers: ArrayLike, radii: ArrayLike, config: FieldConfig, *, threads: int = 1) -> DistanceField:
-    """Make the field that ``config.distance`` names, over (N, 3), (N,) [m]."""
+    """Make the field that ``config.distance`` names."""
     return field_over(Spheres.of(centers, radii), config, threads=threads)
 
 
@@ -305,7 +302,7 @@ def make_field(centers: ArrayLike, radii: ArrayLike, config: FieldConfig, *, thr
 class March:
     """Result of a march from Q points.
 
-    distance (Q,) [m]: walked, plus `rest`; hit (Q, 3) [m]: place reached; rest (Q,) [m]: field there.
+    distance (Q,) [m]: walked, plus rest; hit (Q, 3) [m]; rest (Q,) [m]: field there.
     """
 
     distance: Float64
@@ -316,10 +313,9 @@ class March:
 def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps: int = MARCH_STEPS) -> March:
     """Walk from points (Q, 3) [m], world, to the zero level of `field`.
 
-    Each step follows the local gradient: with a fixed direction, a walk can pass an object by. It is as long as the
-    field reads, at most the `exact` distance, so that it crosses no sphere. The Matern field underestimates: its
-    zero level stands before the spheres (`health.planar_zero_level`). Points at or behind it stay. Raises
-    UsageError for less than one step.
+    Steps follow the local gradient: with a fixed direction, a walk can pass an object by. They are as long as the
+    field, at most the `exact` distance, so as to cross no sphere. The Matern field's zero level stands before the
+    spheres (`health.planar_zero_level`). Points at or behind it stay. Raises UsageError for less than one step.
     """
     if steps < 1:
         raise UsageError(f"marching: expected at least 1 step, got {steps}")

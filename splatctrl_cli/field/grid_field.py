@@ -10,15 +10,14 @@ from splatctrl_cli.records import Bool, Box, DistanceGrid, Float32, Float64
 
 
 class GridField:
-    """Trilinear interpolation between cell centres, and that interpolant's gradient.
+    """Trilinear interpolation between cell centres.
 
-    Outside the box of centres it reads the value at the box's nearest point minus the distance to it: a lower
-    bound, so that a robot outside reads less clearance, never more. Next to a NaN cell (policy ``nan``) it and the
-    certified distance are NaN.
+    Outside their box it reads the nearest value minus the distance to it: a lower bound, so that a robot outside
+    reads less clearance, never more. Next to a NaN cell (policy ``nan``) it is NaN, certified too.
     """
 
     def __init__(self, grid: DistanceGrid, channel: str = "sdf") -> None:
-        """Raises InputError for a missing channel or a single cell along an axis."""
+        """Raises InputError without the channel or for one cell along an axis."""
         if channel not in grid.channels:
             raise InputError(f"distance grid: no channel {channel!r}", remedy=f"it has: {', '.join(grid.channels)}")
         self._values = np.ascontiguousarray(grid.channels[channel], dtype=np.float32)
@@ -36,15 +35,14 @@ class GridField:
         self.box = Box(lower=self._origin, upper=upper)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m], world -> distance (Q,) [m], gradient (Q, 3), not normalised; NaN next to NaN."""
+        """points (Q, 3) [m], world -> distance (Q,) [m], the interpolant's gradient (Q, 3)."""
         return native.interpolate(self._values, self._origin, self._voxel, checked_points(points))
 
     def certified(self, points: Float64) -> Float64:
-        """Lower bound (Q,) [m] of the exact distance to the splats.
+        """Lower bound (Q,) [m] of the exact distance to splats (and obstacle cells), not to objects.
 
-        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding: hard is 1-Lipschitz. It bounds the
-        distance to splats (and never-seen cells as obstacles), not to objects. NaN where `query` is. Raises
-        InputError without the channel bound.
+        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding: hard is 1-Lipschitz. NaN where
+        `query` is. Raises InputError without the channel bound.
         """
         if self._bound is None:
             raise InputError("distance grid: no channel 'bound'", remedy="bake it with --channels sdf,bound")
@@ -61,7 +59,7 @@ class GridField:
 
 
 def exact_channel(grid: DistanceGrid) -> Float32:
-    """Exact distance (X, Y, Z) [m] at cell centres: the channel hard, or bound plus its margin.
+    """Exact distance (X, Y, Z) [m]: the channel hard, or bound plus its margin.
 
     Raises InputError without either.
     """

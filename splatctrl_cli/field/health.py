@@ -1,4 +1,4 @@
-"""Health of a splat set for fields: density, thickness, and kernel error."""
+"""Health of a splat set for fields."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass
@@ -12,10 +12,10 @@ from splatctrl_cli.config.fixed import MAX_RADIUS_SPREAD, ROUGH_LENGTH
 
 @dataclass(frozen=True, kw_only=True)
 class FieldHealth:
-    """Ratios that decide a field's quality, with warnings out of range.
+    """Ratios that decide a field's quality, with warnings.
 
-    spacing: median distance to the nearest other splat [m] (0 for one); radius: median [m]; planar_zero_level:
-    height [m] where the kernel field of a dense plane of such splats is zero.
+    spacing: median distance to the nearest other splat [m], 0 for one; radius: median [m]; planar_zero_level:
+    height [m] where a dense plane's kernel field is zero.
     """
 
     spacing: float
@@ -34,7 +34,7 @@ class FieldHealth:
 def field_health(
     centers: NDArray[np.floating], radii: NDArray[np.floating], length: float, *, kernels: Collection[str]
 ) -> FieldHealth:
-    """Return the health of splats (N, 3), (N,) [m] for these kernels (se, gpdf) of a length scale [m]."""
+    """Return the health of splats (N, 3), (N,) [m] for kernels (se, gpdf)."""
     spacing, radius = median_spacing(centers), float(np.median(radii))
     zero_level = planar_zero_level(radius, length)
     return FieldHealth(
@@ -93,7 +93,7 @@ def _set_warnings(
 
 
 def median_spacing(centers: NDArray[np.floating]) -> float:
-    """Median distance from a splat (N, 3) [m] to its nearest other; 0 for fewer than two."""
+    """Median distance from a splat (N, 3) [m] to the nearest; 0 below two."""
     if len(centers) < 2:
         return 0.0
     points = np.asarray(centers, dtype=np.float64)
@@ -105,7 +105,7 @@ def planar_zero_level(radius: float, length: float) -> float:
     """Height z [m] over a dense plane of splats where the Matern row-sum field is zero.
 
     The field is ``z - l log(1 + z / l) - r`` (the integral of ``e^(-d/l)`` over a plane is ``2 pi l (z + l)
-    e^(-z/l)``, the row sum ``2 pi l^2``). Newton's method starts above, where it is convex.
+    e^(-z/l)``, the row sum ``2 pi l^2``). Newton's method from above: it is convex.
     """
     z = radius + length * (1.0 + np.sqrt(2.0 * radius / length))
     for _ in range(50):

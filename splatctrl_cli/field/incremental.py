@@ -1,4 +1,4 @@
-"""Blocks of a grid that an edit of the splats can change; others keep their bake."""
+"""Blocks of a grid that an edit of the splats can change."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from splatctrl_cli.records import Float64, SplatSet, UInt8
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """mask (blocks of the grid): 1 where a bake is needed; None: everywhere, for `reason`."""
+    """mask (blocks of the grid): 1 where a bake is needed; None: everywhere."""
 
     mask: UInt8 | None
     num_blocks: int
@@ -28,10 +28,10 @@ class Changes:
 
 
 def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) -> Changes:
-    """Return the blocks where bakes of `after` and `before` can differ by a bit.
+    """Return the blocks where bakes of `before` and `after` can differ by a bit.
 
     Layout and configuration are the same. A block can differ where a splat of one set alone matters, by the bake's
-    own culling bounds. Weights are compared too: neighbours' weights change. `observed` does not count.
+    culling bounds. Weights count, as neighbours' change. `observed` does not.
     """
     shape = blocks_of(new.layout)
     num_blocks = int(np.prod(shape))
@@ -74,7 +74,7 @@ def counts_after(
 ) -> dict[str, int]:
     """Return the whole grid's counts of kernel values after baking `mask`.
 
-    From `counts` of the bake before, `old` bakes the blocks again to subtract theirs; `new` adds its own.
+    `old` bakes these blocks again, to subtract theirs from `counts`.
     """
     if not old.counts:
         return {}
@@ -88,7 +88,6 @@ def counts_after(
 
 
 def _reason_for_all(old: Baker, new: Baker) -> str:
-    """Return why every block needs a bake, or an empty string."""
     if new.gpdf is not None:
         return "every splat reaches every cell of gpdf"
     if new.probability is not None and new.config.probability == "paper":
@@ -116,7 +115,7 @@ def _touch(
 def _changed(
     splats: tuple[SplatSet, SplatSet], bakers: tuple[Baker, Baker], *, with_weights: bool
 ) -> tuple[UInt8, UInt8]:
-    """Return each set's entries (16 C,) missing in the other, bit by bit."""
+    """Return entries (16 C,) of each set missing in the other, to the bit."""
     rows = [_rows(s, b, with_weights=with_weights) for s, b in zip(splats, bakers, strict=True)]
     _, kinds = np.unique(np.concatenate(rows), return_inverse=True)
     here, there = np.split(kinds, [len(rows[0])])
@@ -129,9 +128,9 @@ def _changed(
 
 
 def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.void]:
-    """Return each splat as bytes (N,), in cluster order.
+    """Splats as bytes (N,), in cluster order.
 
-    A rank separates splats of one centre: their order can decide the last bit.
+    A rank separates those of one centre: their order can decide the last bit.
     """
     order = baker.spheres.points.source[baker.spheres.points.is_point.view(np.bool_)]
     centers = splats.centers.astype(np.float64)[order] + 0.0  # no -0, which is equal to 0
@@ -146,7 +145,7 @@ def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.v
 
 
 def _ranks(centers: Float64) -> NDArray[np.int64]:
-    """Return how many earlier rows equal each row (N, 3)."""
+    """Number of earlier rows equal to each row (N, 3)."""
     order = np.lexsort(centers.T)  # stable
     is_first = np.ones(len(centers), np.bool_)
     is_first[1:] = (np.diff(centers[order], axis=0) != 0).any(axis=1)

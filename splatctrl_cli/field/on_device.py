@@ -1,4 +1,4 @@
-"""Distance fields on a card, by their names in the configuration."""
+"""Distance fields on a card."""
 
 from collections.abc import Mapping
 from typing import Self
@@ -18,7 +18,7 @@ KERNELS: Mapping[str, type[LogSumExpField]] = {"se": SeField, "gpdf": GpdfField}
 
 
 class OnDevice:
-    """The field that ``config.distance`` names, on a device, for many points."""
+    """The field that ``config.distance`` names, on a device."""
 
     def __init__(self, spheres: Spheres, config: FieldConfig, device: Memory, *, threads: int = 1) -> None:
         """The processor makes the weights. Raises OutOfMemory."""
@@ -28,7 +28,7 @@ class OnDevice:
 
     @classmethod
     def of(cls, centers: ArrayLike, radii: ArrayLike, config: FieldConfig, device: Memory) -> Self:
-        """Make the field over spheres (N, 3), (N,) [m]. Raises as `Spheres.of`."""
+        """Make the field over (N, 3), (N,) [m]. Raises as `Spheres.of`."""
         return cls(Spheres.of(centers, radii), config, device)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
@@ -44,7 +44,7 @@ class OnDevice:
         return self._asked(points).distance.astype(np.float64) if len(points) else np.zeros(0)
 
     def nearest(self, points: Float64) -> NDArray[np.int64]:
-        """points (Q, 3) [m] -> index (Q,) of the sphere that gives the exact distance."""
+        """points (Q, 3) [m] -> index (Q,) of the exact distance's sphere."""
         if not len(points):
             return np.zeros(0, np.int64)
         found = self._asked(points, "entry")
@@ -62,7 +62,7 @@ class OnDevice:
 def device_field(
     spheres: Spheres, kernels: Mapping[str, LogSumExpField], config: FieldConfig, device: Memory
 ) -> DeviceField:
-    """Put the exact distance and `kernels` on a device, with the choice of ``config.distance``."""
+    """Put the exact distance and `kernels` on a device, for ``config.distance``."""
     chosen = KERNEL_OF[config.distance]
     choice = Choice(kernel=chosen, is_single=config.distance == chosen, resolution=RESOLUTION)
     terms = {name: field.terms() for name, field in kernels.items()}

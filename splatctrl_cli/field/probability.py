@@ -1,4 +1,4 @@
-"""Probability of collision at a point: the paper's, or calibrated by a measured error (III-D)."""
+"""Probability of collision: the paper's, or calibrated by a measured error (III-D)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -22,11 +22,11 @@ class CollisionProbability(Protocol):
     """A form of the collision probability."""
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
-        """Probability (X, Y, Z) at the cells of `span`, with chosen distance `sdf` [m]."""
+        """Probability (X, Y, Z) at the cells of `span`; sdf: chosen distance [m]."""
         ...
 
     def at(self, points: Float64, sdf: Float64) -> Float64:
-        """Probability (Q,) at points (Q, 3) [m], with chosen distance sdf (Q,) [m]."""
+        """Probability (Q,) at points (Q, 3) [m]; sdf (Q,): chosen distance [m]."""
         ...
 
     def described(self) -> dict[str, object]:
@@ -36,16 +36,16 @@ class CollisionProbability(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratedProbability:
-    """``Phi((mean - clearance) / sigma)``, for a measured field error.
+    """``Phi((mean - clearance) / sigma)``, with the field's measured error [m].
 
-    mean [m]: how much the field reads too far; sigma [m]: its standard deviation.
+    mean: what it reads too much; sigma: standard deviation.
     """
 
     sigma: float
     mean: float = 0.0
 
     def of(self, clearance: Float64) -> Float64:
-        """Probability of clearances of any shape [m]."""
+        """Probability of clearances [m], any shape."""
         return np.asarray(ndtr((self.mean - clearance) / self.sigma))
 
     def at(self, points: Float64, sdf: Float64) -> Float64:
@@ -59,10 +59,10 @@ class CalibratedProbability:
 
 
 class PaperProbability:
-    """Eq. 13 and 14 with the Matern kernel and lumped weights: a score, not calibrated (docs/field.md).
+    """Eq. 13 and 14 with the Matern kernel and lumped weights: a score (docs/field.md).
 
-    ``P(o >= 1 | o > 0) = Phi((o - 1) / s) / Phi(o / s)`` with o of `GpdfField`, ``s^2 = (1 - sum_i w_i k(x, p_i)^2)
-    / 9``.
+    ``P(o >= 1 | o > 0) = Phi((o - 1) / s) / Phi(o / s)``, o of `GpdfField`, ``s^2 = (1 - sum_i w_i k(x, p_i)^2) /
+    9``.
     """
 
     def __init__(self, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> None:
@@ -94,11 +94,11 @@ class PaperProbability:
         return self._combined(self._gpdf.query_raw(points)[0], half.astype(np.float64))
 
     def at(self, points: Float64, sdf: Float64) -> Float64:
-        """Probability (Q,), independent of sdf."""
+        """Probability (Q,), whatever the sdf."""
         return self.of(points)
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
-        """Probability (X, Y, Z), independent of sdf."""
+        """Probability (X, Y, Z), whatever the sdf."""
         places = self._gpdf.spheres.points
         gpdf, half = np.zeros_like(sdf), np.zeros_like(sdf)
         self._gpdf.bake_raw(span, gpdf, None, threads=threads)
@@ -123,9 +123,9 @@ class PaperProbability:
 
 
 def probability_of_occupancy(occupancy: Float64, explained: Float64) -> Float64:
-    """Eq. 14 of an occupancy o > 0 with variance ``(1 - explained) / 9``, of any shape.
+    """Eq. 14 of an occupancy o > 0 with variance ``(1 - explained) / 9``.
 
-    In logarithms: 1 - Phi loses small values. Far away it is ``Phi(-3) / Phi(0) = 0.0027``, not zero.
+    In logarithms, as 1 - Phi loses small values. Far away it is ``Phi(-3) / Phi(0) = 0.0027``, not zero.
     """
     deviation = np.sqrt(np.maximum(1.0 - explained, LEAST_VARIANCE) / VARIANCE_DIVISOR)
     return np.asarray(np.exp(log_ndtr((occupancy - 1.0) / deviation) - log_ndtr(occupancy / deviation)))
@@ -144,6 +144,6 @@ def make_probability(spheres: Spheres, config: FieldConfig, *, threads: int = 1)
 
 
 def probabilities(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> dict[str, CollisionProbability]:
-    """Make every form for these weights; the paper's variance does not hold for cg."""
+    """Make all forms for these weights; the paper's variance excludes cg."""
     names = [name for name in PROBABILITIES if name != "paper" or config.weights != "cg"]
     return {name: PROBABILITIES[name](spheres, config, threads) for name in names}

@@ -1,4 +1,4 @@
-"""Statistics of a baked grid: how much is known, and how far its gradient is from a distance's."""
+"""Statistics of a baked grid."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -21,7 +21,7 @@ NUM_BINS = 41  # about 0 to 2; the last one holds what is longer, too
 class GradientLengths:
     """Gradient lengths: 1 for a distance (Eikonal equation), less where a kernel field is flat.
 
-    histogram: bin k is within half a `bin_width` of k times that; share_near_one: within 0.05 of 1.
+    histogram: bin k is within half a `bin_width` of k times that; share_near_one: within 0.05.
     """
 
     histogram: tuple[int, ...]
@@ -33,7 +33,7 @@ class GradientLengths:
 
 @dataclass(frozen=True, kw_only=True)
 class Excess:
-    """Cells where a kernel field exceeds the exact distance to the spheres."""
+    """Cells where a kernel field exceeds the exact distance."""
 
     count: int
     share: float
@@ -42,10 +42,10 @@ class Excess:
 
 @dataclass(frozen=True, kw_only=True)
 class GridStatistics:
-    """Statistics of a grid; None or empty without the channels for it.
+    """Statistics of a grid; None or empty without channels for it.
 
-    num_blank: cells with NaN sdf; num_inside: with sdf <= 0; lowest, highest of sdf [m]; observed: cells by state;
-    hard_share: of cells where sdf is exact; excess: by kernel field.
+    num_blank: sdf NaN; num_inside: sdf <= 0; lowest, highest: of sdf [m]; observed: cells by state; hard_share: sdf
+    is exact; excess: by kernel field.
     """
 
     num_cells: int
@@ -69,7 +69,7 @@ class GridStatistics:
 
 
 def grid_statistics(grid: DistanceGrid) -> GridStatistics:
-    """Return a grid's statistics, a few planes at a time: channels may be memory maps."""
+    """Return a grid's statistics, by a few planes: channels may be memory maps."""
     totals = _Totals()
     for part in _parts(grid):
         totals.add(part)

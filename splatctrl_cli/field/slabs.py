@@ -1,4 +1,4 @@
-"""Bakes of a whole grid, or of slabs of x-planes, so that memory need not contain it."""
+"""Bakes of a grid, whole or in slabs of x-planes to save memory."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _BESIDE = 64  # bytes of a cell that baking takes beside its channels, in at mos
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """An earlier bake that an update keeps where `mask` (blocks) is zero, with new observations."""
+    """An earlier bake, valid where `mask` (blocks) is zero, with new observations."""
 
     grid: DistanceGrid
     mask: UInt8
@@ -36,7 +36,7 @@ def bytes_per_cell(channels: Collection[str]) -> int:
 
 
 def slabs(layout: GridLayout, channels: Collection[str], begin: int = 0) -> Iterator[tuple[int, int]]:
-    """Yield the x-planes [first, last) of slabs from plane `begin` on, in whole blocks."""
+    """Yield the x-planes [first, last) of slabs from `begin` on, whole blocks."""
     per_plane = bytes_per_cell(channels) * layout.shape[1] * layout.shape[2]
     step = BLOCK * max(1, SLAB_BYTES // (BLOCK * per_plane))
     for first in range(begin, layout.shape[0], step):
@@ -54,15 +54,12 @@ def check_slab_memory(layout: GridLayout, channels: Collection[str]) -> None:
 
 
 class UnknownSpace:
-    """`apply_unknown` for slabs: never-seen cells are found before the bake.
-
-    num_never_seen, num_changed: cells treated so far.
-    """
+    """`apply_unknown` for slabs, from never-seen cells found before the bake."""
 
     def __init__(
         self, layout: GridLayout, config: FieldConfig, occupancy: OccupancyGrid | None, thresholds: OccupancyConfig
     ) -> None:
-        """Raises NotEvaluableError if nothing was seen, UsageError if obstacles exceed the memory."""
+        """Raises NotEvaluableError if nothing was seen, UsageError without memory for obstacles."""
         self.policy = config.unknown
         self.num_never_seen = self.num_changed = 0
         self._is_unknown: Bool = np.concatenate(
@@ -83,7 +80,7 @@ class UnknownSpace:
             self._cubes = Cubes.of(self._is_unknown, layout.voxel)
 
     def apply(self, planes: Planes, first: int, last: int, bound_margin: float) -> Planes:
-        """Treat the channels of x-planes [first, last) by the policy."""
+        """Treat channels of x-planes [first, last) by the policy."""
         is_unknown = self._is_unknown[first:last]
         num_unknown = int(np.count_nonzero(is_unknown))
         self.num_never_seen += num_unknown
@@ -104,7 +101,7 @@ class UnknownSpace:
 
 
 def baked_planes(baker: Baker, first: int, last: int, kept: Kept | None = None) -> Planes:
-    """Return the channels of x-planes [first, last), before `UnknownSpace`; `kept` ones are copied."""
+    """Return channels of x-planes [first, last), before `UnknownSpace`; `kept` ones are copied."""
     planes = baker.allocate(last - first)
     if kept is None:
         baker.bake(first, last, planes)
@@ -131,9 +128,9 @@ def bake(
 ) -> DistanceGrid:
     """Bake distances to splats with one of `labels` in cells of ``config.voxel`` over `box`.
 
-    `channels` of `CHANNELS` include sdf. Culling is exact for hard; with row sums, a kernel field is too large by
-    at most ``config.truncation``. Bytes do not depend on the thread count. Raises UsageError for a bad or too large
-    box, NotEvaluableError without splats, InputError for splats not finite.
+    channels: of `CHANNELS`, with sdf. Culling is exact for hard; with row sums, a kernel field is too large by at
+    most ``config.truncation``. Bytes do not depend on threads. Raises UsageError for a bad or too large box,
+    NotEvaluableError without splats, InputError for splats not finite.
     """
     chosen = field_splats(splats, labels)
     layout = GridLayout.over(box, config.voxel)

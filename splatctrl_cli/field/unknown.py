@@ -133,7 +133,7 @@ def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
 
 
 def blank(channels: Mapping[str, NDArray[np.generic]], is_unknown: Bool) -> Channels:
-    """Set distance, gradient and probability to NaN where `is_unknown` (X, Y, Z)."""
+    """Set distance, gradient, probability (X, Y, Z) to NaN where unknown."""
     blanked = dict(channels)
     for name in BLANKED:
         if name in channels:

@@ -62,7 +62,7 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
 
 
 def _blocks(cells: Index, reach: int) -> list[tuple[Index, Index, Index]]:
-    """Return each block's first node (3,), centres within reach, and centres inside."""
+    """Return each block's first node (3,), centres in reach, centres inside."""
     inner = NODES - 2 * reach - 1  # the cells whose eight nodes no mass from beyond the block reaches
     blocks, which = np.unique(cells // inner, axis=0, return_inverse=True)
     order = np.argsort(which.ravel(), kind="stable")
@@ -108,7 +108,7 @@ def _transformed_kernel(sampled: Float64) -> NDArray[np.complex128]:
 
 
 def _convolved(mass: Float64, transformed: NDArray[np.complex128]) -> Float64:
-    """Convolve circularly: what wraps stays within `reach` of the faces."""
+    """Convolve circularly: what wraps stays within `reach` of faces."""
     return np.asarray(irfftn(rfftn(mass) * transformed, s=mass.shape))
 
 
@@ -298,15 +298,15 @@ def row_sum_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int
 
 
 def voxel_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
-    """Return `row_sum_weights` from a voxel grid, in linear time (III-D)."""
+    """Return `row_sum_weights` from a voxel grid (III-D)."""
     return _lumped(np.log(voxel_row_sums(_centers(spheres), kernel.length, kernel.value)), noise)
 
 
 def process_weights(spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
     """Solve eq. 8, ``M = (K + noise I)^-1 y``: weights of either sign.
 
-    Matern: y is ``k_d(-r)``, ``w_i = M_i / k_d(-r_i)``. Gaussian: y is 1, ``w = M``, as ``k_d(-r) = k_d(r)`` loses
-    the radius's sign.
+    Matern: y is ``k_d(-r)``, ``w_i = M_i / k_d(-r_i)``. Gaussian: y is 1, ``w = M``: ``k_d(-r) = k_d(r)`` loses the
+    radius's sign.
     """
     log_values = spheres.radii / kernel.length if isinstance(kernel, Matern12) else np.zeros(len(spheres.radii))
     solution = solve_process(_centers(spheres), log_values, kernel.length, kernel.value, noise)

@@ -1,7 +1,7 @@
 """Compiled kernels: numpy in, numpy out. Imports nothing of ours.
 
-`native` is the best module for this processor's instruction set. SPLATCTRL_KERNELS=base or v3 forces a plainer one;
-v3 (AVX2) and v4 (AVX-512) give the same bytes.
+`native` is the best for this processor's instruction set; SPLATCTRL_KERNELS=base or v3 forces a plainer one. v3
+(AVX2) and v4 (AVX-512) give the same bytes.
 """
 
 import importlib
@@ -31,7 +31,7 @@ native: Any = _best()
 
 
 def arithmetic() -> str:
-    """Return the plainest module with the same bytes as `native`."""
+    """Return the plainest module with `native`'s bytes."""
     name: str = native.__name__.rpartition(".")[2]
     return "_native_v3" if name == "_native_v4" else name
 
@@ -40,9 +40,9 @@ MIN_CAP = 16  # threads that may be asked for on any machine
 
 
 def num_threads(requested: int = 0) -> int:
-    """Return `requested`, at most 16 or one per usable processor, whichever is more; 0: one per processor.
+    """Return `requested`, at most 16 or one per usable processor, whichever is more; 0: the latter.
 
-    The cap avoids minutes of starting threads; results do not depend on it.
+    Starting thousands takes minutes; results do not depend on it.
     """
     if 0 < requested <= MIN_CAP:
         return requested

@@ -1,4 +1,4 @@
-"""Spheres on a kinematic tree, and gaps between them: typed wrappers.
+"""Spheres on a kinematic tree, and gaps between them.
 
 Shapes: B bodies, the base first, J = B - 1 joints, S spheres, T postures, P pairs.
 """
@@ -17,8 +17,8 @@ REVOLUTE, PRISMATIC = 0, 1
 class Chain:
     """Body b > 0 hangs on its parent by joint b - 1: ``T_b = T_parent placement_b joint(q)``.
 
-    parent, kind (B,): parents first, `REVOLUTE` or `PRISMATIC`; placement (B, 3, 4), the base's in the world; axis
-    (B, 3), unit; sphere_body (S,); offset (S, 3) [m], in its body.
+    parent, kind (B,): parents first, `REVOLUTE` or `PRISMATIC`; placement (B, 3, 4), the base's in world; axis (B,
+    3), unit; sphere_body (S,); offset (S, 3) [m], in its body.
     """
 
     parent: Int64
@@ -42,7 +42,7 @@ class Chain:
         return centers, jacobians
 
     def frame(self, q: Float64, body: int, in_body: Float64) -> tuple[Float64, Float64]:
-        """World pose (3, 4) of a frame `in_body` (3, 4), and its Jacobian (6, J), linear first."""
+        """World pose (3, 4) of a frame `in_body` (3, 4), Jacobian (6, J), linear first."""
         pose, jacobian = np.empty((3, 4)), np.empty((6, len(q)))
         native.chain_frame(*self._arrays, np.ascontiguousarray(q), body, in_body, pose, jacobian)
         return pose, jacobian
@@ -53,7 +53,7 @@ class Chain:
 
 
 def pair_gaps(centers: Float64, radii: Float64, pairs: Int64) -> tuple[Float64, Float64]:
-    """Gaps (P,) [m] between sphere surfaces and unit directions (P, 3) from second centre to first.
+    """Gaps (P,) [m] of sphere surfaces, unit directions (P, 3) from second to first centre.
 
     centers (S, 3), radii (S,) [m]; pairs (P, 2). Zero direction for coincident centres.
     """

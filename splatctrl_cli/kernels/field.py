@@ -1,7 +1,7 @@
 """Distances to spheres and on baked grids: typed wrappers.
 
-Shapes: N spheres laid out as C clusters of `LANES`, in G groups of as many clusters; Q points, (X, Y, Z) cells.
-Frames are the caller's; float32 wants an origin near the data.
+Shapes: N spheres as C clusters of `LANES`, in G groups of as many clusters; Q points, (X, Y, Z) cells. float32
+wants an origin near the data.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ SPARE_PLACE = 1e15
 
 @dataclass(frozen=True, kw_only=True)
 class Clusters:
-    """Spheres in clusters of 16 neighbours, boxed; C is a multiple of 16, G of 8, spare ones far away.
+    """Spheres in boxed clusters of 16; C is a multiple of 16, G of 8, spare ones far away.
 
     centers (3, 16 C) [m]; boxes (6, C + G) [m], lower then upper corner, clusters then groups.
     """
@@ -37,7 +37,7 @@ class Clusters:
 class Offsets:
     """values (16 C,): o of ``|x - p| - o`` [m], or b of ``|x - p|^2 - b`` [m^2]; spare -1e30.
 
-    maxima (C + G,): the largest of each cluster, then group.
+    maxima (C + G,): of clusters, then groups.
     """
 
     values: Float32
@@ -51,10 +51,10 @@ class Offsets:
 
 @dataclass(frozen=True, kw_only=True)
 class GridSpan:
-    """The cells centred at ``origin + voxel (i, j, k)``, i in [first, last), of a grid of `shape`.
+    """The cells centred at ``origin + voxel (i, j, k)``, i in [first, last), of a grid.
 
-    origin (3,) [m], in the spheres' frame; `first` and `last` are multiples of `BLOCK`, or `last` the grid's end;
-    mask (blocks of the grid): zero where a block keeps its values.
+    origin (3,) [m], in the spheres' frame; `first`, `last`: multiples of `BLOCK`, or the grid's end; mask (blocks
+    of the grid): zero where a block keeps its values.
     """
 
     origin: Float64
@@ -80,8 +80,8 @@ class GridSpan:
 class LogSumExp:
     """The terms of a kernel field.
 
-    offsets only cull; exact (16 C,): offsets [m] of Matern, log weights of the Gaussian; radii (16 C,) [m];
-    tolerance: the share of terms left out of Matern, the rise [m] of the Gaussian.
+    offsets: for culling; exact (16 C,): offsets [m] of Matern, log weights of the Gaussian; radii (16 C,) [m];
+    tolerance: share of the terms left out of Matern, or rise [m] of the Gaussian.
     """
 
     is_matern: bool
@@ -96,7 +96,7 @@ class LogSumExp:
 def nearest(
     spheres: Clusters, radii: Offsets, points: Float32, *, threads: int = 0
 ) -> tuple[Float32, Float32, Int32]:
-    """``min_i |x - p_i| - r_i`` (Q,), its gradient (Q, 3), zero at a centre, its entry (Q,)."""
+    """``min_i |x - p_i| - r_i`` (Q,), its gradient (Q, 3), 0 at a centre, its entry (Q,)."""
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     entry = np.empty(len(points), np.int32)
     native.field_nearest(*spheres.arrays, *radii.arrays, points, num_threads(threads), score, gradient, entry)
@@ -115,8 +115,8 @@ def matern(
 ) -> tuple[Float32, Float32]:
     """``-l log sum_i c_i exp(-(|x - p_i| - o_i) / l)`` (Q,) and its gradient (Q, 3).
 
-    sign (16 C,) is c, 1 if None. Without signs, leaving out the share `truncation` of the sum raises the result by
-    at most ``-l log(1 - truncation)``. NaN where the sum is not positive.
+    sign (16 C,): c, 1 if None. Without signs, truncation of a share raises the result by at most ``-l log(1 -
+    truncation)``. NaN where the sum is not positive.
     """
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     native.field_matern(
@@ -140,7 +140,7 @@ def gaussian(
     """``sqrt(-2 l^2 L) - sum_i pi_i r_i`` (Q,) and its gradient (Q, 3).
 
     ``L = log sum_i c_i w_i exp(-|x - p_i|^2 / (2 l^2))``, pi the terms' shares. offsets: ``2 l^2 log w_i - common``
-    [m^2]; radii (16 C,) [m]; sign (16 C,) is c, 1 if None. Without signs, truncation raises the result by at most
+    [m^2]; radii (16 C,) [m]; sign (16 C,): c, 1 if None. Without signs, truncation raises the result by at most
     `tolerance` [m]. NaN where L >= 0.
     """
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
@@ -173,7 +173,7 @@ def safe(
     *,
     threads: int = 0,
 ) -> tuple[Float64, Float64] | None:
-    """The smaller of `gaussian` and `nearest` (Q,), its gradient (Q, 3); `nearest` if equal or NaN.
+    """The smaller of `gaussian` and `nearest` (Q,), its gradient (Q, 3); `nearest` in ties.
 
     points (Q, 3), in the frame of anchor (3,). None if one is not finite.
     """
@@ -196,7 +196,7 @@ def safe(
 
 
 def row_sums(spheres: Clusters, has_sphere: UInt8, length: float, *, is_matern: bool, threads: int = 0) -> Float64:
-    """``sum_j k(p_i, p_j)`` (16 C,) where `has_sphere` (16 C,) is set, j = i included; else 0.
+    """``sum_j k(p_i, p_j)`` (16 C,) over entries in `has_sphere` (16 C,), j = i included; else 0.
 
     Terms are rounded to 2^-24 and added as integers: order changes no bit.
     """
@@ -215,7 +215,7 @@ def bake_hard(
     *,
     threads: int = 0,
 ) -> None:
-    """Write `nearest` at the cells of `span` to (X, Y, Z), (X, Y, Z, 3), (X, Y, Z)."""
+    """Write `nearest` at the cells of `span`; gradient is (X, Y, Z, 3)."""
     native.field_bake_hard(
         *spheres.arrays, *radii.arrays, *span.arrays, num_threads(threads), distance, gradient, entry
     )
@@ -255,7 +255,7 @@ def bake_matern(
     *,
     threads: int = 0,
 ) -> None:
-    """Write `matern` at the cells of `span`; exact: the offsets in float64."""
+    """Write `matern` at the cells of `span`; exact: offsets in float64."""
     native.field_bake_matern(
         *spheres.arrays,
         *terms.offsets.arrays,
@@ -282,7 +282,7 @@ def touched_blocks(
 ) -> None:
     """Set is_touched (blocks) to 1 where spheres in `changed` (16 C,) can matter.
 
-    That is to `bake_hard` if `length` is None (offsets: radii), else to `bake_gaussian` (``2 l^2 log |w_i|``).
+    `length` None: to `bake_hard` (offsets: radii), else to `bake_gaussian` (``2 l^2 log |w_i|``).
     """
     native.field_touched(
         *spheres.arrays,
@@ -298,8 +298,8 @@ def touched_blocks(
 def interpolate(values: Float32, origin: Float64, voxel: float, points: Float64) -> tuple[Float64, Float64]:
     """Trilinear value (Q,) and that interpolant's gradient (Q, 3), for points (Q, 3).
 
-    values (X, Y, Z) at the nodes ``origin + voxel (i, j, k)``. Outside: the value at the box's nearest point minus
-    the distance to it.
+    values (X, Y, Z) at ``origin + voxel (i, j, k)``. Outside: the value at the box's nearest point minus the
+    distance.
     """
     value, gradient = np.empty(len(points)), np.empty((len(points), 3))
     native.grid_interpolate(values, origin, voxel, points, value, gradient)
@@ -307,7 +307,7 @@ def interpolate(values: Float32, origin: Float64, voxel: float, points: Float64)
 
 
 def lipschitz_bound(values: Float32, origin: Float64, voxel: float, points: Float64) -> Float64:
-    """The largest ``value(corner) - |x - corner|`` (Q,) over the corners of each point's cell."""
+    """The largest ``value(corner) - |x - corner|`` (Q,) over corners of the cell."""
     bound = np.empty(len(points))
     native.grid_bound(values, origin, voxel, points, bound)
     return bound

@@ -1,4 +1,4 @@
-"""Voxel kernels: depth integration and entity bits, in place on a grid's arrays."""
+"""Voxel kernels, in place on a grid's arrays."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,9 @@ from splatctrl_cli.kernels import Float64, UInt8, native
 
 @dataclass(frozen=True, kw_only=True)
 class DepthImage:
-    """A depth image as the kernels take it.
+    """A depth image: intrinsics (6,) fx, fy, cx, cy, width, height; T_world_camera (4, 4); depth (H, W) [m].
 
-    intrinsics (6,): fx, fy, cx, cy, width, height; T_world_camera (4, 4); depth (H, W) [m]. Below min_range depth
-    does not count; beyond max_range it is no hit.
+    Below min_range depth does not count; beyond max_range it is no hit.
     """
 
     intrinsics: Float64
@@ -42,11 +41,11 @@ def integrate_depth(
     step: int,
     num_threads: int,
 ) -> None:
-    """Add a depth image to log_odds and num_updates (X, Y, Z); set last_seen to `step` where changed.
+    """Add a depth image to log_odds and num_updates (X, Y, Z); changed voxels get last_seen `step`.
 
-    A voxel with a pixel's point is a hit, else a miss if its centre is before the depth of its pixel. A pixel
-    without depth takes the nearest one's, until the rays are half a voxel apart. Depth beyond max_range frees what
-    is nearer. hits: scratch, zero before and after.
+    A voxel with a pixel's point is a hit, else a miss if its centre is before its pixel's depth. Without depth, the
+    nearest pixel's counts while the rays are within half a voxel. Depth beyond max_range frees nearer voxels. hits:
+    scratch, zero before and after.
     """
     native.integrate_depth(
         grid, log_odds, num_updates, last_seen, hits, image.intrinsics, image.T_world_camera, image.depth,
@@ -64,7 +63,7 @@ def label_hits(
     clear_bits: int = 0,
     num_threads: int,
 ) -> None:
-    """Set or clear bits of entity (X, Y, Z) in voxels with points of chosen (H, W) pixels."""
+    """Set or clear bits of entity (X, Y, Z) at points of chosen (H, W) pixels."""
     native.label_hits(
         grid, entity, image.intrinsics, image.T_world_camera, image.depth, chosen, image.min_range, image.max_range,
         set_bits, clear_bits, num_threads,
@@ -72,5 +71,5 @@ def label_hits(
 
 
 def mark_spheres(grid: Float64, entity: UInt8, centers: Float64, radii: Float64, bits: int, num_threads: int) -> None:
-    """OR bits into voxels of entity (X, Y, Z) that meet spheres (S, 3), (S,) [m]."""
+    """OR bits into entity (X, Y, Z) where spheres (S, 3), (S,) [m] meet."""
     native.mark_spheres(grid, entity, centers, radii, bits, num_threads)

@@ -1,4 +1,4 @@
-"""Distances of points and balls to triangles, and what these enclose. Same bytes at any thread count."""
+"""Distances to triangles; the same bytes at any thread count."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,16 +12,16 @@ INSIDE = 0.5  # of a winding number, from which a point is inside
 
 
 class TriangleTree:
-    """Triangles (F, 3, 3) [m], counter-clockwise from outside; they may be open and in pieces."""
+    """Triangles (F, 3, 3) [m], counter-clockwise from outside; open or in pieces, too."""
 
     def __init__(self, corners: Float64, num_threads: int = 1) -> None:
         self._num_threads = num_threads
         self._native: Any = native.TriangleTree(np.ascontiguousarray(corners, np.float64))
 
     def closest(self, points: Float64, bound: Float64 | float = np.inf) -> tuple[Float64, Int64, Float64]:
-        """Return distance (N,) [m], number (N,) and nearest point of the nearest triangle to points (N, 3) [m].
+        """Return distance (N,) [m] and number (N,) of the triangle nearest to points (N, 3) [m].
 
-        Nearest points are barycentric (N, 3). Beyond `bound` (N,) [m]: infinite, -1 and 0.
+        Also its nearest points, barycentric (N, 3). Beyond `bound` (N,) [m]: infinite, -1, 0.
         """
         points = np.ascontiguousarray(points, np.float64)
         most = np.array(np.broadcast_to(np.float64(bound), len(points)))
@@ -30,7 +30,7 @@ class TriangleTree:
         return distance, face, shares
 
     def holds(self, points: Float64) -> Bool:
-        """Points (N, 3) [m] that triangles surround more than half (the winding number)."""
+        """Points (N, 3) [m] more than half surrounded (winding number)."""
         number = np.empty(len(points))
         self._native.winding(np.ascontiguousarray(points, np.float64), number, self._num_threads)
         return np.asarray(number > INSIDE)
@@ -38,9 +38,9 @@ class TriangleTree:
     def gaps(
         self, poses: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
     ) -> tuple[Float64, Int64]:
-        """Return the signed gap (T,) [m] of the nearest of balls (N, 3), (N,) [m], negative inside, and its number.
+        """Return the signed gap (T,) [m] and number of the nearest ball, negative inside.
 
-        poses (T, 4, 4): from the balls' frame to the triangles'. Infinite and -1 without any.
+        Balls (N, 3), (N,) [m]; poses (T, 4, 4): from their frame to the triangles'. Infinite and -1 without any.
         """
         gap, ball = np.empty(len(poses)), np.empty(len(poses), np.int64)
         self._native.gaps(
@@ -63,9 +63,9 @@ def better(
 ) -> None:
     """Lower signed distances (N,) [m] of points (N, 3), in place, where triangles are nearer.
 
-    poses (4, 4): from the points' frame to each tree's. Triangles beyond `within` (N,) [m] do not count, nor does
-    the inside for points `outside` (N,). If `enough` (N,) [m] >= 0, any distance on the same side of `enough` and
-    `within` will do.
+    poses (4, 4): from points to each tree. Triangles beyond `within` (N,) [m] do not count, nor the inside for
+    points `outside` (N,). If `enough` (N,) [m] >= 0, any distance on the same side of `enough` and `within` will
+    do.
     """
     num = len(distance)
     native.signed_distance(

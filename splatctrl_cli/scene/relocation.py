@@ -81,8 +81,8 @@ def use_idle(
 def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:
     """Return at most `num_seeds` pixel-sized seeds on measured surfaces, drawn by squared colour error.
 
-    The error is a 3 x 3 mean, weighted by a pixel's area of surface. Seeds keep their diameters apart: views share
-    spots.
+    The error is a 3 x 3 mean, weighted by a pixel's area of surface. Seeds keep their diameters apart, as views
+    share spots.
     """
     every = thinning(misfit.error > 0 for misfit in misfits)
     masks = [thinned(misfit.error > 0, every) for misfit in misfits]

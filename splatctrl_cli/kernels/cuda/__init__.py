@@ -1,1 +1,1 @@
-"""The fit on a CUDA device, by the extra `cuda` (cuda-core, cuda-bindings, NVRTC)."""
+"""The fit on a CUDA device, with the extra `cuda` (cuda-core, cuda-bindings, NVRTC)."""

@@ -1,4 +1,4 @@
-"""A CUDA card: memory by the driver, kernels and graphs by cuda-core."""
+"""A CUDA card, over its driver and cuda-core."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ MANY = 20  # replays in a graph: to launch one costs the host as much as a small
 
 
 def _check(result: tuple[Any, ...]) -> Any:
-    """Return a driver call's values, or raise its error."""
+    """Return a driver call's values, or raise."""
     status, *values = result
     if status == driver.CUresult.CUDA_SUCCESS:
         return values if len(values) > 1 else values[0] if values else None
@@ -40,7 +40,7 @@ def _named_faults() -> Iterator[None]:
 
 
 class CudaDevice:
-    """A card as `Memory`, the first by default, with one stream. Raises DeviceError if unusable."""
+    """A card as `Memory`, with one stream. Raises DeviceError if unusable."""
 
     def __init__(self, card: Card | None = None, *, source: str = FIT) -> None:
         """source: kernels to compile now; others compile at first launch."""
@@ -63,7 +63,7 @@ class CudaDevice:
         return address
 
     def free(self, address: int) -> None:
-        """Free memory, after what is queued."""
+        """Free, after what is queued."""
         self.wait()
         _check(driver.cuMemFree(address))
 
@@ -74,7 +74,7 @@ class CudaDevice:
         self.wait()  # the array may go
 
     def read(self, address: int, out: Array) -> None:
-        """Wait for what is queued, and copy from there."""
+        """Copy from there, after what is queued."""
         _check(driver.cuMemcpyDtoHAsync(out.ctypes.data, address, out.nbytes, self._handle))
         self.wait()
 
@@ -109,7 +109,7 @@ class CudaDevice:
             launch(target, config, self._codes[one.source].get_kernel(one.kernel), *one.arguments)
 
     def seconds(self, graph: Graph, num_times: int) -> float:
-        """Return a replay's mean time, measured on the device."""
+        """Return a replay's mean time on the device."""
         before, after = (self._device.create_event({"timing_enabled": True}) for _ in range(2))
         self._stream.record(before)
         graph.run(num_times)

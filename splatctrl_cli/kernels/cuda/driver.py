@@ -1,4 +1,4 @@
-"""NVIDIA's cards by ctypes: a machine without one imports nothing of CUDA."""
+"""NVIDIA's cards by ctypes, without importing CUDA."""
 
 import ctypes
 import re
@@ -28,14 +28,14 @@ class Card:
 
 
 def num_cards() -> int:
-    """Return the driver's number of cards; none is woken, so that a process may still fork."""
+    """Return the number of cards; none is woken: the process may still fork."""
     with suppress(OSError):
         return len([*CARDS.iterdir()])
     return 0
 
 
 def usable_card(index: int = 0) -> Card:
-    """Return the card of that number. Raises DeviceError with a remedy if unusable."""
+    """Return the card of that number. Raises DeviceError with a remedy."""
     try:
         cuda: Any = ctypes.CDLL(LIBRARY)
     except OSError as error:

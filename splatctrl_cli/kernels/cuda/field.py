@@ -1,4 +1,4 @@
-"""Distance fields on a device, exact and of kernels, in grid cells and at points.
+"""Distance fields on a device, in grid cells and at points.
 
 Shapes: N spheres as C clusters (kernels/field.py), Q points, (X, Y, Z) cells.
 """
@@ -36,9 +36,9 @@ HARD = "hard"
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """Choice of a distance: exact, with a kernel the smaller, or if is_single the kernel's where defined.
+    """Choice of distance: exact; with a kernel, the smaller, or if is_single, the kernel's where defined.
 
-    resolution [m]: a kernel above the exact distance by more is counted.
+    resolution [m]: a larger excess of a kernel is counted.
     """
 
     kernel: str | None
@@ -48,10 +48,10 @@ class Choice:
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Results in (X, Y, Z) cells or (Q,) points, as far as wanted [m].
+    """Wanted results in (X, Y, Z) cells or (Q,) points [m].
 
-    bound: exact distance minus the margin; entry: of the nearest sphere; kernels: exact where undefined; counts: by
-    kernel, cells undefined and above the exact distance.
+    bound: exact minus margin; entry: nearest sphere's; kernels: exact where undefined; counts: by kernel, undefined
+    and excessive cells.
     """
 
     distance: Float32
@@ -97,7 +97,7 @@ class DeviceField:
         self._rooms = {}
 
     def bake(self, span: GridSpan, wanted: Collection[str], *, margin: float = 0.0) -> Answers:
-        """Return `wanted` (fields of `Answers`, kernels) at a span's cells, ignoring its mask; margin [m]."""
+        """Return `wanted` (fields of `Answers`, kernels) in a span, without its mask; margin [m]."""
         grid = np.zeros((), GRID)
         grid["place"], grid["size"], grid["planes"] = (*span.origin, span.voxel), span.shape, (span.first, span.last)
         shape = span.shape_of_channel
@@ -105,7 +105,7 @@ class DeviceField:
         return self._answered("bake", {"grid": grid}, shape, num_warps, wanted, margin)
 
     def query(self, points: Float64, anchor: Float64, wanted: Collection[str] = ("gradient",)) -> Answers:
-        """Return `wanted` at points (Q, 3), Q > 0, in the frame of anchor (3,)."""
+        """Return `wanted` at points (Q, 3), Q > 0, in anchor's (3,) frame."""
         address = self._put("points", points)
         asked: dict[str, Array | int] = {"points": address, "num_points": len(points), "anchor": anchor}
         return self._answered("query", asked, (len(points),), len(points), wanted, 0.0)
@@ -149,7 +149,6 @@ class DeviceField:
         )
 
     def _choices(self, num: int, places: Mapping[str, tuple[int, int]], margin: float | None) -> list[Launch]:
-        """Return launches that choose the distance, then count each kernel's."""
         task = np.zeros((), CHOICE)
         task["hard"], task["num"], task["margin"] = places[HARD], num, margin or 0.0
         task["resolution"], task["takes_least"] = self.choice.resolution, not self.choice.is_single
@@ -168,7 +167,6 @@ class DeviceField:
         return [self._launch("choose", "choice", task, num, CHOOSE, CHOOSE), *launches]
 
     def _launch(self, kernel: str, name: str, task: Array, num: int, per_block: int, threads: int) -> Launch:
-        """Return the launch of a task by address, for `num` warps or cells."""
         grid = (-(-num // per_block), 1, 1)
         return Launch(kernel=kernel, grid=grid, block=threads, arguments=(self._put(name, task),), source=FIELD)
 
@@ -178,7 +176,6 @@ class DeviceField:
         return task
 
     def _room(self, name: str, num_bytes: int) -> int:
-        """Return the address of named memory of at least that size."""
         address, size = self._rooms.get(name, (0, 0))
         if size < num_bytes:
             if address:

@@ -1,7 +1,6 @@
-"""Iterations of the fit on a device, where splats, Adam's state and views stay.
+"""Iterations of the fit on a device, which keeps splats, Adam's state and views.
 
-Shapes: N splats, (H, W) pixels, K tiles of 16 x 16 pixels. Lists that turn out too short grow, and the run repeats
-from its start.
+Shapes: N splats, (H, W) pixels, K tiles of 16 x 16 pixels. If a list is too short, it grows, and the run repeats.
 """
 
 from collections.abc import Callable, Sequence
@@ -59,7 +58,7 @@ def bytes_needed(
     list_capacity: int = LIST_CAPACITY,
     splat_tiles: float = SPLAT_TILES,
 ) -> int:
-    """Return the bytes of a fit of N splats to views of `sizes` (H, W)."""
+    """Return a fit's bytes, of N splats and views of `sizes` (H, W)."""
     splats = (sum(STATE.values()) * 2 + sum(WORK.values()) + 4 * NUM_SUMS * splat_tiles) * num_splats
     tiles = [-(-height // TILE) * -(-width // TILE) for height, width in set(sizes)]
     pixels = sum(sum(PIXEL.values()) * height * width for height, width in set(sizes))
@@ -74,10 +73,7 @@ def bytes_needed(
 
 
 class DeviceFit:
-    """Optimiser of N splats on a device, for views of `sizes` (H, W) at first.
-
-    Raises OutOfMemory, with what would fit.
-    """
+    """Optimiser of N splats on a device. Raises OutOfMemory, with what would fit."""
 
     def __init__(
         self,
@@ -111,7 +107,7 @@ class DeviceFit:
         self._addresses, self._images, self._sizes = {}, {}, {}
 
     def expect(self, sizes: Sequence[tuple[int, int]]) -> None:
-        """Check that views of these sizes (H, W) fit. Raises OutOfMemory."""
+        """Expect views of sizes (H, W). Raises OutOfMemory."""
         self._asked = list(sizes)
         if self._needed(self.num_splats) > self._usable():
             raise self._too_large()
@@ -123,12 +119,12 @@ class DeviceFit:
             self.device.write(self._addresses[name], values)
 
     def take(self, parameters: Float32, moments: Moments) -> None:
-        """Read splats (N, 8) and Adam's state into arrays."""
+        """Read splats (N, 8) and Adam's state."""
         for name, values in self._state(parameters, moments).items():
             self.device.read(self._addresses[name], values)
 
     def add_view(self, camera: Float64, target: TargetView) -> int:
-        """Add a view, its images on the device; return its number for `run`."""
+        """Copy a view to the device; return its number for `run`."""
         height, width = target.depth.shape
         num_values = 3.0 * max(int(np.count_nonzero(target.counted)), 1)
         num_depths = int(np.count_nonzero((target.depth > 0) & (target.counted != 0)))
@@ -149,13 +145,13 @@ class DeviceFit:
         return len(self.views) - 1
 
     def number_of(self, camera: Float64, target: TargetView) -> int:
-        """Return a view's number; add the view if its target is new."""
+        """Return a view's number, added if its target is new."""
         known = (k for k, view in enumerate(self.views) if view.target is target)
         number = next(known, None)
         return self.add_view(camera, target) if number is None else number
 
     def keep(self, targets: Sequence[TargetView]) -> None:
-        """Free the images of other views; view numbers change."""
+        """Free other views' images; view numbers change."""
         kept = {id(target) for target in targets}
         gone = [view for view in self.views if id(view.target) not in kept]
         self.views = [view for view in self.views if id(view.target) in kept]
@@ -166,9 +162,9 @@ class DeviceFit:
     def run(
         self, schedule: Sequence[int], weights: LossWeights, settings: OptimiserSettings, seed: int
     ) -> dict[int, LossTerms]:
-        """Run an iteration on each scheduled view; return each view's loss at its last iteration.
+        """Run an iteration on each scheduled view; return losses at their last iteration.
 
-        Iteration k draws noise with seed `seed` + k.
+        Iteration k draws noise with `seed` + k.
         """
         if not schedule:
             return {}
@@ -204,14 +200,14 @@ class DeviceFit:
                 return out, self._terms([view])[view]
 
     def list_lengths(self, view: int) -> NDArray[np.int32]:
-        """Splats (K,) on each tile's list, at the last launch of the view's size."""
+        """Splats (K,) on tile lists, at the size's last launch."""
         height, width = self.views[view].height, self.views[view].width
         out = np.empty(-(-height // TILE) * -(-width // TILE), np.int32)
         self.device.read(self._addresses[f"num_entries {height} {width}"], out)
         return out
 
     def read_image(self, name: str, view: int, channels: int) -> Float32:
-        """Read `planes`, `plane_gradients` or `maps` (channels, H, W) of the view's size after the last launch."""
+        """Read `planes`, `plane_gradients` or `maps` (channels, H, W) of the size's last launch."""
         height, width = self.views[view].height, self.views[view].width
         out = np.empty((channels, height, width), np.float32)
         self.device.read(self._addresses[f"{name} {height} {width}"], out)
@@ -224,7 +220,7 @@ class DeviceFit:
         }  # fmt: skip
 
     def _room(self, name: str, num_bytes: int) -> int:
-        """Return the address of named memory of at least that size; growing it loses its content."""
+        """Return the address of named memory; growing loses its content."""
         if self._sizes.get(name, -1) < num_bytes:
             if name in self._addresses:
                 self.device.free(self._addresses.pop(name))
@@ -254,7 +250,6 @@ class DeviceFit:
         return self.device.available() + sum(self._sizes.values()) + sum(self._images.values())
 
     def _too_large(self) -> OutOfMemory:
-        """Return the error with what is needed and what would fit, in one significant digit."""
         usable, fixed = self._usable(), self._needed(0)
         each = (self._needed(self.num_splats) - fixed) / max(self.num_splats, 1)
         most = min(int((usable - fixed) / each), self.num_splats // 2)
@@ -268,7 +263,7 @@ class DeviceFit:
     def rewind(
         self, schedule: Sequence[int], weights: LossWeights | None, settings: OptimiserSettings | None, seed: int = 0
     ) -> None:
-        """Set a schedule before the next launches; without weights and settings, for rendering."""
+        """Set a schedule before the next launches; by default, for rendering."""
         run = np.zeros((), RUN)
         if settings is not None and weights is not None:
             w = weights
@@ -285,7 +280,7 @@ class DeviceFit:
         self._room("terms", max(8 * NUM_TERMS * len(self.views), LEAST_TABLE))
 
     def _fits(self) -> bool:
-        """Return True if every list had room; grow them otherwise."""
+        """Return True if all lists had room; else grow them."""
         counters = np.zeros((), COUNTERS)
         self.device.read(self._addresses["counters"], counters)
         longest, most = int(counters["longest_list"]), int(counters["most_parts"])
@@ -323,7 +318,7 @@ class DeviceFit:
         return known
 
     def launches(self, height: int, width: int, gradients: int = 0) -> list[Launch]:
-        """Return one iteration on a view of that size; `gradients`: their address instead of a step, or 0."""
+        """Return one iteration's launches; gradients: their address, or 0 to step."""
         at: Callable[[str], int] = self._addresses.__getitem__
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         patches_x, patches_y = -(-width // PATCH), -(-height // PATCH)

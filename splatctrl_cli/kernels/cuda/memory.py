@@ -1,4 +1,4 @@
-"""Interface of a device: memory, and kernel launches replayed as one graph."""
+"""Interface of a device: memory, and launches replayed as one graph."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ FIT, FIELD = "fit.cu", "field.cu"  # the sources of kernels
 
 
 class DeviceError(RuntimeError):
-    """The device is missing, unusable, or has failed; `remedy` says what to do."""
+    """The device is missing, unusable, or failed."""
 
     def __init__(self, message: str, *, remedy: str = "") -> None:
         super().__init__(message)
@@ -19,12 +19,12 @@ class DeviceError(RuntimeError):
 
 
 class OutOfMemory(DeviceError):  # noqa: N818  (as the driver names it)
-    """The device's memory does not suffice."""
+    """Too little memory on the device."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Launch:
-    """One kernel launch: blocks (x, y, z), threads in a block; addresses are int, other arguments np.int32."""
+    """One kernel launch: grid (x, y, z), threads per block; addresses are int, other arguments np.int32."""
 
     kernel: str
     grid: tuple[int, int, int]

@@ -26,10 +26,7 @@ def source_digest() -> bytes:
 
 
 def compiled(capability: tuple[int, int], cache_folder: Path | None = None, *, source: str = FIT) -> Any:
-    """Return a source's kernels as machine code, cached in cuda-core's or the given folder.
-
-    An unwritable cache only costs the compilation.
-    """
+    """Return a source's machine code, cached in cuda-core's or the given folder, if writable."""
     options = ProgramOptions(
         name=source, arch=f"sm_{capability[0]}{capability[1]}", std="c++17", include_path=[str(f) for f in FOLDERS]
     )
