@@ -40,8 +40,9 @@ T = TypeVar("T", bound=np.generic)
 class Baker:
     """Channels of a field over splats at the cells of `layout`.
 
-    Cut and thread count change no bit. counts: ``se_without_value``, cells with exact distance instead of the
-    kernel's; ``se_over_estimates``, those where it exceeds the exact one by `RESOLUTION`; likewise gpdf.
+    The cut into planes and the thread count change no bit. counts: ``se_without_value``, cells with exact distance
+    instead of the kernel's; ``se_over_estimates``, those where it exceeds the exact one by `RESOLUTION`; likewise
+    gpdf.
     """
 
     def __init__(

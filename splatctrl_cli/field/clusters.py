@@ -60,7 +60,7 @@ class ClusteredPoints:
 def cluster_points(points_world: NDArray[np.floating], frame: Box | None = None) -> ClusteredPoints:
     """Cluster points (N, 3) [m], N > 0.
 
-    Anchor and curve follow `frame`, by default the points' box. In one frame, points of two sets keep order and
+    Anchor and curve follow `frame`, by default the points' box. With one frame, points of two sets keep order and
     coordinates to the bit.
     """
     points = np.asarray(points_world, dtype=np.float64)
@@ -99,7 +99,7 @@ def _padded(count: int, multiple: int) -> int:
 
 
 def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> NDArray[np.int64]:
-    """Places (N,) along a Hilbert curve, near if near in space.
+    """Places (N,) along a Hilbert curve, whose neighbours are near in space.
 
     Skilling, "Programming the Hilbert curve" (AIP Conf. Proc. 707, 2004).
     """
@@ -144,7 +144,7 @@ class Spheres:
 
 
 def checked_points(points: NDArray[np.floating]) -> Float64:
-    """Return finite points (Q, 3). Raises InputError for others."""
+    """Return points as float64. Raises InputError unless (Q, 3) and finite."""
     array = shaped_points(points)
     if not np.isfinite(array).all():
         raise not_finite(array)
@@ -152,7 +152,7 @@ def checked_points(points: NDArray[np.floating]) -> Float64:
 
 
 def shaped_points(points: NDArray[np.floating]) -> Float64:
-    """Return points (Q, 3). Raises InputError for another shape."""
+    """Return points as float64. Raises InputError unless (Q, 3)."""
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"query points: expected shape (Q, 3), got {array.shape}")

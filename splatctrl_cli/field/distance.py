@@ -314,8 +314,8 @@ def march(field: DistanceField, exact: DistanceField, points: Float64, *, steps:
     """Walk from points (Q, 3) [m], world, to the zero level of `field`.
 
     Steps follow the local gradient: with a fixed direction, a walk can pass an object by. They are as long as the
-    field, at most the `exact` distance, so as to cross no sphere. The Matern field's zero level stands before the
-    spheres (`health.planar_zero_level`). Points at or behind it stay. Raises UsageError for less than one step.
+    field reads, at most the `exact` distance, and so cross no sphere. The Matern field's zero level stands before
+    the spheres (`health.planar_zero_level`). Points at or behind it stay. Raises UsageError for less than one step.
     """
     if steps < 1:
         raise UsageError(f"marching: expected at least 1 step, got {steps}")

@@ -1,4 +1,4 @@
-"""Cells of a distance grid, their memory, and their observation."""
+"""Layout of a distance grid, its memory, and what cameras saw in it."""
 
 import math
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class GridLayout:
 
     @classmethod
     def over(cls, box: Box, voxel: float) -> "GridLayout":
-        """Cover a box with centres from its lower corner on, at least two per axis.
+        """Cover a box with centres, from its lower corner to its upper or just beyond, two at least.
 
         Raises UsageError for a voxel or box without size.
         """
@@ -121,7 +121,7 @@ def observed_planes(
 ) -> UInt8:
     """Return the `VoxelState` (last - first, Y, Z) at centres of x-planes [first, last).
 
-    Never seen outside the occupancy grid.
+    Never seen outside the occupancy grid, or without one.
     """
     observed = np.full((last - first, *layout.shape[1:]), VoxelState.NEVER_SEEN, dtype=np.uint8)
     if occupancy is None:

@@ -12,8 +12,9 @@ from splatctrl_cli.records import Bool, Box, DistanceGrid, Float32, Float64
 class GridField:
     """Trilinear interpolation between cell centres.
 
-    Outside their box it reads the nearest value minus the distance to it: a lower bound, so that a robot outside
-    reads less clearance, never more. Next to a NaN cell (policy ``nan``) it is NaN, certified too.
+    Outside their box it reads the value at the box's nearest point minus the distance to it. This lower bound shows
+    a robot outside less clearance, never more. Next to a NaN cell (policy ``nan``), this and the certified distance
+    are NaN.
     """
 
     def __init__(self, grid: DistanceGrid, channel: str = "sdf") -> None:

@@ -93,7 +93,7 @@ def _set_warnings(
 
 
 def median_spacing(centers: NDArray[np.floating]) -> float:
-    """Median distance from a splat (N, 3) [m] to the nearest; 0 below two."""
+    """Median distance from a splat (N, 3) [m] to its nearest other; 0 for one."""
     if len(centers) < 2:
         return 0.0
     points = np.asarray(centers, dtype=np.float64)
@@ -105,7 +105,7 @@ def planar_zero_level(radius: float, length: float) -> float:
     """Height z [m] over a dense plane of splats where the Matern row-sum field is zero.
 
     The field is ``z - l log(1 + z / l) - r`` (the integral of ``e^(-d/l)`` over a plane is ``2 pi l (z + l)
-    e^(-z/l)``, the row sum ``2 pi l^2``). Newton's method from above: it is convex.
+    e^(-z/l)``, the row sum ``2 pi l^2``). Newton's method starts above, where it is convex.
     """
     z = radius + length * (1.0 + np.sqrt(2.0 * radius / length))
     for _ in range(50):

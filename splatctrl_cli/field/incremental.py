@@ -15,7 +15,7 @@ from splatctrl_cli.records import Float64, SplatSet, UInt8
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """mask (blocks of the grid): 1 where a bake is needed; None: everywhere."""
+    """mask (blocks of the grid): 1 where a bake is needed; None: everywhere, for `reason`."""
 
     mask: UInt8 | None
     num_blocks: int
@@ -31,7 +31,7 @@ def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) ->
     """Return the blocks where bakes of `before` and `after` can differ by a bit.
 
     Layout and configuration are the same. A block can differ where a splat of one set alone matters, by the bake's
-    culling bounds. Weights count, as neighbours' change. `observed` does not.
+    culling bounds. Weights are compared too, as those of neighbours change; `observed` is not.
     """
     shape = blocks_of(new.layout)
     num_blocks = int(np.prod(shape))

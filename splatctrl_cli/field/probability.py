@@ -59,7 +59,7 @@ class CalibratedProbability:
 
 
 class PaperProbability:
-    """Eq. 13 and 14 with the Matern kernel and lumped weights: a score (docs/field.md).
+    """Eq. 13 and 14 with the Matern kernel and lumped weights: only a score (docs/field.md).
 
     ``P(o >= 1 | o > 0) = Phi((o - 1) / s) / Phi(o / s)``, o of `GpdfField`, ``s^2 = (1 - sum_i w_i k(x, p_i)^2) /
     9``.
@@ -144,6 +144,6 @@ def make_probability(spheres: Spheres, config: FieldConfig, *, threads: int = 1)
 
 
 def probabilities(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> dict[str, CollisionProbability]:
-    """Make all forms for these weights; the paper's variance excludes cg."""
+    """Make all forms for these weights; the paper's variance does not hold for cg."""
     names = [name for name in PROBABILITIES if name != "paper" or config.weights != "cg"]
     return {name: PROBABILITIES[name](spheres, config, threads) for name in names}

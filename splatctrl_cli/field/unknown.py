@@ -96,9 +96,9 @@ Channels = dict[str, NDArray[np.generic]]
 def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
     """Return the grid with never-seen cells treated by `policy`, and its header updated.
 
-    ``free``: distances from splats alone. ``nan``: no sdf, gradient or probability there. ``obstacle``: solid
-    cubes; sdf, gradient and bound are of the nearer of splats and cubes, their probability is 1. Cells that only
-    the robot swept are known (`VoxelState.SWEPT_BY_ROBOT`); space outside is ignored.
+    ``free``: distances from splats alone. ``nan``: no sdf, gradient or probability there. ``obstacle``: solid cubes
+    of probability 1; sdf, gradient and bound are of the nearer of splats and cubes. Cells that only the robot swept
+    are known (`VoxelState.SWEPT_BY_ROBOT`); space outside is ignored.
 
     Raises UsageError for another policy, InputError without `observed`, NotEvaluableError if nothing was seen.
     """
@@ -157,8 +157,9 @@ class Cubes:
     def of(cls, is_unknown: Bool, voxel: float) -> "Cubes":
         """Bound the distances in a grid with known and unknown cells.
 
-        Outside: the larger of nearest centre minus half a diagonal, and chessboard distance minus half a cell.
-        Inside: half a cell minus the nearest known centre, which the depth does not exceed.
+        Outside: the larger of the nearest centre's distance minus half a diagonal, and the chessboard distance
+        minus half a cell. Inside: half a cell minus the distance to the nearest known centre, which the depth does
+        not exceed.
         """
         here = np.indices(is_unknown.shape, dtype=np.int32)
         distance, nearest = distance_transform_edt(~is_unknown, return_indices=True)

@@ -150,8 +150,9 @@ def solve_process(
 ) -> Solution:
     """``(K(P, P) + noise I)^-1 y`` (eq. 8, 12) for centres (N, 3) [m], y = exp(log_values) (N,).
 
-    The kernel is cut off at 8 l. Groups that it does not join are scaled by their largest y: Matern's ``e^(r / l)``
-    overflows. Raises UsageError for little memory or a wide spread of y, NotEvaluableError without convergence.
+    The kernel is cut off at 8 l. Groups that it does not join are scaled by their largest y, as Matern's ``e^(r /
+    l)`` overflows. Raises UsageError for too little memory or too wide a spread of y, NotEvaluableError without
+    convergence.
     """
     matrix = _kernel_matrix(centers, length, kernel, noise)
     num_groups, group = connected_components(matrix, directed=False)

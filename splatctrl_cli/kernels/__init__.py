@@ -40,9 +40,9 @@ MIN_CAP = 16  # threads that may be asked for on any machine
 
 
 def num_threads(requested: int = 0) -> int:
-    """Return `requested`, at most 16 or one per usable processor, whichever is more; 0: the latter.
+    """Return `requested`, capped at 16 or the number of usable processors, whichever is more.
 
-    Starting thousands takes minutes; results do not depend on it.
+    0 means one per processor. Starting thousands takes minutes; results do not depend on it.
     """
     if 0 < requested <= MIN_CAP:
         return requested

@@ -37,7 +37,7 @@ class Clusters:
 class Offsets:
     """values (16 C,): o of ``|x - p| - o`` [m], or b of ``|x - p|^2 - b`` [m^2]; spare -1e30.
 
-    maxima (C + G,): of clusters, then groups.
+    maxima (C + G,): the largest of clusters, then groups.
     """
 
     values: Float32
@@ -141,7 +141,7 @@ def gaussian(
 
     ``L = log sum_i c_i w_i exp(-|x - p_i|^2 / (2 l^2))``, pi the terms' shares. offsets: ``2 l^2 log w_i - common``
     [m^2]; radii (16 C,) [m]; sign (16 C,): c, 1 if None. Without signs, truncation raises the result by at most
-    `tolerance` [m]. NaN where L >= 0.
+    `tolerance` [m]. NaN unless the root's argument is positive.
     """
     score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
     native.field_gaussian(
@@ -173,7 +173,7 @@ def safe(
     *,
     threads: int = 0,
 ) -> tuple[Float64, Float64] | None:
-    """The smaller of `gaussian` and `nearest` (Q,), its gradient (Q, 3); `nearest` in ties.
+    """The smaller of `gaussian` and `nearest` (Q,), its gradient (Q, 3); `nearest` if equal or NaN.
 
     points (Q, 3), in the frame of anchor (3,). None if one is not finite.
     """
@@ -282,7 +282,7 @@ def touched_blocks(
 ) -> None:
     """Set is_touched (blocks) to 1 where spheres in `changed` (16 C,) can matter.
 
-    `length` None: to `bake_hard` (offsets: radii), else to `bake_gaussian` (``2 l^2 log |w_i|``).
+    They matter to `bake_hard` if `length` is None (offsets: radii), else to `bake_gaussian` (``2 l^2 log |w_i|``).
     """
     native.field_touched(
         *spheres.arrays,

@@ -86,7 +86,7 @@ class EdgeRoom:
     ) -> tuple[Float64, Int64]:
         """Return the share (E,) of edges start (E, J) to end (E, J) proved free, and checks (E,).
 
-        A row collides if less `rounding` it is below `contact` [m]; one that an edge does not move loses `still`
+        A row that less `rounding` is below `contact` [m] collides; one that an edge does not move loses `still`
         [m]. The proof stops `give_up` [rad] before a collision. With only_whole, an edge not all free has share 0.
         """
         share, num_checks = np.empty(len(start)), np.empty(len(start), np.int64)

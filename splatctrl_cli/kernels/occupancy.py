@@ -43,9 +43,9 @@ def integrate_depth(
 ) -> None:
     """Add a depth image to log_odds and num_updates (X, Y, Z); changed voxels get last_seen `step`.
 
-    A voxel with a pixel's point is a hit, else a miss if its centre is before its pixel's depth. Without depth, the
-    nearest pixel's counts while the rays are within half a voxel. Depth beyond max_range frees nearer voxels. hits:
-    scratch, zero before and after.
+    A voxel with a pixel's point is a hit, else a miss if its centre is before its pixel's depth. A pixel without
+    depth takes the nearest one's, while their rays are within half a voxel. Depth beyond max_range frees nearer
+    voxels. hits: scratch, zero before and after.
     """
     native.integrate_depth(
         grid, log_odds, num_updates, last_seen, hits, image.intrinsics, image.T_world_camera, image.depth,
@@ -71,5 +71,5 @@ def label_hits(
 
 
 def mark_spheres(grid: Float64, entity: UInt8, centers: Float64, radii: Float64, bits: int, num_threads: int) -> None:
-    """OR bits into entity (X, Y, Z) where spheres (S, 3), (S,) [m] meet."""
+    """OR bits into voxels of entity (X, Y, Z) that spheres (S, 3), (S,) [m] meet."""
     native.mark_spheres(grid, entity, centers, radii, bits, num_threads)

@@ -54,9 +54,9 @@ def render_surface(
 ) -> SurfaceImage:
     """Cast a ray through every pixel's centre; intrinsics (6,): fx, fy, cx, cy, width, height.
 
-    measured (H, W) [m], 0 = none: a point is inside a solid if `tolerance` + `quadratic` depth^2 [m] from its front
-    and back along the ray; triangles contain none. Solids around the camera and triangles reaching behind it are
-    not seen.
+    measured (H, W) [m], 0 = none: a point is inside a solid if over `tolerance` + `quadratic` depth^2 [m] behind
+    its front and before its back; triangles contain none. Solids around the camera and triangles that reach behind
+    it are not seen.
     """
     shape = (int(intrinsics[5]), int(intrinsics[4]))
     depth, link, inside = np.empty(shape, np.float32), np.empty(shape, np.int16), np.empty(shape, np.int16)

@@ -94,8 +94,7 @@ class SplatBuffer:
         return Filled(added=count - num_reused, relocated=num_reused, unmet=len(seeds) - count)
 
     def copy(self, sources: NDArray[np.intp], opacities: Float64, radii: Float64) -> int:
-        """Make dead slots copies of slots `sources` (K,), with repetitions, as far as there are; return their
-        number.
+        """Copy slots `sources` (K,), with repetitions, into dead slots as available; return how many.
 
         opacities (M,), radii (M,) [m]: new ones of sources and copies. Labels are copied; moments restart.
         """

@@ -40,7 +40,7 @@ def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Boo
 def count_carried(
     declared: Declarations, frame: RgbdFrame, mask: SelfMask, robot: RobotPosture, bare: RobotSurface, time_s: float
 ) -> None:
-    """Count declared boxes that robot pixels needed, unexplained by its `bare` surface.
+    """Count the declared boxes that explain robot pixels, where the `bare` surface does not.
 
     time_s: of the frame, from the first joint state.
     """
@@ -62,10 +62,11 @@ def contact_seeds(
     num_threads: int = 1,
     each: Each = map,
 ) -> Seeds:
-    """Seeds where an object near the robot has no splat's centre within `contact_radius`, of half that.
+    """Return seeds on objects near the robot without a splat's centre within `contact_radius`.
 
-    Larger ones stand out of a plane by more than the gaps are deep. mappable: pixels (H, W) of each frame. The
-    robot hides the contact, and depth edges have no return: the surface is assumed to extend this far.
+    Their radius is half of it: larger splats stand out of a plane by more than the gaps are deep. mappable: pixels
+    (H, W) of each frame. The robot hides the contact, and depth edges have no return: the surface is assumed to
+    extend that far beyond its measured part.
     """
     radius = config.contact_radius
     beside = each(lambda one, pixels: contact_pixels(one[0], one[1], robot) & pixels, seen, mappable)

@@ -1,6 +1,6 @@
 """Rays through a surface that another camera measures: shiny or dark objects.
 
-They are measured far behind their place, or return no depth.
+Such an object is measured far behind its place, or returns no depth.
 """
 
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ class Contradicted:
         return self._spread((self.until > 0) & ~self.is_blank, shape)
 
     def unproven(self, frame: RgbdFrame) -> RgbdFrame:
-        """Return the frame without depth that another's rays cross."""
+        """Return the frame without depth that another's rays cross: it proves no free space."""
         is_through = self._spread(self.through > 0, frame.depth.shape)
         return replace(frame, depth=np.where(is_through, np.float32(0.0), frame.depth)) if is_through.any() else frame
 
@@ -81,10 +81,10 @@ class _Surface:
 def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
     """Yield, for each frame of one time step, what other frames or the drawn robot contradict.
 
-    Rays of a block and its neighbours all cross another frame's surface, and end more than `CONTRADICTED` [m]
-    behind it or return no depth, in range and outside stereo shadows. No return from the drawn robot counts, too.
-    Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Either frame may be wrong: a ray to
-    `SEEN_THROUGH_PIXELS` crossed blocks proves no free space either.
+    All rays of a contradicted block and its neighbours cross a surface of another frame. They end more than
+    `CONTRADICTED` [m] behind it, or return no depth, in range and outside stereo shadows. No return from the drawn
+    robot counts, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Either frame may be wrong: a
+    surface with `SEEN_THROUGH_PIXELS` crossed blocks proves no free space either.
     """
     surfaces = [_surface(*one) for one in seen]
     through = [np.zeros([size // _side(frame) for size in frame.depth.shape], np.float32) for frame, _ in seen]
@@ -138,7 +138,7 @@ def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class _Rays:
-    """Least depth [m] of rays by block (h, w), and blocks that unexpectedly return none."""
+    """Depth [m] that all rays of a block (h, w) reach, and blocks that unexpectedly return none."""
 
     frame: RgbdFrame
     side: int
@@ -156,7 +156,7 @@ class _Rays:
         return cls(frame=frame, side=side, surely=surely, is_blank=np.asarray(is_blank))
 
     def run_through(self, surface: _Surface, until: Float32) -> Index:
-        """Write crossed surface depths into `until` (h, w); return points with depth measured behind."""
+        """Write the depth of crossed surface points into `until` (h, w); return those with depth behind."""
         pixel, z = pixels_at(self.frame, surface.points)
         width = self.frame.intrinsics.width
         v, u = pixel // width // self.side, pixel % width // self.side

@@ -1,7 +1,7 @@
 """Holes without depth, which may contain dark, shiny or clear objects.
 
-A hole is surrounded by depth; its content is on its rays, before what is seen around. Rays of other cameras and
-later images clear it. Depth is also lost at depth edges: the nearer surface may extend there.
+Depth surrounds a hole. An object in it is on its rays, before what is seen around. Rays of other cameras and later
+images clear it. Depth is also lost at depth edges: the nearer surface may extend there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,9 +27,9 @@ MOST_POINTS = 1 << 18  # at a time: fine voxels and a large hole come to a hundr
 def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Iterator[Float64]:
     """Yield points (K, 3) [m], world, half a voxel apart on rays of a frame's holes.
 
-    Some repeat. Rays are about a voxel apart, from `min_range` to the nearest depth seen. Holes up to `NARROW_HOLE`
-    voxels wide do not count, nor those near the robot (robot_depth (H, W) [m], 0 = none): background may show
-    there.
+    Some repeat. Rays are about a voxel apart, from `min_range` to the depth of the nearest pixel with depth. Holes
+    up to `NARROW_HOLE` voxels wide do not count, nor those beside the robot, where background may show. robot_depth
+    (H, W) [m]: rendered, 0 = none.
     """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
@@ -70,7 +70,7 @@ def _on_rays(
 
 
 def _holes(is_blank: Bool, is_end: Bool) -> Bool:
-    """Return pixels (H, W) without depth, in groups off border and `is_end`."""
+    """Return pixels (H, W) without depth, in groups that meet neither border nor `is_end`."""
     _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
     return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
@@ -94,9 +94,9 @@ def lost_edges(
 ) -> dict[str, LostEdges]:
     """Return, by camera, a ball for each pixel without depth next to an object pixel.
 
-    It has the nearest such depth and a pixel's radius: a surface shown there ends before the next centre. Left out
-    are lone object pixels, which are noise, and balls that a frame sees through by `see_through`, or as near to the
-    robot: its own outline.
+    Its depth is that of the nearest object beside it. Its radius is one pixel: a surface shown there ends before
+    the next centre. Lone object pixels are noise. Balls that a frame sees through by `see_through`, or that near to
+    the robot, are left out: the latter are its outline.
     """
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
     surely = [

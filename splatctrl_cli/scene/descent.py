@@ -25,10 +25,10 @@ from splatctrl_cli.scene.render import BLACK, Color, Rendering, loss_weights
 
 
 class Descent:
-    """Optimiser of a buffer's M splats, with noise seeded by seed and iteration.
+    """Optimiser of a buffer's M splats, with noise drawn from seed and iteration.
 
-    background: behind the splats, None until chosen. heard: called after each iteration. device: of `run` and
-    `rendering`, else the processor; failures raise DeviceError.
+    background: colour behind the splats, None until chosen. heard: called after each iteration. device: for `run`
+    and `rendering`, else the processor; failures raise DeviceError.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Descent:
         self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
 
     def run(self, views: Sequence[View], settings: OptimiserSettings, depth: float = 1.0) -> dict[int, LossTerms]:
-        """Run an iteration on each view; return each view's loss at its last one, by identity.
+        """Run an iteration on each view; return each view's last loss, by id.
 
         `depth` multiplies the weight of the depth loss.
         """
@@ -131,7 +131,7 @@ class Descent:
         )
 
     def misfits(self, views: Sequence[View]) -> tuple[list[Misfit], Float64]:
-        """Return each view's colour error where mappable, and each slot's blended opacity, summed (M,).
+        """Return each view's colour error where mappable, and each slot's summed blended opacity (M,).
 
         The derivative of a summed colour plane by a splat's colour is the sum of its weights.
         """

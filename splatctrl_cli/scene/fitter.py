@@ -268,7 +268,7 @@ class SceneFitter:
                 self.window.newest = [self.view(view.frame) for view in self.window.newest]
 
     def _behind(self, views: Sequence[View]) -> Color:
-        """Return the background colour, of pixels without depth, or without any depth, of uncovered ones."""
+        """Return the colour of pixels without depth, or without any depth, of pixels without splats."""
         if self.config.background == "black":
             return BLACK
         counted = [view.target.counted > 0 for view in views]
@@ -363,7 +363,7 @@ class SceneFitter:
     def _fill_gaps(
         self, views: Sequence[View], masks: Sequence[SelfMask], removed: dict[str, int], half: int | None = None
     ) -> Filled:
-        """Add splats where measured surfaces are far from all spheres, alternate halves per step.
+        """Add splats where measured surfaces are far from all spheres, in alternate halves per step.
 
         The robot's surface has spheres of its own. For other surfaces, slots are evicted every EVICT_EVERY steps.
         """

@@ -23,7 +23,7 @@ DIRECTIONS = _STEPS / np.linalg.norm(_STEPS, axis=1, keepdims=True)  # (26, 3), 
 class View:
     """A frame for the optimiser, with its `nearest_depth` (H, W) [m].
 
-    nearest_object: likewise, with robot pixels apart.
+    nearest_object: the same, with robot pixels counted apart.
     """
 
     frame: RgbdFrame
@@ -48,7 +48,8 @@ def make_view(
 ) -> View:
     """Return a view of `frame`; `mappable` (H, W): pixels with depth in the workspace.
 
-    Pixels without depth count in the colour loss; invalid, `mounted` and outside ones do not.
+    Pixels without depth count in the colour loss. Pixels that are invalid, `mounted`, or outside the workspace do
+    not count.
     """
     counted = mappable | (frame.depth <= 0)
     if frame.valid is not None:
@@ -83,7 +84,7 @@ def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
     """Return centres (N, 3) [m], world, those that float up to `most` [m] put on the surface.
 
     A centre floats if all views that see it measure more depth around its pixel. It moves along the ray with the
-    smallest step. A view that measures less depth by `most` does not see it.
+    smallest step. A view with depth over `most` before the centre does not see it.
     """
     least, towards = np.full(len(centers), np.inf, np.float32), np.zeros_like(centers)
     for view in views:
@@ -103,8 +104,8 @@ def kept_radii(
 ) -> Float32:
     """Return radii (N,) [m] that keep spheres within measured depth, at least `least` [m].
 
-    A sphere shrinks while some view sees a point of its edge float by `tolerance` [m] before depth around it, or
-    its nearest point before the centre pixel's depth.
+    A sphere shrinks while a point of its edge floats by `tolerance` [m] before depth around its pixel in some view.
+    So it does while its nearest point floats before the centre pixel's depth.
     """
     cameras = [view.camera for view in views]
     depths = [np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)) for view in views]

@@ -42,8 +42,9 @@ def relabel(
 def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture, seen: Seen) -> tuple[Bool, Bool]:
     """Return splats (M,) of the robot, and those that a pixel shows to be an object.
 
-    The pixel with the nearest depth decides. Without one, labels stay, as the robot occludes objects: its own
-    within `see_through` of its body. Others well inside become robot, in solid voxels only if all of it is drawn.
+    The pixel whose depth a splat explains best decides. Splats that no pixel shows keep their label, since the
+    robot hides objects; its own must be within `see_through` of its body. Others well inside the body become robot,
+    in solid voxels only if all of it is drawn.
     """
     alive, config = buffer.is_alive, occupancy.config
     kind = shown_kinds(buffer.centers, seen, config)

@@ -42,7 +42,8 @@ class OccupancyMap:
     def take_in(self, frames: Sequence[RgbdFrame]) -> None:
         """Add the depth images of one time step; human pixels set the human bit.
 
-        Passing rays clear it, with the solid bit; so do other pixels of masked images. Occluded people stay.
+        Rays that pass clear it, and the solid bit; other pixels of masked images clear it, too. Occluded people
+        stay.
         """
         self._begin_step(frames)
         masked = [(frame, frame.human) for frame in frames if frame.human is not None]
@@ -103,7 +104,7 @@ class OccupancyMap:
         self.last_seen[i[is_never], j[is_never], k[is_never]] = reason
 
     def unexplained(self, centers: Float64, radii: Float64) -> NDArray[np.intp]:
-        """Flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m], with open reason."""
+        """Flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m] with changeable reasons."""
         is_near = np.zeros_like(self.entity)
         mark_spheres(self._packed, is_near, centers, radii, 1, self.num_threads)
         voxels = np.flatnonzero(is_near)
@@ -116,7 +117,7 @@ class OccupancyMap:
         self.last_seen.reshape(-1)[voxels] = reasons
 
     def keep_edges(self, edges: Mapping[str, LostEdges]) -> None:
-        """Replace the lost edges by camera, within the grid."""
+        """Replace these cameras' lost edges, within the grid."""
         upper = self.origin + self.config.voxel * (np.array(self.log_odds.shape) - 1)
         for camera, each in edges.items():
             self.edges[camera] = each.select(np.all((each.centers >= self.origin) & (each.centers <= upper), axis=1))
@@ -143,7 +144,7 @@ class OccupancyMap:
         """Clear solid voxels within the robot that connect to none outside.
 
         Their object left while the contact was hidden. Spheres (S, 3), (S,) [m] contain the robot; distance: points
-        (Q, 3) -> signed (Q,) [m].
+        (Q, 3) -> signed distance (Q,) [m].
         """
         reach = radii.max() + 2.0 * self.config.voxel
         low, high = ((f - self.origin) / self.config.voxel for f in (centers.min(axis=0), centers.max(axis=0)))
@@ -193,8 +194,8 @@ class OccupancyMap:
     def occupancy_around(self, points_world: Float32) -> tuple[Float32, Bool]:
         """Return the largest occupancy (N,) of the eight nearest voxels; True if one was seen.
 
-        They reach half a voxel to all sides, as far as a surface supports a splat. Unless all are never seen (one
-        half), those do not count.
+        The eight reach half a voxel to all sides: a surface that near supports a splat. Never-seen ones count only
+        if all are (one half).
         """
         base = np.floor((points_world - self.origin) / self.config.voxel).astype(np.int64)
         limit = np.array(self.log_odds.shape) - 1
@@ -260,7 +261,7 @@ class OccupancyMap:
 class PeopleMemory:
     """Flat indices `voxels` (K,) of people, and `stamps_ns` (K,) of their last observation.
 
-    `OccupancyMap.take_in` clears them; unobserved for `memory` [s], they become never seen.
+    `OccupancyMap.take_in` clears voxels seen otherwise; unobserved for `memory` [s], they become never seen.
     """
 
     def __init__(self, memory: float) -> None:

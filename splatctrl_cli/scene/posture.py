@@ -37,7 +37,7 @@ class RobotPosture:
     def distance(self, points_world: NDArray[np.floating], without: Sequence[str] = ()) -> Float64:
         """Signed distance (N,) [m] of points (N, 3) to the robot at the newest stamp, negative inside.
 
-        Exact up to `ROBOT_REACH`, except from the links `without`.
+        Exact up to `ROBOT_REACH`; the links `without` do not count.
         """
         surface, T = self.seen_at(max(self.T_world_surface, default=0))
         return surface.distance(T, points_world, without=without, within=ROBOT_REACH, num_threads=self.num_threads)
@@ -82,7 +82,7 @@ POSTURE_NAMES = ("centers", "radii", "T_world_link")  # what the next time step 
 def carried(points: Float32, before: RobotPosture, after: RobotPosture) -> Float32:
     """Move points (N, 3) [m], world, with the link of the nearest sphere surface.
 
-    Otherwise each frame would trail and re-seed the arm. The paper does not move them.
+    Splats left behind would become trails, and the arm be seeded anew every frame. The paper does not move them.
     """
     gap = np.linalg.norm(points[:, None] - before.centers[None], axis=2) - before.radii
     sphere = np.argmin(np.abs(gap), axis=1)

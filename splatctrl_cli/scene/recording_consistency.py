@@ -15,9 +15,9 @@ from splatctrl_cli.scene.seeding import world_points_at
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Distance |dz| [m] of surfaces that two cameras see: median and lower quartile.
+    """Distance |dz| [m] between surfaces that two cameras both see: median and lower quartile.
 
-    depth [m]: theirs; detour [m]: least sum of medians by way of a third camera.
+    depth [m]: of these surfaces; detour [m]: least sum of medians by way of a third camera.
     """
 
     cameras: tuple[str, str]
@@ -29,15 +29,15 @@ class Agreement:
 
     @property
     def limit(self) -> float:
-        """Limit of good cameras [m]: 3 cm, 3 % beyond 1 m (2 % each)."""
+        """Limit of good cameras [m]: 3 cm, beyond 1 m 3 % of depth (2 % each, independent)."""
         return fixed.PAIR_LIMIT * max(1.0, self.depth)
 
     @property
     def holds(self) -> bool:
         """False if median and detour exceed the limit, and the quartile half of it.
 
-        Both sides of a thin object look like one surface, but then a share of pixels or a third camera agrees; with
-        wrong poses neither.
+        Both sides of a thin object look like one surface. Then a share of the pixels, or a third camera, still
+        agrees; with wrong poses neither does.
         """
         return min(self.median, self.detour) <= self.limit or self.quartile <= 0.5 * self.limit
 

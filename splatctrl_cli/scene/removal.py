@@ -17,8 +17,8 @@ REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain"
 def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH, is_robot: Bool | None = None) -> Float32:
     """Return the least valid depth (H, W) [m] within `reach` [m] of each pixel; inf without any.
 
-    `reach` is at the median depth. Robot pixels count only for themselves and neighbours: nearer splats beside it
-    float.
+    `reach` is at the median depth. Robot pixels count only for themselves and neighbours: beside the robot, what is
+    before all else floats.
     """
     depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
     valid = frame.depth[frame.depth > 0]
@@ -52,7 +52,8 @@ def removals(
     seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 beyond the patience. trail: was
     robot or human. Set elsewhere: robot (moved off it), evicted (for bare surface), weak (for detail).
 
-    Splats in never-seen surroundings stay, unless the rule is "literal". `counts_time` counts uncertain steps.
+    Splats in never-seen surroundings stay, unless the rule is "literal". `counts_time`: this is a time step, which
+    counts towards the patience.
     """
     config = occupancy.config
     centers = buffer.centers
@@ -96,10 +97,10 @@ def _verdict(value: Float32, is_observed: Bool, config: OccupancyConfig) -> tupl
 def room_for(
     seeds: Seeds, num: int, buffer: SplatBuffer, occupancy: OccupancyMap, shown: Float64, tolerance: float
 ) -> tuple[Bool, Seeds]:
-    """Return slots (M,) of at most `num` splats to evict, and seeds in order.
+    """Return slots (M,) of at most `num` splats to evict, and the seeds in order of slots.
 
-    Redundant object splats go first, by how little they show (M,), then those far from the robot's path. tolerance
-    [m]: as in `redundant`.
+    Only object splats go: redundant ones that show least, then those far from the robot's path, for seeds near it.
+    shown (M,): how much slots show; tolerance [m]: as in `redundant`.
     """
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_alive)
     stands = splats.labels != Label.ROBOT
@@ -129,8 +130,8 @@ def redundant(
     """Return at most `num_wanted` splats of `order` that others can replace.
 
     splats: N of objects and people; voxels (K, 3) [m]: occupied centres. A splat represents voxels within
-    `tolerance` [m] of its sphere, among the eight nearest centres. If each keeps another splat, its removal bares
-    no surface.
+    `tolerance` [m] of its sphere, among the eight nearest centres. It may go if all its voxels keep another: this
+    bares no surface.
     """
     if not len(order) or not len(voxels) or num_wanted < 1:
         return np.zeros(0, np.intp)

@@ -63,9 +63,9 @@ def depth_noise(images: Sequence[Float32]) -> float:
     """Return the standard deviation [1/m] of one camera's inverse depth (H, W); 0 if unknown.
 
     At depth z, that is times z^2, as in disparity sensors (Khoshelham and Elberink 2012: 1.425e-3 of a Kinect).
-    Inverse depth of a plane is linear in the pixel: residuals of linear fits to blocks are noise, at a low
-    quantile. A fit absorbs noise that neighbours share: blocks two or three times as wide count up to twice as
-    much; more is shape.
+    Inverse depth of a plane is linear in the pixel: residuals of linear fits to blocks are noise, and a low
+    quantile leaves out edges. Fits absorb noise that neighbours share. Blocks two or three times as wide may raise
+    it, up to twice; more is shape.
     """
     narrow, *wider = (_linear_noise(images, times) for times in (1, *NOISE_WIDER))
     return max(narrow, min(max(wider), 2 * narrow))

@@ -48,7 +48,7 @@ def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, mi
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:
     """M_add (H, W): pixels to seed, eq. 5 with a term for holes.
 
-    A mappable pixel is a hole (opacity below `hole_opacity`), or closer than the map by more than lambda_MDE times
+    A mappable pixel is seeded if a hole (opacity below `hole_opacity`), or closer than the map by lambda_MDE times
     the median depth error. The median is of explained mappable pixels, clipped at both ends; the map's depth is
     normalised by opacity.
     """
@@ -70,7 +70,7 @@ class Candidates(Columns):
 
 
 def thinning(masks: Iterable[Bool]) -> int:
-    """Return n: every n-th pixel of the masks (H, W) fits `SEED_MOST_PIXELS`."""
+    """Return n: every n-th pixel of masks (H, W) is within `SEED_MOST_PIXELS`."""
     return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / SEED_MOST_PIXELS))
 
 
@@ -96,7 +96,9 @@ def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Candidates
 
 @dataclass(frozen=True, kw_only=True)
 class SeedDensity:
-    """Density of seeds: coarsest edge [m], detail at which a cube splits, candidates it was chosen on."""
+    """Density of seeds: coarsest edge [m], detail at which a cube splits, and the number of candidates
+    behind both.
+    """
 
     edge: float
     tolerance: float
@@ -152,9 +154,10 @@ def gap_seeds(
 ) -> Seeds:
     """Return seeds where a measured surface is further than `max_gap` [m] from every sphere.
 
-    Blending covers pixels from distant splats; a distance field does not. Checked are every `stride`-th pixel and
-    row of the views (by default third or fewer, half of `max_gap`), and occupied centres (K, 3), up to half a voxel
-    off surfaces now out of view. `half` 0 or 1: only every second row. `each`: a `map` over views.
+    Blending covers pixels with distant splats; a distance field shows the gap. Every `stride`-th pixel and row of
+    the views is checked (by default every third or fewer, about half of `max_gap`). So are occupied centres (K, 3),
+    for surfaces out of view; they may be half a voxel off. `half` 0 or 1: only every second row. `each`: a `map`
+    over views.
     """
     spheres = SplatTree(splats.centers, splats.radii, num_threads)
 

@@ -64,7 +64,7 @@ class SelfMask:
 
 
 def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
-    """Return the self-mask of a frame, with the robot as at its stamp.
+    """Return the self-mask of a frame, with the robot's pose at its stamp.
 
     A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths nearby:
     as many pixels as the tolerance spans, as surfaces slant and calibration shifts outlines. So is a point this
@@ -168,8 +168,8 @@ def settled(
 ) -> SelfMask:
     """Return the mask with each doubted piece decided: object or mixed.
 
-    Object if one of `others` measured half of it, or without others. others: other cameras' frames, and settled
-    ones of the last time step.
+    It is an object if one of `others` measured half of it, or if there are none. others: other cameras' frames, and
+    settled ones of the last time step.
     """
     is_doubted = mask.kinds == PixelKind.DOUBTED
     if not is_doubted.any():
@@ -281,7 +281,7 @@ def without(frame: RgbdFrame, mask: SelfMask, kind: PixelKind) -> RgbdFrame:
 
 
 def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_SIGMAS) -> Float32:
-    """Return how far [m] depth of the robot may differ from rendered depth."""
+    """Return how far [m] measured depth of the robot may be from rendered depth."""
     return np.asarray(config.self_mask_tolerance + sigmas * config.depth_error * depth * depth, np.float32)
 
 
@@ -299,7 +299,7 @@ class LinkResidual:
 
     @property
     def sign(self) -> int:
-        """1 if measured behind the rendered surface."""
+        """1 behind the rendered surface, -1 before."""
         return 0 if self.median is None else int(np.sign(self.median))
 
 

@@ -93,7 +93,7 @@ class Shell:
     def _add(self, shown: Masked) -> None:
         """Seed what the shell does not explain; restart coarser if too many seeds are unmet.
 
-        A restart keeps its splats that are out of view.
+        A restart seeds all views and its own splats' places.
         """
         asked = [(view, add_mask(view.frame, self._descent.rendering(view), m, self._scaled)) for view, m in shown]
         most = SHELL_UNMET * self.config.max_splats

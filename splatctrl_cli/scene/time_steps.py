@@ -52,13 +52,13 @@ class TimeStep:
 
 @dataclass(frozen=True, kw_only=True)
 class AuditRow:
-    """Result of one time step; counts are of splats, loss (eq. 4) and PSNR [dB] of the newest frames, at their last
-    iteration.
+    """Result of one time step.
 
-    dead: reusable slots. unmet: seeds without a slot. evicted: slots given to bare surface. unrepresented: occupied
-    voxels without a splat. without_depth: frames without any. loss, psnr: None if no view shows the workspace.
-    self_mask: by link, measured minus rendered depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link,
-    unexplained points inside. blind: cameras without depth.
+    Counts are of splats; loss (eq. 4) and PSNR [dB] of the newest frames, at their last iteration, None if none
+    shows the workspace. dead: reusable slots. unmet: seeds without a slot. evicted: slots given to bare surface.
+    unrepresented: occupied voxels without a splat. without_depth: frames without any. self_mask: by link, measured
+    minus rendered depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link, unexplained points inside.
+    blind: cameras without depth.
     """
 
     stamp_ns: int
@@ -131,7 +131,7 @@ def time_steps(
 
 
 def planar(frame: RgbdFrame) -> RgbdFrame:
-    """Return the frame with colour stored by plane, as the optimiser takes it: without copies."""
+    """Return the frame with colour by plane, as the optimiser takes it: views then share memory."""
     planes = np.ascontiguousarray(np.moveaxis(frame.color, 2, 0))
     return replace(frame, color=np.moveaxis(planes, 0, 2))
 

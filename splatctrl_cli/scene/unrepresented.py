@@ -77,7 +77,7 @@ def bare_voxels(
 def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Bool:
     """Voxels (X, Y, Z) within `reach` [m] of a sphere, wherever its centre is in its voxel.
 
-    Most are, at a tenth of the cost of a search.
+    This settles most, at a tenth of the cost of a search.
     """
     voxel, shape = occupancy.config.voxel, occupancy.log_odds.shape
     cells = np.floor((splats.centers - occupancy.origin) / voxel + 0.5).astype(np.int64)
@@ -95,8 +95,8 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
 class GridAgreement:
     """Agreement of splats with a grid; NaN without any.
 
-    on_surface: share of object and human splats in or next to a voxel that is not free, of those outside the grid
-    or by a seen voxel. represented: share of num_voxels occupied voxels with a splat or ball.
+    on_surface: share of object and human splats in or next to a voxel that is not free, of those outside the grid,
+    or in or next to a seen voxel. represented: share of num_voxels occupied voxels with a splat or ball.
     """
 
     on_surface: float

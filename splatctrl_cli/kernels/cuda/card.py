@@ -123,7 +123,6 @@ class CudaGraph:
         self._graphs, self._stream = graphs, stream
 
     def run(self, num_times: int = 1) -> None:
-        """Queue the launches `num_times`."""
         with _named_faults():
             for _ in range(num_times // MANY):
                 self._graphs[MANY].launch(self._stream)

@@ -50,8 +50,8 @@ class Choice:
 class Answers:
     """Wanted results in (X, Y, Z) cells or (Q,) points [m].
 
-    bound: exact minus margin; entry: nearest sphere's; kernels: exact where undefined; counts: by kernel, undefined
-    and excessive cells.
+    bound: exact distance minus margin; entry: nearest sphere's; kernels: exact where undefined; counts: by kernel,
+    cells undefined, and above the exact distance.
     """
 
     distance: Float32

@@ -73,7 +73,10 @@ def bytes_needed(
 
 
 class DeviceFit:
-    """Optimiser of N splats on a device. Raises OutOfMemory, with what would fit."""
+    """Optimiser of N splats on a device, for views of `sizes` (H, W) at first.
+
+    Raises OutOfMemory, with what would fit.
+    """
 
     def __init__(
         self,
