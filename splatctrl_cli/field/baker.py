@@ -98,7 +98,7 @@ class Baker:
         return HALF_DIAGONAL * self.layout.voxel + 1e-6 + 1e-6 * size
 
     def allocate(self, num_planes: int) -> Planes:
-        """Return arrays for the channels of `num_planes` x-planes."""
+        """Arrays for the channels of `num_planes` x-planes."""
         return {name: np.empty(self.shape_of(name, num_planes), CHANNELS[name][0]) for name in self.channels}
 
     def shape_of(self, channel: str, num_planes: int) -> tuple[int, ...]:
@@ -119,7 +119,7 @@ class Baker:
             self._bake_planes(begin, end, part, mask)
 
     def span(self, first: int, last: int, mask: UInt8 | None = None) -> GridSpan:
-        """Return the cells of x-planes [first, last), in the spheres' frame."""
+        """Cells of x-planes [first, last), in the spheres' frame."""
         origin = self.layout.origin - self.spheres.points.anchor
         return GridSpan(
             origin=origin, voxel=self.layout.voxel, shape=self.layout.shape, first=first, last=last, mask=mask

@@ -160,7 +160,7 @@ def shaped_points(points: NDArray[np.floating]) -> Float64:
 
 
 def not_finite(points: Float64) -> InputError:
-    """Return the error for the first point (Q, 3) not finite."""
+    """Error for the first point (Q, 3) not finite."""
     i = int(np.argmax(~np.isfinite(points).all(axis=1)))
     return InputError(f"query point {i}: expected finite coordinates, got {points[i].tolist()}")
 

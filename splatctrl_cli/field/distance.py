@@ -38,7 +38,7 @@ class SphereField:
         self._threads = threads
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3), 0 at a centre."""
+        """As `DistanceField.query`; zero gradient at a centre."""
         local = self.spheres.points.relative(checked_points(points))
         score, gradient, _ = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)
         return score.astype(np.float64), gradient.astype(np.float64)
@@ -220,7 +220,7 @@ class SeField(LogSumExpField):
         )
 
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
-        """Write `query_raw` at the cells of `span`, (X, Y, Z) and (X, Y, Z, 3)."""
+        """As `GpdfField.bake_raw`."""
         native.bake_gaussian(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
 
 
@@ -237,7 +237,7 @@ class SafeField:
         self._both = kernel if isinstance(kernel, SeField) and are_of_one else None
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3); exact in ties."""
+        """As `DistanceField.query`; exact in ties."""
         if self._both is not None:
             return self._both.query_safe(points)
         distance, gradient = self._exact.query(points)
@@ -262,7 +262,7 @@ def laid_out_sign(spheres: Spheres, sign: Float32 | None) -> Float32 | None:
 
 
 def normalised(gradient: Float64) -> Float64:
-    """Return unit gradients (Q, 3), eq. 11 with its sign corrected; 0 stays 0."""
+    """Unit gradients (Q, 3), eq. 11 with its sign corrected; 0 stays 0."""
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
     return np.asarray(np.divide(gradient, length, out=np.zeros_like(gradient), where=length > 0))
 

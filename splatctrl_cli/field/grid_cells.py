@@ -56,7 +56,7 @@ class GridLayout:
 
 
 def bounding_box(splats: SplatSet, padding: float) -> Box:
-    """Return the box of the spheres, widened by `padding` [m] per side."""
+    """Box of the spheres, widened by `padding` [m] per side."""
     lower = (splats.centers - splats.radii[:, None]).min(axis=0).astype(np.float64)
     upper = (splats.centers + splats.radii[:, None]).max(axis=0).astype(np.float64)
     return Box(lower=lower - padding, upper=upper + padding)
@@ -100,7 +100,7 @@ def check_room(what: str, needed: int, remedy: str) -> None:
 
 
 def available_memory() -> int:
-    """Return bytes free without swapping, within the control group's limit."""
+    """Bytes free without swapping, within the control group's limit."""
     for line in (PROC / "meminfo").read_text(encoding="ascii").splitlines():
         if line.startswith("MemAvailable:"):
             return min([int(line.split()[1]) * 1024, *_group_room()])
@@ -119,7 +119,7 @@ def _group_room() -> list[int]:
 def observed_planes(
     occupancy: OccupancyGrid | None, layout: GridLayout, thresholds: OccupancyConfig, first: int, last: int
 ) -> UInt8:
-    """Return the `VoxelState` (last - first, Y, Z) at centres of x-planes [first, last).
+    """`VoxelState` (last - first, Y, Z) at centres of x-planes [first, last).
 
     Never seen outside the occupancy grid, or without one.
     """

@@ -36,7 +36,7 @@ class GridField:
         self.box = Box(lower=self._origin, upper=upper)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m], world -> distance (Q,) [m], the interpolant's gradient (Q, 3)."""
+        """As `DistanceField.query`, with the interpolant's gradient."""
         return native.interpolate(self._values, self._origin, self._voxel, checked_points(points))
 
     def certified(self, points: Float64) -> Float64:

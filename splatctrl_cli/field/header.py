@@ -27,7 +27,7 @@ def field_header(
     has_occupancy: bool,
     num_unrepresented: int = 0,
 ) -> dict[str, object]:
-    """Return the header of `baker`'s bake of `chosen`: labelled `splats`, then `num_unrepresented` balls."""
+    """Header of `baker`'s bake of `chosen`: labelled `splats`, then `num_unrepresented` balls."""
     config = baker.config
     radii: Mapping[str, float] = {
         "min": float(chosen.radii.min()),

@@ -34,7 +34,7 @@ class FieldHealth:
 def field_health(
     centers: NDArray[np.floating], radii: NDArray[np.floating], length: float, *, kernels: Collection[str]
 ) -> FieldHealth:
-    """Return the health of splats (N, 3), (N,) [m] for kernels (se, gpdf)."""
+    """Health of splats (N, 3), (N,) [m] for kernels (se, gpdf)."""
     spacing, radius = median_spacing(centers), float(np.median(radii))
     zero_level = planar_zero_level(radius, length)
     return FieldHealth(

@@ -28,7 +28,7 @@ class Changes:
 
 
 def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) -> Changes:
-    """Return the blocks where bakes of `before` and `after` can differ by a bit.
+    """Blocks where bakes of `before` and `after` can differ by a bit.
 
     Layout and configuration are the same. A block can differ where a splat of one set alone matters, by the bake's
     culling bounds. Weights are compared too, as those of neighbours change; `observed` is not.
@@ -52,13 +52,13 @@ def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) ->
 
 
 def blocks_of(layout: GridLayout) -> tuple[int, int, int]:
-    """Return the blocks along x, y and z."""
+    """Blocks along x, y and z."""
     x, y, z = (-(-cells // BLOCK) for cells in layout.shape)
     return (x, y, z)
 
 
 def whole_span(baker: Baker) -> GridSpan:
-    """Return all cells of a baker's grid, in its spheres' frame."""
+    """All cells of a baker's grid, in its spheres' frame."""
     layout = baker.layout
     return GridSpan(
         origin=layout.origin - baker.spheres.points.anchor,
@@ -72,7 +72,7 @@ def whole_span(baker: Baker) -> GridSpan:
 def counts_after(
     counts: Mapping[str, int], old: Baker, new: Baker, mask: UInt8, slabs: Sequence[tuple[int, int]]
 ) -> dict[str, int]:
-    """Return the whole grid's counts of kernel values after baking `mask`.
+    """Counts of kernel values in the whole grid after baking `mask`.
 
     `old` bakes these blocks again, to subtract theirs from `counts`.
     """
@@ -115,7 +115,7 @@ def _touch(
 def _changed(
     splats: tuple[SplatSet, SplatSet], bakers: tuple[Baker, Baker], *, with_weights: bool
 ) -> tuple[UInt8, UInt8]:
-    """Return entries (16 C,) of each set missing in the other, to the bit."""
+    """Entries (16 C,) of each set missing in the other, to the bit."""
     rows = [_rows(s, b, with_weights=with_weights) for s, b in zip(splats, bakers, strict=True)]
     _, kinds = np.unique(np.concatenate(rows), return_inverse=True)
     here, there = np.split(kinds, [len(rows[0])])

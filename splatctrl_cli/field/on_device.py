@@ -32,7 +32,6 @@ class OnDevice:
         return cls(Spheres.of(centers, radii), config, device)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m], gradient (Q, 3)."""
         if not len(points):
             return np.zeros(0), np.zeros((0, 3))
         found = self._asked(points, "gradient")

@@ -69,7 +69,7 @@ class GridStatistics:
 
 
 def grid_statistics(grid: DistanceGrid) -> GridStatistics:
-    """Return a grid's statistics, a few planes at a time, as channels may be memory maps."""
+    """Statistics of a grid, a few planes at a time, as channels may be memory maps."""
     totals = _Totals()
     for part in _parts(grid):
         totals.add(part)

@@ -31,7 +31,7 @@ class Kept:
 
 
 def bytes_per_cell(channels: Collection[str]) -> int:
-    """Return the bytes of the channels."""
+    """Bytes of the channels."""
     return sum(np.dtype(CHANNELS[name][0]).itemsize * CHANNELS[name][1] for name in channels if name in CHANNELS)
 
 
@@ -101,7 +101,7 @@ class UnknownSpace:
 
 
 def baked_planes(baker: Baker, first: int, last: int, kept: Kept | None = None) -> Planes:
-    """Return channels of x-planes [first, last), before `UnknownSpace`; `kept` ones are copied."""
+    """Channels of x-planes [first, last), before `UnknownSpace`; `kept` ones are copied."""
     planes = baker.allocate(last - first)
     if kept is None:
         baker.bake(first, last, planes)

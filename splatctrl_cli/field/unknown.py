@@ -34,7 +34,7 @@ class ObstacleSpheres:
 def obstacle_spheres(
     splats: SplatSet, balls: Balls | None, labels: Collection[Label] = DEFAULT_LABELS
 ) -> ObstacleSpheres:
-    """Return splats and balls with one of `labels`. Raises as `field_splats` without such balls."""
+    """Splats and balls with one of `labels`. Raises as `field_splats` without such balls."""
     values = [int(label) for label in labels]
     is_chosen = np.isin(splats.labels, values)
     kept = np.zeros(0, bool) if balls is None else np.isin(balls.labels, values)
@@ -55,7 +55,7 @@ def obstacle_spheres(
 
 
 def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -> SplatSet:
-    """Return splats with one of `labels`, in order; by default without the robot.
+    """Splats with one of `labels`, in order; by default without the robot.
 
     Raises NotEvaluableError without any, InputError for an unknown label.
     """
@@ -79,7 +79,7 @@ def check_labels(splats: SplatSet) -> None:
 
 
 def label_counts(splats: SplatSet) -> dict[str, int]:
-    """Return the number of splats by label name."""
+    """Number of splats by label name."""
     return {label.name.lower(): int(np.count_nonzero(splats.labels == label)) for label in Label}
 
 
@@ -94,7 +94,7 @@ Channels = dict[str, NDArray[np.generic]]
 
 
 def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
-    """Return the grid with never-seen cells treated by `policy`, and its header updated.
+    """Grid with never-seen cells treated by `policy`, and its header updated.
 
     ``free``: distances from splats alone. ``nan``: no sdf, gradient or probability there. ``obstacle``: solid cubes
     of probability 1; sdf, gradient and bound are of the nearer of splats and cubes. Cells that only the robot swept
@@ -176,7 +176,7 @@ class Cubes:
         )
 
     def planes(self, first: int, last: int) -> "Cubes":
-        """Return the x-planes [first, last)."""
+        """X-planes [first, last)."""
         return replace(
             self,
             is_unknown=self.is_unknown[first:last],
@@ -185,7 +185,7 @@ class Cubes:
         )
 
     def joined(self, channels: Mapping[str, NDArray[np.generic]], bound_margin: float) -> tuple[Channels, int]:
-        """Return channels of the nearer of field and cubes, and the number of changed cells."""
+        """Channels of the nearer of field and cubes, and the number of changed cells."""
         joined = dict(channels)
         is_nearer = np.asarray(self.distance < np.asarray(channels["sdf"], dtype=np.float32))
         joined["sdf"] = np.where(is_nearer, self.distance, channels["sdf"])

@@ -326,7 +326,7 @@ METHODS: Mapping[str, Method] = {"rowsum": row_sum_weights, "voxel": voxel_weigh
 
 
 def weights_named(name: str, spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
-    """Return the weights of a configured method."""
+    """Weights of a configured method."""
     return METHODS[name](spheres, kernel, noise, threads)
 
 

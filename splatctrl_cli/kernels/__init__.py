@@ -31,7 +31,7 @@ native: Any = _best()
 
 
 def arithmetic() -> str:
-    """Return the plainest module with `native`'s bytes."""
+    """Plainest module with `native`'s bytes."""
     name: str = native.__name__.rpartition(".")[2]
     return "_native_v3" if name == "_native_v4" else name
 

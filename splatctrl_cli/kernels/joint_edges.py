@@ -84,7 +84,7 @@ class EdgeRoom:
         only_whole: bool,
         threads: int = 1,
     ) -> tuple[Float64, Int64]:
-        """Return the share (E,) of edges start (E, J) to end (E, J) proved free, and checks (E,).
+        """Share (E,) of edges start (E, J) to end (E, J) proved free, and checks (E,).
 
         A row that less `rounding` is below `contact` [m] collides; one that an edge does not move loses `still`
         [m]. The proof stops `give_up` [rad] before a collision. With only_whole, an edge not all free has share 0.
@@ -123,7 +123,7 @@ class EdgeRoom:
 
 
 def _parts(chain: Chain) -> tuple[Int64, Int64, Float64, Float64]:
-    """Return the part (S,) of each sphere; body (K,), middle (K, 3), radius (K,) [m] of each part."""
+    """Part (S,) of each sphere; body (K,), middle (K, 3), radius (K,) [m] of each part."""
     part = np.empty(len(chain.sphere_body), np.int64)
     bodies: list[int] = []
     middles: list[Float64] = []

@@ -23,7 +23,7 @@ class DepthImage:
 
 
 def pack_grid(origin: Float64, voxel: float, shape: tuple[int, ...]) -> Float64:
-    """Return a grid (7,) as the kernels take it."""
+    """Grid (7,) as the kernels take it."""
     return np.concatenate([origin, [voxel], shape]).astype(np.float64)
 
 

@@ -15,14 +15,14 @@ from splatctrl_cli.kernels import Float32, Float64, native
 def pack_camera(
     fx: float, fy: float, cx: float, cy: float, width: int, height: int, T_camera_world: Float64
 ) -> Float64:
-    """Return a camera (18,) as the kernels take it."""
+    """Camera (18,) as the kernels take it."""
     return np.concatenate(
         [[fx, fy, cx, cy, width, height], T_camera_world[:3, :3].ravel(), T_camera_world[:3, 3]]
     ).astype(np.float64)
 
 
 def empty_planes(height: int, width: int) -> Float32:
-    """Return planes (5, H, W) aligned so that a tile's row is one cache line."""
+    """Planes (5, H, W) aligned so that a tile's row is one cache line."""
     size = 5 * height * width
     memory = np.empty(size + 16, np.float32)
     first = -(memory.ctypes.data // 4) % 16
@@ -118,7 +118,7 @@ class ImageLoss:
         self._native: Any = native.ImageLoss()
 
     def evaluate(self, planes: Float32, view: TargetView, weights: LossWeights, out: Float32) -> LossTerms:
-        """Return the loss of planes (5, H, W); write its derivative to out (5, H, W)."""
+        """Loss of planes (5, H, W); write its derivative to out (5, H, W)."""
         height, width = view.depth.shape
         w = weights
         l1, dssim, error, transmittance, squared = self._native.evaluate(

@@ -19,7 +19,7 @@ class TriangleTree:
         self._native: Any = native.TriangleTree(np.ascontiguousarray(corners, np.float64))
 
     def closest(self, points: Float64, bound: Float64 | float = np.inf) -> tuple[Float64, Int64, Float64]:
-        """Return distance (N,) [m] and number (N,) of the triangle nearest to points (N, 3) [m].
+        """Distance (N,) [m] and number (N,) of the triangle nearest to points (N, 3) [m].
 
         Also its nearest points, barycentric (N, 3). Beyond `bound` (N,) [m]: infinite, -1, 0.
         """
@@ -38,7 +38,7 @@ class TriangleTree:
     def gaps(
         self, poses: Float64, centers: NDArray[np.floating], radii: NDArray[np.floating]
     ) -> tuple[Float64, Int64]:
-        """Return the signed gap (T,) [m] and number of the nearest ball, negative inside.
+        """Signed gap (T,) [m] and number of the nearest ball, negative inside.
 
         Balls (N, 3), (N,) [m]; poses (T, 4, 4): from their frame to the triangles'. Infinite and -1 without any.
         """

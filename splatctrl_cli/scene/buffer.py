@@ -117,7 +117,7 @@ class SplatBuffer:
         self.num_uncertain[slots] = 0
 
     def splats(self, num_threads: int) -> SplatSet:
-        """Return the live splats, in slot order."""
+        """Live splats, in slot order."""
         centers, radii, colors, opacities = unpack_parameters(self.parameters, num_threads)
         alive = self.is_alive
         return SplatSet(
@@ -130,7 +130,7 @@ class SplatBuffer:
         )
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Return the whole state, by name."""
+        """Whole state, by name."""
         return {
             "parameters": self.parameters,
             "first_moment": self.moments.first,

@@ -116,7 +116,7 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
 
 
 def workspace_of(arrays: Arrays) -> Box:
-    """Return the workspace of a fitter's state."""
+    """Workspace of a fitter's state."""
     lower, upper = np.asarray(arrays["workspace"], np.float64)
     return Box(lower=lower, upper=upper)
 

@@ -62,7 +62,7 @@ def contact_seeds(
     num_threads: int = 1,
     each: Each = map,
 ) -> Seeds:
-    """Return seeds on objects near the robot without a splat's centre within `contact_radius`.
+    """Seeds on objects near the robot without a splat's centre within `contact_radius`.
 
     Their radius is half of it: larger splats stand out of a plane by more than the gaps are deep. mappable: pixels
     (H, W) of each frame. The robot hides the contact, and depth edges have no return: the surface is assumed to

@@ -43,16 +43,16 @@ class Contradicted:
     through: Float32
 
     def pixels(self, shape: tuple[int, ...]) -> Bool:
-        """Return pixels (H, W) whose depth is on no surface."""
+        """Pixels (H, W) whose depth is on no surface."""
         return self._spread((self.until > 0) & ~self.is_blank, shape)
 
     def unproven(self, frame: RgbdFrame) -> RgbdFrame:
-        """Return the frame without depth that another's rays cross: it proves no free space."""
+        """Frame without depth that another's rays cross: it proves no free space."""
         is_through = self._spread(self.through > 0, frame.depth.shape)
         return replace(frame, depth=np.where(is_through, np.float32(0.0), frame.depth)) if is_through.any() else frame
 
     def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Float64:
-        """Return points (K, 3) [m], world, half a voxel apart, on its rays before that surface."""
+        """Points (K, 3) [m], world, half a voxel apart, on its rays before that surface."""
         end = np.maximum(self.until, self.through)
         v, u = np.nonzero((end > 0) & (self.is_blank == is_blank))
         depths = np.arange(config.min_range, end.max(initial=config.min_range), 0.5 * config.voxel)
@@ -108,7 +108,7 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
 
 
 def without_contradicted(mask: SelfMask, found: Contradicted) -> SelfMask:
-    """Return the mask with contradicted depth marked."""
+    """Mask with contradicted depth marked."""
     pixels = found.pixels(mask.kinds.shape)
     return replace(mask, kinds=np.where(pixels, np.uint8(PixelKind.CONTRADICTED), mask.kinds))
 
@@ -118,7 +118,7 @@ def _side(frame: RgbdFrame) -> int:
 
 
 def _blocks(image: NDArray[T], side: int) -> NDArray[T]:
-    """Return the pixels (h, w, side^2) of an image's blocks."""
+    """Pixels (h, w, side^2) of an image's blocks."""
     h, w = (size // side for size in image.shape)
     parts = image[: h * side, : w * side].reshape(h, side, w, side)
     return parts.swapaxes(1, 2).reshape(h, w, side * side)
@@ -169,7 +169,7 @@ class _Rays:
 
 
 def _side_by_side(depths: Float32, least: int) -> Float32:
-    """Return depths (h, w) [m] of blocks and neighbours, in groups of at least `least`."""
+    """Depths (h, w) [m] of blocks and neighbours, in groups of at least `least`."""
     wide = cv2.dilate(depths, BESIDE)
     num, piece = cv2.connectedComponents((wide > 0).view(np.uint8), connectivity=8)
     counts = np.bincount(piece[depths > 0], minlength=num)

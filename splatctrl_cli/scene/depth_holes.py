@@ -70,7 +70,7 @@ def _on_rays(
 
 
 def _holes(is_blank: Bool, is_end: Bool) -> Bool:
-    """Return pixels (H, W) without depth, in groups that meet neither border nor `is_end`."""
+    """Pixels (H, W) without depth, in groups that meet neither border nor `is_end`."""
     _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
     return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)

@@ -107,7 +107,7 @@ class Descent:
         return Rendering(color=np.moveaxis(planes[:3], 0, 2), depth=planes[3], opacity=planes[4])
 
     def evaluate(self, view: View) -> LossTerms:
-        """Return the loss of a view."""
+        """Loss of a view."""
         planes = self.planes(view)
         return self._loss.evaluate(planes, view.target, self._weights(), empty_planes(*view.target.depth.shape))
 
@@ -115,7 +115,7 @@ class Descent:
         return loss_weights(self._config, self.background or BLACK)
 
     def settings(self, rate: float = 1.0, geometry: float = 1.0) -> OptimiserSettings:
-        """Return learning rates times `rate`, of centre and radius times `geometry`."""
+        """Learning rates times `rate`, of centre and radius times `geometry`."""
         c = self._config
         return OptimiserSettings(
             lr_center=c.lr_center * geometry,
@@ -131,7 +131,7 @@ class Descent:
         )
 
     def misfits(self, views: Sequence[View]) -> tuple[list[Misfit], Float64]:
-        """Return each view's colour error where mappable, and each slot's summed blended opacity (M,).
+        """Colour error of each view where mappable, and summed blended opacity of each slot (M,).
 
         The derivative of a summed colour plane by a splat's colour is the sum of its weights.
         """

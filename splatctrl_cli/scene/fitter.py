@@ -223,7 +223,7 @@ class SceneFitter:
         return self.buffer.splats(self.num_threads)
 
     def shell_splats(self) -> SplatSet | None:
-        """Return splats beyond the workspace, for pictures only."""
+        """Splats beyond the workspace, for pictures only."""
         return None if self.shell is None else self.shell.splats()
 
     @property
@@ -246,11 +246,11 @@ class SceneFitter:
         self._unrepresented = balls
 
     def known_voxels(self) -> KnownVoxels:
-        """Return the present knowledge of space."""
+        """Present knowledge of space."""
         return self.occupancy.known(self.unrepresented)
 
     def view(self, frame: RgbdFrame, mask: SelfMask | None = None) -> View:
-        """Return a frame as the optimiser takes it."""
+        """Frame as the optimiser takes it."""
         min_range = self.occupancy.config.min_range
         mappable = inside_workspace(frame, world_points(frame), self.workspace, min_range)
         reach = NEAREST_REACH * (self.config.scale or 1.0)
@@ -268,7 +268,7 @@ class SceneFitter:
                 self.window.newest = [self.view(view.frame) for view in self.window.newest]
 
     def _behind(self, views: Sequence[View]) -> Color:
-        """Return the colour of pixels without depth, or without any depth, of pixels without splats."""
+        """Colour of pixels without depth, or without any depth, of pixels without splats."""
         if self.config.background == "black":
             return BLACK
         counted = [view.target.counted > 0 for view in views]

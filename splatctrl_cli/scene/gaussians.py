@@ -20,7 +20,7 @@ PER_CHANNEL = 16  # harmonics
 
 
 def parameters_of(gaussians: GaussianSet) -> Float32:
-    """Return parameters (N, 59); opacities 0 and 1 become the nearest finite logit."""
+    """Parameters (N, 59); opacities 0 and 1 become the nearest finite logit."""
     rows = np.zeros((len(gaussians), NUM_PARAMETERS), np.float32)
     rows[:, CENTER] = gaussians.centers
     rows[:, LOG_SCALE] = np.log(gaussians.scales)

@@ -46,7 +46,7 @@ def make_view(
     is_robot: Bool | None = None,
     reach: float = NEAREST_REACH,
 ) -> View:
-    """Return a view of `frame`; `mappable` (H, W): pixels with depth in the workspace.
+    """View of `frame`; `mappable` (H, W): pixels with depth in the workspace.
 
     Pixels without depth count in the colour loss. Pixels that are invalid, `mounted`, or outside the workspace do
     not count.
@@ -81,7 +81,7 @@ def seen_through(
 
 
 def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
-    """Return centres (N, 3) [m], world, those that float up to `most` [m] put on the surface.
+    """Centres (N, 3) [m], world, those that float up to `most` [m] put on the surface.
 
     A centre floats if all views that see it measure more depth around its pixel. It moves along the ray with the
     smallest step. A view with depth over `most` before the centre does not see it.
@@ -102,7 +102,7 @@ def on_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
 def kept_radii(
     centers: Float32, radii: Float32, views: Sequence[View], tolerance: float, least: float, num_threads: int = 1
 ) -> Float32:
-    """Return radii (N,) [m] that keep spheres within measured depth, at least `least` [m].
+    """Radii (N,) [m] that keep spheres within measured depth, at least `least` [m].
 
     A sphere shrinks while a point of its edge floats by `tolerance` [m] before depth around its pixel in some view.
     So it does while its nearest point floats before the centre pixel's depth.
@@ -153,7 +153,7 @@ class Window:
         return metres > self.config.keyframe_distance or degrees > self.config.keyframe_angle
 
     def schedule(self, num_iterations: int, rng: np.random.Generator) -> list[View]:
-        """Return each iteration's view, in shuffled rounds of newest views and as many keyframes."""
+        """View of each iteration: shuffled rounds of newest views and as many keyframes."""
         views: list[View] = []
         while len(views) < num_iterations:
             count = min(len(self.keyframes), max(len(self.newest), 1))

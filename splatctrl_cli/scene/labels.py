@@ -40,7 +40,7 @@ def relabel(
 
 
 def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture, seen: Seen) -> tuple[Bool, Bool]:
-    """Return splats (M,) of the robot, and those that a pixel shows to be an object.
+    """Splats (M,) of the robot, and those that a pixel shows to be an object.
 
     The pixel whose depth a splat explains best decides. Splats that no pixel shows keep their label, since the
     robot hides objects; its own must be within `see_through` of its body. Others well inside the body become robot,
@@ -60,7 +60,7 @@ def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPostu
 
 
 def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
-    """Return the `PixelKind` (N,) of the pixel with depth nearest to centers (N, 3) [m], world.
+    """`PixelKind` (N,) of the pixel with depth nearest to centers (N, 3) [m], world.
 
     OBJECT within `see_through`, unless nearer to the rendered robot; ROBOT within its tolerance, without what it
     occludes; else NOTHING.
@@ -82,7 +82,7 @@ def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
 
 
 def human_splats(buffer: SplatBuffer, occupancy: OccupancyMap) -> Bool:
-    """Return splats (M,) in voxels that human pixels hit.
+    """Splats (M,) in voxels that human pixels hit.
 
     They stay human while one of the eight nearest voxels is: the surface is a voxel thick, and splats move.
     """

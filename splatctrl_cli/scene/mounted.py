@@ -14,7 +14,7 @@ from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 
 
 def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """Return at most `MOUNTED_MAX_VIEWS` frames, more than `MOUNTED_APART` apart."""
+    """At most `MOUNTED_MAX_VIEWS` frames, more than `MOUNTED_APART` apart."""
     chosen: list[RgbdFrame] = []
     places: list[Float64] = []
     for frame in frames:

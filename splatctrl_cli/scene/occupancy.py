@@ -192,7 +192,7 @@ class OccupancyMap:
         return bits
 
     def occupancy_around(self, points_world: Float32) -> tuple[Float32, Bool]:
-        """Return the largest occupancy (N,) of the eight nearest voxels; True if one was seen.
+        """Largest occupancy (N,) of the eight nearest voxels; True if one was seen.
 
         The eight reach half a voxel to all sides: a surface that near supports a splat. Never-seen ones count only
         if all are (one half).
@@ -220,7 +220,7 @@ class OccupancyMap:
         return np.asarray(self.entity.reshape(-1)[voxels] & (SWEPT | SOLID) == SWEPT)
 
     def swept_box(self) -> Box | None:
-        """Return the box of the robot's path so far; None without any."""
+        """Box of the robot's path so far; None without any."""
         is_swept = self.entity & SWEPT > 0
         found = [np.flatnonzero(is_swept.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
         if not len(found[0]):
@@ -238,7 +238,7 @@ class OccupancyMap:
         return self.centers_of(self.occupied_voxels())
 
     def grid(self) -> OccupancyGrid:
-        """Return a copy of the present grid."""
+        """Copy of the present grid."""
         return OccupancyGrid(
             origin=self.origin.copy(),
             voxel=self.config.voxel,
@@ -248,7 +248,7 @@ class OccupancyMap:
         )
 
     def known(self, unrepresented: Balls) -> KnownVoxels:
-        """Return the present knowledge of space."""
+        """Present knowledge of space."""
         return KnownVoxels(
             grid=self.grid(),
             last_seen=self.last_seen.copy(),

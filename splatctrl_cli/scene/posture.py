@@ -29,7 +29,7 @@ class RobotPosture:
     num_threads: int = 1
 
     def seen_at(self, stamp_ns: int) -> tuple[RobotSurface, Float64]:
-        """Return the surface and its links' poses (L, 4, 4) at a stamp, else of the spheres."""
+        """Surface and its links' poses (L, 4, 4) at a stamp, else of the spheres."""
         if self.surface is None:
             return RobotSurface.of_balls(self.centers, self.radii), np.eye(4)[None]
         return self.surfaces.get(stamp_ns, self.surface), self.T_world_surface[stamp_ns]
@@ -56,7 +56,7 @@ class RobotPosture:
 def posture_of(
     robot: RobotModel, q: Float64, at_frames: Mapping[int, Float64], carried: Sequence[tuple[str, Box]] = ()
 ) -> RobotPosture:
-    """Return the robot at joint positions q (J,), and at those of frame stamps [ns].
+    """The robot at joint positions q (J,), and at those of frame stamps [ns].
 
     carried: boxes in link frames, part of its surface.
     """

@@ -49,7 +49,7 @@ CAUSES = (
 
 
 def agreements(frames: Sequence[RgbdFrame], min_range: float, max_range: float) -> list[Agreement]:
-    """Return the agreement of camera pairs with enough common pixels, in a still scene.
+    """Agreement of camera pairs with enough common pixels, in a still scene.
 
     Views of one camera are paired, too. Depth counts from `min_range` to `max_range` [m].
     """
@@ -109,7 +109,7 @@ class PoseJump:
 
 
 def largest_jump(poses: Iterable[tuple[int, str, Float64]]) -> PoseJump | None:
-    """Return a camera's longest move between frames within a second; None without any.
+    """Longest move of a camera between frames within a second; None without any.
 
     poses: stamp [ns], camera and T_world_camera, by stamp.
     """

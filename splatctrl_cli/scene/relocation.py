@@ -16,7 +16,7 @@ from splatctrl_cli.scene.seeding import NO_SEEDS, candidates, thinned, thinning
 
 
 def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> tuple[Float64, Float64]:
-    """Return opacity (N,) and radius (N,) [m] of each of `count` (N,) coinciding copies.
+    """Opacity (N,) and radius (N,) [m] of each of `count` (N,) coinciding copies.
 
     The peak is conserved, `a = 1 - (1 - alpha)^(1/N)`, and the blended opacity over the screen, `r' = r sqrt(alpha
     / sum_{i=1..N} (1 - (1 - a)^i) / i)`: the 2-D rule. The 1-D rule of 3DGS-MCMC (Kheradmand et al. 2024, eq. 9)
@@ -79,7 +79,7 @@ def use_idle(
 
 
 def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:
-    """Return at most `num_seeds` pixel-sized seeds on measured surfaces, drawn by squared colour error.
+    """At most `num_seeds` pixel-sized seeds on measured surfaces, drawn by squared colour error.
 
     The error is a 3 x 3 mean, weighted by a pixel's area of surface. Seeds keep their diameters apart, as views
     share spots.
@@ -136,7 +136,7 @@ def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: NDArray[
 
 
 def _apart(points: Float32, distances: Float32) -> NDArray[np.intp]:
-    """Return indices of points (K, 3) not within the distance (K,) of earlier kept ones."""
+    """Indices of points (K, 3) not within the distance (K,) of earlier kept ones."""
     is_taken = np.zeros(len(points), bool)
     neighbours = cKDTree(points).query_ball_point(points, distances)
     kept = []

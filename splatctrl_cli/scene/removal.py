@@ -15,7 +15,7 @@ REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain"
 
 
 def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH, is_robot: Bool | None = None) -> Float32:
-    """Return the least valid depth (H, W) [m] within `reach` [m] of each pixel; inf without any.
+    """Least valid depth (H, W) [m] within `reach` [m] of each pixel; inf without any.
 
     `reach` is at the median depth. Robot pixels count only for themselves and neighbours: beside the robot, what is
     before all else floats.
@@ -31,7 +31,7 @@ def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH, is_robot: Bool
 
 
 def least_around(depth: Float32, half: int) -> Float32:
-    """Return the least value (H, W) within `half` pixels."""
+    """Least value (H, W) within `half` pixels."""
     window = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
     return np.asarray(cv2.erode(depth, window, borderType=cv2.BORDER_REPLICATE), np.float32)
 
@@ -46,7 +46,7 @@ def removals(
     is_floating: Bool,
     counts_time: bool = True,
 ) -> dict[str, Bool]:
-    """Return masks (M,) of live splats to remove, each under its first reason in `REASONS`.
+    """Masks (M,) of live splats to remove, each under its first reason in `REASONS`.
 
     broken: not finite. workspace: outside. opacity: below alpha_min. free: all voxels around observed free.
     seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 beyond the patience. trail: was
@@ -97,7 +97,7 @@ def _verdict(value: Float32, is_observed: Bool, config: OccupancyConfig) -> tupl
 def room_for(
     seeds: Seeds, num: int, buffer: SplatBuffer, occupancy: OccupancyMap, shown: Float64, tolerance: float
 ) -> tuple[Bool, Seeds]:
-    """Return slots (M,) of at most `num` splats to evict, and the seeds in order of slots.
+    """Slots (M,) of at most `num` splats to evict, and the seeds in order of slots.
 
     Only object splats go: redundant ones that show least, then those far from the robot's path, for seeds near it.
     shown (M,): how much slots show; tolerance [m]: as in `redundant`.
@@ -127,7 +127,7 @@ def redundant(
     tolerance: float,
     num_threads: int = 1,
 ) -> NDArray[np.intp]:
-    """Return at most `num_wanted` splats of `order` that others can replace.
+    """At most `num_wanted` splats of `order` that others can replace.
 
     splats: N of objects and people; voxels (K, 3) [m]: occupied centres. A splat represents voxels within
     `tolerance` [m] of its sphere, among the eight nearest centres. It may go if all its voxels keep another: this
@@ -153,7 +153,7 @@ def redundant(
 
 
 def far_away(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> NDArray[np.intp]:
-    """Return at most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
+    """At most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
 
     Each is EVICT_NEARER farther from the path than its seed: no two surfaces exchange slots in turn.
     """

@@ -30,7 +30,7 @@ class Rendering:
         return normalised_depth(self.depth, self.opacity)
 
     def before(self, background: Color) -> "Rendering":
-        """Return the view before one colour: color + (1 - opacity) background."""
+        """View before one colour: color + (1 - opacity) background."""
         behind = (1.0 - self.opacity)[..., None] * np.array(background, np.float32)
         return replace(self, color=self.color + behind)
 
@@ -42,7 +42,7 @@ def normalised_depth(depth: Float32, opacity: Float32) -> Float32:
 
 
 def camera_array(intrinsics: Intrinsics, T_world_camera: Float64) -> Float64:
-    """Return the camera (18,) that the kernels take."""
+    """Camera (18,) that the kernels take."""
     k = intrinsics
     return pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, invert_transform(T_world_camera))
 
@@ -63,7 +63,7 @@ def render(splats: SplatSet, intrinsics: Intrinsics, T_world_camera: Float64, *,
 
 
 def loss_weights(config: SceneConfig, background: Color = BLACK) -> LossWeights:
-    """Return the image loss's weights, with the colour behind the splats."""
+    """Weights of the image loss, and the colour behind the splats."""
     return LossWeights(
         dssim=config.lambda_dssim,
         color=config.lambda_color,

@@ -60,7 +60,7 @@ class RecordedDepth:
 
 
 def depth_noise(images: Sequence[Float32]) -> float:
-    """Return the standard deviation [1/m] of one camera's inverse depth (H, W); 0 if unknown.
+    """Standard deviation [1/m] of one camera's inverse depth (H, W); 0 if unknown.
 
     At depth z, that is times z^2, as in disparity sensors (Khoshelham and Elberink 2012: 1.425e-3 of a Kinect).
     Inverse depth of a plane is linear in the pixel: residuals of linear fits to blocks are noise, and a low
@@ -88,7 +88,7 @@ def _linear_noise(images: Sequence[Float32], times: int) -> float:
 
 
 def _block_side(depth: Float32) -> int:
-    """Return a block's side: wide enough for noise that neighbours share."""
+    """Side of a block: wide enough for noise that neighbours share."""
     return int(max(depth.shape[1] // NOISE_BLOCKS, NOISE_LEAST_SIDE))
 
 

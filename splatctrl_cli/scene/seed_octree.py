@@ -47,7 +47,7 @@ class CubeLevel:
 def cube_levels(
     points: Float32, colors: Float32, edge: float, num_levels: int, num_threads: int = 1
 ) -> list[CubeLevel]:
-    """Return cubes of edges `edge`, `edge` / 2, … [m] over points (K, 3) with colours (K, 3)."""
+    """Cubes of edges `edge`, `edge` / 2, … [m] over points (K, 3) with colours (K, 3)."""
     levels: list[CubeLevel] = []
     above = np.zeros(len(points), np.int32)
     for level in range(num_levels):
@@ -61,7 +61,7 @@ def cube_levels(
 
 
 def leaves(levels: Sequence[CubeLevel], tolerance: float) -> list[Bool]:
-    """Return masks (K,) per level of standing cubes: one splits while its detail exceeds `tolerance`."""
+    """Masks (K,) per level of standing cubes: one splits while its detail exceeds `tolerance`."""
     masks = []
     is_reached = np.ones(len(levels[0].points), bool)
     for level, below in zip(levels, [*levels[1:], None], strict=True):
@@ -75,7 +75,7 @@ def leaves(levels: Sequence[CubeLevel], tolerance: float) -> list[Bool]:
 
 
 def tolerance_for(levels: Sequence[CubeLevel], count: int) -> float:
-    """Return the least tolerance (to 1 %) for at most `count` cubes; infinite if the coarsest exceed it."""
+    """Least tolerance (to 1 %) for at most `count` cubes; infinite if the coarsest exceed it."""
     if len(levels[0].points) > count:
         return float("inf")
     low, high = 1e-6, float(max(level.detail.max() for level in levels)) + 1e-6

@@ -75,7 +75,7 @@ def thinning(masks: Iterable[Bool]) -> int:
 
 
 def thinned(mask: Bool, every: int) -> Bool:
-    """Return every n-th pixel of a mask (H, W), in row order."""
+    """Every n-th pixel of a mask (H, W), in row order."""
     if every == 1:
         return mask
     kept = np.zeros(mask.size, bool)
@@ -84,7 +84,7 @@ def thinned(mask: Bool, every: int) -> Bool:
 
 
 def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Candidates:
-    """Return the candidates in a mask (H, W)."""
+    """Candidates in a mask (H, W)."""
     focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
     colors = frame.color[mask].astype(np.float32) / 255.0
     return Candidates(
@@ -106,7 +106,7 @@ class SeedDensity:
 
 
 def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig, num_threads: int = 1) -> SeedDensity:
-    """Return the density that spends at most `count` seeds on the candidates.
+    """Density that spends at most `count` seeds on the candidates.
 
     The edge starts at what the largest splats cover, and grows by 5 % while cubes are too many, up to the cloud's
     extent.
@@ -127,7 +127,7 @@ def seeds_at(
     config: SceneConfig,
     num_threads: int = 1,
 ) -> Seeds:
-    """Return one seed per standing cube over the candidates, finest cubes first.
+    """One seed per standing cube over the candidates, finest cubes first.
 
     None is within 0.7 edges of a live splat (L, 3): blended depth at silhouettes would ask for seeds forever. The
     paper's radius min(D/f, r_max) is one pixel. For a smaller budget, r = min(max(radius_per_edge * edge, D/f),
@@ -152,7 +152,7 @@ def gap_seeds(
     num_threads: int = 1,
     each: Each = map,
 ) -> Seeds:
-    """Return seeds where a measured surface is further than `max_gap` [m] from every sphere.
+    """Seeds where a measured surface is further than `max_gap` [m] from every sphere.
 
     Blending covers pixels with distant splats; a distance field shows the gap. Every `stride`-th pixel and row of
     the views is checked (by default every third or fewer, about half of `max_gap`). So are occupied centres (K, 3),

@@ -64,7 +64,7 @@ class SelfMask:
 
 
 def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
-    """Return the self-mask of a frame, with the robot's pose at its stamp.
+    """Self-mask of a frame, with the robot's pose at its stamp.
 
     A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths nearby:
     as many pixels as the tolerance spans, as surfaces slant and calibration shifts outlines. So is a point this
@@ -166,7 +166,7 @@ def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Flo
 def settled(
     frame: RgbdFrame, mask: SelfMask, others: Sequence[tuple[RgbdFrame, SelfMask]], config: OccupancyConfig
 ) -> SelfMask:
-    """Return the mask with each doubted piece decided: object or mixed.
+    """Mask with each doubted piece decided: object or mixed.
 
     It is an object if one of `others` measured half of it, or if there are none. others: other cameras' frames, and
     settled ones of the last time step.
@@ -190,7 +190,7 @@ def settled(
 
 
 def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: float) -> list[SelfMask]:
-    """Return the masks of one time step without object pixels that robot pixels outvote.
+    """Masks of one time step without object pixels that robot pixels outvote.
 
     All frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
     object pixels are outline or noise, and become mixed.
@@ -221,7 +221,7 @@ def voted(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: fl
 
 
 def pixels_at(frame: RgbdFrame, points: Float32 | Float64) -> tuple[Index, Float32]:
-    """Return flat pixel indices (N,), -1 outside, and depths (N,) [m] of points (N, 3) [m], world."""
+    """Flat pixel indices (N,), -1 outside, and depths (N,) [m] of points (N, 3) [m], world."""
     k = frame.intrinsics
     there = transform_points(invert_transform(frame.T_world_camera), points)
     z = there[:, 2].astype(np.float32)
@@ -252,7 +252,7 @@ def _grown(box: tuple[slice, slice], pixels: int, shape: tuple[int, ...]) -> tup
 
 
 def object_mask(frame: RgbdFrame) -> SelfMask:
-    """Return the mask without a known robot: all depth is object."""
+    """Mask without a known robot: all depth is object."""
     return SelfMask(
         kinds=(frame.depth > 0).view(np.uint8),
         robot_depth=_nothing_rendered(frame.depth.shape),
@@ -270,18 +270,18 @@ def _nothing_rendered(shape: tuple[int, int]) -> Float32:
 
 
 def of_label(mask: SelfMask, label: Label) -> Bool:
-    """Return the pixels (H, W) of the robot, or of objects."""
+    """Pixels (H, W) of the robot, or of objects."""
     return np.asarray(mask.kinds == (PixelKind.ROBOT if label == Label.ROBOT else PixelKind.OBJECT))
 
 
 def without(frame: RgbdFrame, mask: SelfMask, kind: PixelKind) -> RgbdFrame:
-    """Return the frame with depth 0 in pixels of a kind."""
+    """Frame with depth 0 in pixels of a kind."""
     is_of_it = mask.kinds == kind
     return replace(frame, depth=np.where(is_of_it, np.float32(0.0), frame.depth)) if is_of_it.any() else frame
 
 
 def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = MASK_SIGMAS) -> Float32:
-    """Return how far [m] measured depth of the robot may be from rendered depth."""
+    """Largest difference [m] of the robot's measured and rendered depth."""
     return np.asarray(config.self_mask_tolerance + sigmas * config.depth_error * depth * depth, np.float32)
 
 
@@ -304,7 +304,7 @@ class LinkResidual:
 
 
 def link_residuals(masks: Sequence[SelfMask]) -> dict[str, LinkResidual]:
-    """Return the residual of each link that a mask saw."""
+    """Residual of each link that a mask saw."""
     links = dict.fromkeys(link for mask in masks for link in [*mask.residuals, *mask.num_inside])
     found = {}
     for link in links:
@@ -336,7 +336,7 @@ def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
 
 
 def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -> dict[str, Any]:
-    """Return the self-mask's part of ``run.json``, over all time steps.
+    """Part of the self-mask in ``run.json``, over all time steps.
 
     `self_mask`: by link, median residual and reach [mm], and pixels; `self_mask_residual_mm`: the largest of judged
     links, None without any; `inside_robot_points`, with the first step and link. Links with `MASK_PIXELS` are
@@ -372,7 +372,7 @@ def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -
 
 
 def nearest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:
-    """Return the least depth (H, W) of chosen pixels within `reach` pixels, else inf."""
+    """Least depth (H, W) of chosen pixels within `reach` pixels, else inf."""
     kept = np.full(depth.shape, np.inf, np.float32)
     cv2.copyTo(depth, chosen.view(np.uint8), kept)
     return _least_within(kept, reach)
@@ -383,7 +383,7 @@ def _least_within(image: Float32, reach: int) -> Float32:
 
 
 def farthest_within(depth: Float32, reach: int) -> Float32:
-    """Return the greatest depth (H, W) within `reach` pixels, else 0."""
+    """Greatest depth (H, W) within `reach` pixels, else 0."""
     return np.asarray(cv2.dilate(depth, _window(reach)), np.float32)
 
 
@@ -392,7 +392,7 @@ def _window(reach: int) -> UInt8:
 
 
 def pixels_of(length: float, frame: RgbdFrame, rendered: Float32) -> int:
-    """Return the pixels that a length [m] spans at the robot's median depth, at least 1."""
+    """Pixels that a length [m] spans at the robot's median depth, at least 1."""
     some = rendered[::4, ::4]
     depths = some[some > 0] if some.any() else rendered[rendered > 0]
     if not len(depths):

@@ -13,7 +13,7 @@ from splatctrl_cli.records import Bool, RgbdFrame
 def steadied(
     frame: RgbdFrame, before: tuple[RgbdFrame, Bool] | None, is_object: Bool, config: OccupancyConfig
 ) -> tuple[RgbdFrame, Bool]:
-    """Return the frame with a running mean of its depth, and its steady pixels (H, W).
+    """Frame with a running mean of its depth, and its steady pixels (H, W).
 
     An object pixel is steady if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2. Depths around
     it may change by `STEADY_MOVED` `depth_error` z^2 on average: a moving surface lags no more. Only what was an

@@ -31,7 +31,7 @@ def shadowed(depth: Float32, focal: float) -> Bool:
 
 
 def _baseline(depth: Float32, following: Index, focal: float) -> float:
-    """Return the baseline [m] of shadows left of nearer objects; 0 without any.
+    """Baseline [m] of shadows left of nearer objects; 0 without any.
 
     following (H, W): column of the next depth, W = none. Each step nearer by `SHADOW_STEP` gives a baseline by its
     lost pixels. The median is of the higher half, weighted by height: fattened outlines cover low steps' shadows.

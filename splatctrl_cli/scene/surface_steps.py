@@ -10,7 +10,7 @@ from splatctrl_cli.records import Bool, Float32
 def surface_steps(
     is_object: Bool, depth: Float32, is_edge: Bool, edge: int, tolerance: Float32, depth_error: float
 ) -> Float32:
-    """Return the largest depth step (H, W) [m] from each pixel to a neighbour on its surface.
+    """Largest depth step (H, W) [m] from each pixel to a neighbour on its surface.
 
     It is `MASK_STEP`, except in the robot's outline (is_edge), `edge` pixels wide: mixed pixels there would lead
     from robot to background in small steps. An object pixel off its plane by more than `tolerance` (H, W) [m] gets

@@ -153,14 +153,14 @@ def _time_step(frames: Sequence[RgbdFrame], joints: JointState | None) -> TimeSt
 
 
 def cloud_box(cloud: PointCloud) -> Box:
-    """Return the box of a cloud, widened by 5 % and 5 cm per side."""
+    """Box of a cloud, widened by 5 % and 5 cm per side."""
     lower, upper = cloud.points.min(axis=0).astype(np.float64), cloud.points.max(axis=0).astype(np.float64)
     margin = 0.05 * (upper - lower) + 0.05
     return Box(lower=lower - margin, upper=upper + margin)
 
 
 def depth_box(frames: Sequence[RgbdFrame], max_range: float, scale: float = 1.0) -> Box:
-    """Return the box of valid depth up to `max_range` [m], without the outer 0.5 % per side.
+    """Box of valid depth up to `max_range` [m], without the outer 0.5 % per side.
 
     It is widened by 2 % and 2 cm times `scale`. Raises InputError without valid depth.
     """

@@ -19,7 +19,7 @@ from splatctrl_cli.voxels import SWEPT, Balls, KnownVoxels, VoxelState
 
 
 def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: SceneConfig, error: float = 0.0) -> Balls:
-    """Return the occupied voxels that no splat represents, as balls labelled human or object.
+    """Occupied voxels that no splat represents, as balls labelled human or object.
 
     A splat represents voxels with centres within `representing_reach` of its sphere, among the eight nearest. error
     [m]: of the sensor. Robot splats do not count: fields leave them out.
@@ -36,7 +36,7 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
 
 
 def confirmed(found: Balls, before: Balls | None) -> Balls:
-    """Return balls that touch in groups of `BARE_GROUP` or more, or that were found before.
+    """Balls that touch in groups of `BARE_GROUP` or more, or that were found before.
 
     Smaller groups are often noise or gaps not yet filled. before: of the last time step, None in the first.
     """
@@ -53,7 +53,7 @@ def confirmed(found: Balls, before: Balls | None) -> Balls:
 
 
 def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) -> float:
-    """Return how far [m] a voxel's centre may be from a sphere that represents it.
+    """Largest distance [m] of a voxel's centre from a sphere that represents it.
 
     That is `max_gap` and half a voxel, as in gap filling, plus the sensor's error [m]; at most a voxel's diagonal.
     """
@@ -113,7 +113,7 @@ class GridAgreement:
 def agreement_with_grid(
     splats: SplatSet, known: KnownVoxels, scene: SceneConfig, occupancy: OccupancyConfig
 ) -> GridAgreement:
-    """Return how well splats agree with the voxels of their map or snapshot.
+    """Agreement of splats with the voxels of their map or snapshot.
 
     Swept voxels are left out. Both shares detect wrong units or moved splats, `represented` missing ones.
     """

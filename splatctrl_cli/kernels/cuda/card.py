@@ -16,7 +16,7 @@ MANY = 20  # replays in a graph: to launch one costs the host as much as a small
 
 
 def _check(result: tuple[Any, ...]) -> Any:
-    """Return a driver call's values, or raise."""
+    """Values of a driver call; raises its error."""
     status, *values = result
     if status == driver.CUresult.CUDA_SUCCESS:
         return values if len(values) > 1 else values[0] if values else None
@@ -109,7 +109,7 @@ class CudaDevice:
             launch(target, config, self._codes[one.source].get_kernel(one.kernel), *one.arguments)
 
     def seconds(self, graph: Graph, num_times: int) -> float:
-        """Return a replay's mean time on the device."""
+        """Mean time of a replay on the device."""
         before, after = (self._device.create_event({"timing_enabled": True}) for _ in range(2))
         self._stream.record(before)
         graph.run(num_times)

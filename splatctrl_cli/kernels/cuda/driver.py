@@ -28,14 +28,14 @@ class Card:
 
 
 def num_cards() -> int:
-    """Return the number of cards; none is woken: the process may still fork."""
+    """Number of cards; none is woken, so that the process may still fork."""
     with suppress(OSError):
         return len([*CARDS.iterdir()])
     return 0
 
 
 def usable_card(index: int = 0) -> Card:
-    """Return the card of that number. Raises DeviceError with a remedy."""
+    """Card of that number. Raises DeviceError with a remedy."""
     try:
         cuda: Any = ctypes.CDLL(LIBRARY)
     except OSError as error:
@@ -74,7 +74,7 @@ def usable_card(index: int = 0) -> Card:
 
 
 def _driver_version() -> str:
-    """Return the version, such as 580.159.04, or an empty string."""
+    """Version, such as 580.159.04, or an empty string."""
     with suppress(OSError):
         if found := re.search(r"\b\d{3,}\.\d+(\.\d+)?\b", VERSION_FILE.read_text()):
             return found[0]

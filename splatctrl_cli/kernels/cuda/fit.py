@@ -46,7 +46,7 @@ class _DeviceView:
 
 
 def camera_row(camera: Float64) -> Array:
-    """Return a `pack_camera` camera as the kernels read it."""
+    """`pack_camera` camera as the kernels read it."""
     row = np.zeros((), CAMERA)
     row["floats"], row["size"], row["T_camera_world"] = camera[:4], camera[4:6], camera[6:18]
     return row
@@ -58,7 +58,7 @@ def bytes_needed(
     list_capacity: int = LIST_CAPACITY,
     splat_tiles: float = SPLAT_TILES,
 ) -> int:
-    """Return a fit's bytes, of N splats and views of `sizes` (H, W)."""
+    """Bytes of a fit of N splats to views of `sizes` (H, W)."""
     splats = (sum(STATE.values()) * 2 + sum(WORK.values()) + 4 * NUM_SUMS * splat_tiles) * num_splats
     tiles = [-(-height // TILE) * -(-width // TILE) for height, width in set(sizes)]
     pixels = sum(sum(PIXEL.values()) * height * width for height, width in set(sizes))
@@ -148,7 +148,7 @@ class DeviceFit:
         return len(self.views) - 1
 
     def number_of(self, camera: Float64, target: TargetView) -> int:
-        """Return a view's number, added if its target is new."""
+        """Number of a view, added if its target is new."""
         known = (k for k, view in enumerate(self.views) if view.target is target)
         number = next(known, None)
         return self.add_view(camera, target) if number is None else number
@@ -192,7 +192,7 @@ class DeviceFit:
                 return self.read_image("planes", view, 5)
 
     def gradients(self, view: int, weights: LossWeights, settings: OptimiserSettings) -> tuple[Float32, LossTerms]:
-        """Return the loss and its derivatives (N, 8); parameters stay."""
+        """Loss and its derivatives (N, 8); parameters stay."""
         height, width = self.views[view].height, self.views[view].width
         while True:
             self.rewind([view], weights, settings, 0)
@@ -223,7 +223,7 @@ class DeviceFit:
         }  # fmt: skip
 
     def _room(self, name: str, num_bytes: int) -> int:
-        """Return the address of named memory; growing loses its content."""
+        """Address of named memory; growing loses its content."""
         if self._sizes.get(name, -1) < num_bytes:
             if name in self._addresses:
                 self.device.free(self._addresses.pop(name))
@@ -321,7 +321,7 @@ class DeviceFit:
         return known
 
     def launches(self, height: int, width: int, gradients: int = 0) -> list[Launch]:
-        """Return one iteration's launches; gradients: their address, or 0 to step."""
+        """Launches of one iteration; gradients: their address, or 0 to step."""
         at: Callable[[str], int] = self._addresses.__getitem__
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         patches_x, patches_y = -(-width // PATCH), -(-height // PATCH)

@@ -44,10 +44,10 @@ class Memory(Protocol):
     """A device's memory; addresses are int."""
 
     def allocate(self, num_bytes: int) -> int:
-        """Return the address of zeroed memory. Raises OutOfMemory."""
+        """Address of zeroed memory. Raises OutOfMemory."""
 
     def available(self) -> int:
-        """Return the free bytes."""
+        """Number of free bytes."""
 
     def free(self, address: int) -> None:
         """Free memory."""

@@ -17,7 +17,7 @@ FOLDERS = (HERE / "src", HERE / "include", HERE.parent / "src")  # as #include l
 
 @cache
 def source_digest() -> bytes:
-    """Return the digest of all files that kernels may include."""
+    """Digest of all files that kernels may include."""
     digest = hashlib.sha256()
     for folder in FOLDERS:
         for path in sorted(p for p in folder.iterdir() if p.suffix in {"", ".h", ".cu", ".cuh"} and p.is_file()):
@@ -26,7 +26,7 @@ def source_digest() -> bytes:
 
 
 def compiled(capability: tuple[int, int], cache_folder: Path | None = None, *, source: str = FIT) -> Any:
-    """Return a source's machine code, cached in cuda-core's or the given folder, if writable."""
+    """Machine code of a source, cached in cuda-core's or the given folder, if writable."""
     options = ProgramOptions(
         name=source, arch=f"sm_{capability[0]}{capability[1]}", std="c++17", include_path=[str(f) for f in FOLDERS]
     )
