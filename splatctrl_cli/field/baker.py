@@ -112,7 +112,7 @@ class Baker:
         mask (blocks of the grid): zero where `out` keeps its values.
         """
         per_plane = 40 * self.layout.shape[1] * self.layout.shape[2]
-        step = BLOCK * max(1, (64 << 20) // (BLOCK * per_plane))  # bytes beside the channels
+        step = BLOCK * max(1, (64 << 20) // (BLOCK * per_plane))  # bytes besides the channels
         for begin in range(first, last, step):
             end = min(begin + step, last)
             part = {name: values[begin - first : end - first] for name, values in out.items()}
@@ -211,12 +211,10 @@ class Baker:
 
 
 def _picked(values: NDArray[T], cells: NDArray[np.int64] | None) -> NDArray[T]:
-    """Values of all cells, or of some in one row."""
     return values if cells is None else values.reshape(-1, *values.shape[3:])[cells]
 
 
 def _cells(mask: UInt8, span: GridSpan) -> Bool:
-    """Expand a mask of blocks to the span's cells."""
     blocks = mask[span.first // BLOCK : -(-span.last // BLOCK)].view(np.bool_)
     for axis in range(3):
         blocks = np.repeat(blocks, BLOCK, axis=axis)

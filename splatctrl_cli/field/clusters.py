@@ -12,15 +12,16 @@ from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.kernels.field import LANES, SPARE_OFFSET, SPARE_PLACE, Clusters, Offsets
 from splatctrl_cli.records import Box, Float32, Float64, UInt8
 
-_BITS = 10  # of each coordinate in a Hilbert code
+_BITS = 10  # per coordinate of a Hilbert code
 _GROUPS = 8  # their number is a multiple of this
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClusteredPoints:
-    """N points as C clusters, relative to an anchor (float32 keeps 0.1 um within a metre or two).
+    """N points as C clusters, relative to an anchor.
 
-    anchor (3,) [m], world; source (16 C,): point of each entry; is_point (16 C,): 0 if spare.
+    float32 then keeps 0.1 um within a metre or two. anchor (3,) [m], world; source (16 C,): point of each entry;
+    is_point (16 C,): 0 if spare.
     """
 
     anchor: Float64

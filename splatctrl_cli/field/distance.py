@@ -38,7 +38,7 @@ class SphereField:
         self._threads = threads
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """As `DistanceField.query`; zero gradient at a centre."""
+        """Distance and gradient, as in `DistanceField.query`; zero gradient at a centre."""
         local = self.spheres.points.relative(checked_points(points))
         score, gradient, _ = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)
         return score.astype(np.float64), gradient.astype(np.float64)
@@ -108,7 +108,7 @@ class GpdfField(LogSumExpField):
         tolerance = config.truncation * (1.0 if self.weights.sign is None else SIGNED_CARE)
         self.share = self.kernel.share(tolerance)
         offsets = spheres.radii + self.kernel.length * self.weights.log_size
-        # Float32 keeps what is left of the offsets to the micrometre: the largest goes in at the end, in float64.
+        # Float32 keeps the differences to the micrometre: the largest offset is added at the end, in float64.
         self._common = float(offsets.max())
         self.offsets = offsets
         self._offsets = spheres.points.offsets(offsets - self._common)
@@ -220,7 +220,7 @@ class SeField(LogSumExpField):
         )
 
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
-        """As `GpdfField.bake_raw`."""
+        """See `GpdfField.bake_raw`."""
         native.bake_gaussian(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
 
 
@@ -237,7 +237,7 @@ class SafeField:
         self._both = kernel if isinstance(kernel, SeField) and are_of_one else None
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """As `DistanceField.query`; exact in ties."""
+        """Distance and gradient, as in `DistanceField.query`; exact in ties."""
         if self._both is not None:
             return self._both.query_safe(points)
         distance, gradient = self._exact.query(points)

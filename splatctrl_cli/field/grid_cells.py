@@ -15,7 +15,7 @@ PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
 
 RESOLUTION = 2e-6  # [m] float32 distances nearer than this are the same
 HALF_DIAGONAL = 0.5 * 3.0**0.5  # of a cell, in voxels
-LOSS = 2.0 * HALF_DIAGONAL  # the most that the certified distance may read too little, in voxels
+LOSS = 2.0 * HALF_DIAGONAL  # largest loss of the certified distance, in voxels
 
 Shape = tuple[int, int, int]
 
@@ -30,7 +30,7 @@ class GridLayout:
 
     @classmethod
     def over(cls, box: Box, voxel: float) -> "GridLayout":
-        """Cover a box with centres, from its lower corner to its upper or just beyond, two at least.
+        """Cover a box with centres, from lower corner to upper or just beyond, two at least.
 
         Raises UsageError for a voxel or box without size.
         """

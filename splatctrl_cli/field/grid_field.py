@@ -36,18 +36,18 @@ class GridField:
         self.box = Box(lower=self._origin, upper=upper)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """As `DistanceField.query`, with the interpolant's gradient."""
+        """Distance and the interpolant's gradient, as in `DistanceField.query`."""
         return native.interpolate(self._values, self._origin, self._voxel, checked_points(points))
 
     def certified(self, points: Float64) -> Float64:
-        """Lower bound (Q,) [m] of the exact distance to splats (and obstacle cells), not to objects.
+        """Lower bound (Q,) [m] of the exact distance to splats, not to objects.
 
-        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding: hard is 1-Lipschitz. NaN where
-        `query` is. Raises InputError without the channel bound.
+        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding: hard is 1-Lipschitz. It holds for
+        obstacle cells, too. NaN where `query` is. Raises InputError without the channel bound.
         """
         if self._bound is None:
             raise InputError("distance grid: no channel 'bound'", remedy="bake it with --channels sdf,bound")
-        # The channel holds for a whole cell: at its centre the exact distance is half a diagonal more.
+        # The channel bounds a whole cell: at its centre the exact distance is half a diagonal more.
         lowest = native.lipschitz_bound(self._bound, self._origin, self._voxel, checked_points(points))
         certified = np.asarray(lowest + HALF_DIAGONAL * self._voxel)
         if self._has_blank:

@@ -104,8 +104,8 @@ def median_spacing(centers: NDArray[np.floating]) -> float:
 def planar_zero_level(radius: float, length: float) -> float:
     """Height z [m] over a dense plane of splats where the Matern row-sum field is zero.
 
-    The field is ``z - l log(1 + z / l) - r`` (the integral of ``e^(-d/l)`` over a plane is ``2 pi l (z + l)
-    e^(-z/l)``, the row sum ``2 pi l^2``). Newton's method starts above, where it is convex.
+    The field is ``z - l log(1 + z / l) - r``. (The integral of ``e^(-d/l)`` over a plane is ``2 pi l (z + l)
+    e^(-z/l)``, the row sum ``2 pi l^2``.) Newton's method starts above, where it is convex.
     """
     z = radius + length * (1.0 + np.sqrt(2.0 * radius / length))
     for _ in range(50):

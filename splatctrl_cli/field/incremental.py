@@ -31,7 +31,7 @@ def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) ->
     """Blocks where bakes of `before` and `after` can differ by a bit.
 
     Layout and configuration are the same. A block can differ where a splat of one set alone matters, by the bake's
-    culling bounds. Weights are compared too, as those of neighbours change; `observed` is not.
+    culling bounds. Weights are compared too, as neighbours' weights change; `observed` is not.
     """
     shape = blocks_of(new.layout)
     num_blocks = int(np.prod(shape))
@@ -130,7 +130,7 @@ def _changed(
 def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.void]:
     """Splats as bytes (N,), in cluster order.
 
-    A rank separates those of one centre: their order can decide the last bit.
+    A rank separates splats of one centre: their order can decide the last bit.
     """
     order = baker.spheres.points.source[baker.spheres.points.is_point.view(np.bool_)]
     centers = splats.centers.astype(np.float64)[order] + 0.0  # no -0, which is equal to 0

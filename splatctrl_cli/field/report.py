@@ -13,8 +13,8 @@ from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.records import DistanceGrid, Float32
 from splatctrl_cli.voxels import VoxelState
 
-BIN = 0.05  # of the histogram of the gradient's length: bin k is about k times this
-NUM_BINS = 41  # about 0 to 2; the last one holds what is longer, too
+BIN = 0.05  # bin k of the histogram is about k times this length
+NUM_BINS = 41  # about 0 to 2; the last one includes longer ones
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,7 @@ class GridStatistics:
 
 
 def grid_statistics(grid: DistanceGrid) -> GridStatistics:
-    """Statistics of a grid, a few planes at a time, as channels may be memory maps."""
+    """Statistics of a grid, by a few planes, as channels may be memory maps."""
     totals = _Totals()
     for part in _parts(grid):
         totals.add(part)
@@ -107,7 +107,7 @@ class _Totals:
             return  # bound is then of unknown space, too
         try:
             exact = exact_channel(part)
-        except InputError:  # the grid has it not
+        except InputError:  # the grid has no exact distance
             return
         self.has_exact = True
         self.num_hard += int(np.count_nonzero(np.abs(_floats(part, "sdf") - exact) <= RESOLUTION))

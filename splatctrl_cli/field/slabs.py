@@ -15,9 +15,9 @@ from splatctrl_cli.kernels.field import BLOCK
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Label, SplatSet, UInt8
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
-SLAB_BYTES = 48 << 20  # of the channels of a slab, or what a block's planes take
-_CUBES = 64  # bytes of a cell that finding the nearest never-seen one takes, of the whole grid
-_BESIDE = 64  # bytes of a cell that baking takes beside its channels, in at most 64 MiB or a block's planes
+SLAB_BYTES = 48 << 20  # per slab's channels, or one block's planes if larger
+_CUBES = 64  # bytes per cell of the whole grid, to find the nearest never-seen one
+_BESIDE = 64  # bytes per cell in a bake besides its channels, in at most 64 MiB or a block's planes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -83,8 +83,8 @@ def label_counts(splats: SplatSet) -> dict[str, int]:
     return {label.name.lower(): int(np.count_nonzero(splats.labels == label)) for label in Label}
 
 
-BLANKED = ("sdf", "gradient", "probability")  # by nan
-ROUNDING = 1e-6  # [m] and of a distance: what float32 may raise it by
+BLANKED = ("sdf", "gradient", "probability")  # by policy nan
+ROUNDING = 1e-6  # [m], and share of a distance: rounding of float32
 BOUND = (
     "no point of the cell is nearer to a splat's sphere or a never-seen cell; "
     "bound + bound_margin is the lesser of hard and the distance to never-seen cells at its centre"

@@ -28,15 +28,15 @@ from splatctrl_cli.kernels import field as native
 from splatctrl_cli.records import Float32, Float64, Index
 
 KernelValue = Callable[[Float64], Float64]
-NODES = 96  # of a block along each axis: a size that transforms fast, 7 MiB
+NODES = 96  # per axis of a block: a size with a fast transform, 7 MiB
 MAX_BLOCKS = 2000
 
 
 def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Float64:
     """``sum_j k(|p_i - p_j|)`` (N,) of centres (N, 3) [m], j = i included, in linear time.
 
-    Each centre spreads one unit over eight nodes (trilinear), these are convolved, and it reads them back, with its
-    own term replaced by k(0) = 1. That blurs by h^2 / 3 per axis; convolving with ``2 k - (mean of k at the six
+    Each centre spreads one unit over eight nodes (trilinear), these are convolved, and it reads them back. Its own
+    term becomes k(0) = 1. That blurs by h^2 / 3 per axis; convolving with ``2 k - (mean of k at the six
     neighbours)`` undoes it to second order. Raises UsageError for more than `MAX_BLOCKS` blocks.
     """
     voxel, reach = length / VOXELS_PER_LENGTH, KERNEL_REACH * VOXELS_PER_LENGTH
@@ -63,7 +63,7 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
 
 def _blocks(cells: Index, reach: int) -> list[tuple[Index, Index, Index]]:
     """Return each block's first node (3,), centres in reach, centres inside."""
-    inner = NODES - 2 * reach - 1  # the cells whose eight nodes no mass from beyond the block reaches
+    inner = NODES - 2 * reach - 1  # cells whose nodes no mass from beyond the block reaches
     blocks, which = np.unique(cells // inner, axis=0, return_inverse=True)
     order = np.argsort(which.ravel(), kind="stable")
     bounds = np.searchsorted(which.ravel()[order], np.arange(len(blocks) + 1))
@@ -93,7 +93,7 @@ def _sampled_kernel(kernel: KernelValue, voxel: float, reach: int) -> Float64:
 
 
 def _own_terms(share: Float64, kernel: Float64) -> Float64:
-    same = share**2 + (1.0 - share) ** 2  # of an axis, that the mass and the reading fall on the same node
+    same = share**2 + (1.0 - share) ** 2  # by axis: share of mass and reading on the same node
     pair = np.stack([same, 1.0 - same])
     return np.asarray(
         sum(pair[x, :, 0] * pair[y, :, 1] * pair[z, :, 2] * kernel[x, y, z] for x, y, z in product((0, 1), repeat=3))
@@ -132,7 +132,7 @@ def _read(density: Float64, cells: Index, share: Float64) -> Float64:
     return np.asarray(sum(part * density[tuple(node.T)] for node, part in _corners(cells, share)))
 
 
-BYTES_PER_PAIR = 44  # of the matrix and of the pairs that it is made of; 40 were measured
+BYTES_PER_PAIR = 44  # of the matrix and its pairs; 40 were measured
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,7 +273,7 @@ def _log_row_sums(points: ClusteredPoints, length: float, *, is_matern: bool, th
     return np.asarray(np.log(points.gathered(sums)))
 
 
-NO_LOG = -1e4  # of a weight that is exactly zero: too small to matter, and finite
+NO_LOG = -1e4  # for a weight of zero: negligible, and finite
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -331,7 +331,7 @@ def weights_named(name: str, spheres: Spheres, kernel: Kernel, noise: float, thr
 
 
 def _lumped(log_sums: Float64, noise: float) -> Weights:
-    with np.errstate(divide="ignore"):  # log 0 = -inf is the right log of no noise
+    with np.errstate(divide="ignore"):  # noise 0 gives log 0 = -inf, rightly
         return Weights(log_size=np.asarray(-np.logaddexp(log_sums, np.log(noise))), sign=None)
 
 

@@ -36,7 +36,7 @@ def arithmetic() -> str:
     return "_native_v3" if name == "_native_v4" else name
 
 
-MIN_CAP = 16  # threads that may be asked for on any machine
+MIN_CAP = 16  # threads allowed on any machine
 
 
 def num_threads(requested: int = 0) -> int:

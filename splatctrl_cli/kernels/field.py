@@ -13,7 +13,7 @@ from splatctrl_cli.kernels import Float32, Float64, Int32, UInt8, native, num_th
 
 LANES = 16
 BLOCK = 8  # cells of a block along each axis
-SPARE_OFFSET = -1e30  # of an entry so far away that nothing ever takes it
+SPARE_OFFSET = -1e30  # of a spare entry: too far away to be nearest
 SPARE_PLACE = 1e15
 
 
@@ -29,7 +29,7 @@ class Clusters:
 
     @property
     def arrays(self) -> tuple[Float32, Float32]:
-        """As the kernels take them."""
+        """Arguments of the kernels."""
         return self.centers, self.boxes
 
 
@@ -45,7 +45,7 @@ class Offsets:
 
     @property
     def arrays(self) -> tuple[Float32, Float32]:
-        """As the kernels take them."""
+        """Arguments of the kernels."""
         return self.values, self.maxima
 
 
@@ -71,7 +71,7 @@ class GridSpan:
 
     @property
     def arrays(self) -> tuple[Float64, float, NDArray[np.int64], UInt8 | None]:
-        """As the kernels take them."""
+        """Arguments of the kernels."""
         sizes = np.array([*self.shape, self.first, self.last], dtype=np.int64)
         return self.origin, self.voxel, sizes, self.mask
 

@@ -10,7 +10,7 @@ import numpy as np
 from splatctrl_cli.kernels import Float64, Int64, native, num_threads
 from splatctrl_cli.kernels.chain import Chain
 
-PART = 10  # spheres that are passed over together, at most
+PART = 10  # most spheres that one ball skips together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +140,6 @@ def _parts(chain: Chain) -> tuple[Int64, Int64, Float64, Float64]:
 
 
 def _split(offset: Float64, spheres: Int64) -> list[Int64]:
-    """Halve spheres along their longest extent, down to `PART`."""
     if len(spheres) <= PART:
         return [spheres]
     axis = int(np.argmax(np.ptp(offset[spheres], axis=0)))

@@ -1,6 +1,6 @@
 """Queries of many points: views through them, cubes, nearby splats and solids.
 
-Bytes are those of the NumPy expressions in tests/reference/points.py, at any thread count.
+Bytes equal the NumPy expressions in tests/reference/points.py, at any thread count.
 """
 
 from collections.abc import Sequence

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.kernels import Bool, Float64, Int64, native
 
-INSIDE = 0.5  # of a winding number, from which a point is inside
+INSIDE = 0.5  # winding number above which a point is inside
 
 
 class TriangleTree:

@@ -31,7 +31,7 @@ def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Boo
     if not is_robot.any():
         return np.zeros_like(chosen)
     shown, reach = mask.robot_depth, pixels_of(CONTACT_REACH, frame, mask.robot_depth)
-    chosen &= frame.depth > nearest_within(shown, is_robot, reach) - CONTACT_REACH  # few, and all that may be
+    chosen &= frame.depth > nearest_within(shown, is_robot, reach) - CONTACT_REACH  # a quick superset
     chosen &= frame.depth < farthest_within(shown, reach) + CONTACT_REACH + CONTACT_THICKNESS
     chosen[chosen] = is_in_contact(world_points_at(frame, chosen), robot)
     return chosen

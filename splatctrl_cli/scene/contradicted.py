@@ -79,7 +79,7 @@ class _Surface:
 
 
 def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
-    """Yield, for each frame of one time step, what other frames or the drawn robot contradict.
+    """Yield for each frame of a time step what other frames or the drawn robot contradict.
 
     All rays of a contradicted block and its neighbours cross a surface of another frame. They end more than
     `CONTRADICTED` [m] behind it, or return no depth, in range and outside stereo shadows. No return from the drawn
@@ -138,7 +138,7 @@ def _surface(frame: RgbdFrame, mask: SelfMask) -> _Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class _Rays:
-    """Depth [m] that all rays of a block (h, w) reach, and blocks that unexpectedly return none."""
+    """Depth [m] that a block's rays reach (h, w), and blocks that unexpectedly return none."""
 
     frame: RgbdFrame
     side: int
@@ -148,7 +148,7 @@ class _Rays:
     @classmethod
     def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_Rays":
         side = _side(frame)
-        surely = cv2.erode(_blocks(frame.depth, side).min(axis=2), BESIDE)  # 0 beside lost pixels
+        surely = cv2.erode(_blocks(frame.depth, side).min(axis=2), BESIDE)  # 0 next to lost pixels
         is_lost = (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~shadowed(frame.depth, frame.intrinsics.fx)
         if frame.valid is not None:
             is_lost &= frame.valid

@@ -21,15 +21,15 @@ from splatctrl_cli.scene.stereo_shadow import shadowed
 from splatctrl_cli.voxels import LostEdges
 
 BESIDE_ROBOT = np.ones((9, 9), np.uint8)  # its outline is fattened, too
-MOST_POINTS = 1 << 18  # at a time: fine voxels and a large hole come to a hundred million
+MOST_POINTS = 1 << 18  # per batch: fine voxels and a large hole may need a hundred million
 
 
 def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Iterator[Float64]:
-    """Yield points (K, 3) [m], world, half a voxel apart on rays of a frame's holes.
+    """Yield points (K, 3) [m], world, half a voxel apart on rays of holes.
 
     Some repeat. Rays are about a voxel apart, from `min_range` to the depth of the nearest pixel with depth. Holes
-    up to `NARROW_HOLE` voxels wide do not count, nor those beside the robot, where background may show. robot_depth
-    (H, W) [m]: rendered, 0 = none.
+    up to `NARROW_HOLE` voxels wide do not count, nor those at the robot, where background may show. robot_depth (H,
+    W) [m]: rendered, 0 = none.
     """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
@@ -86,7 +86,7 @@ def _nearest_depth(depth: Float32) -> Float32:
 
 
 BESIDE = np.ones((3, 3), np.uint8)  # a pixel and its neighbours
-NEAR_ROBOT = np.ones((5, 5), np.uint8)  # its outline is lost, too, and is its own
+NEAR_ROBOT = np.ones((5, 5), np.uint8)  # its own outline loses depth, too
 
 
 def lost_edges(
@@ -94,14 +94,12 @@ def lost_edges(
 ) -> dict[str, LostEdges]:
     """Return, by camera, a ball for each pixel without depth next to an object pixel.
 
-    Its depth is that of the nearest object beside it. Its radius is one pixel: a surface shown there ends before
+    Its depth is that of the nearest object next to it. Its radius is one pixel: a surface shown there ends before
     the next centre. Lone object pixels are noise. Balls that a frame sees through by `see_through`, or that near to
     the robot, are left out: the latter are its outline.
     """
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
-    surely = [
-        cv2.erode(frame.depth, BESIDE) for frame, _ in seen
-    ]  # 0, which sees through nothing, beside lost pixels
+    surely = [cv2.erode(frame.depth, BESIDE) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
     found = dict[str, LostEdges]()
     for frame, mask in seen:
         edges = _of_frame(frame, mask)

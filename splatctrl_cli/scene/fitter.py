@@ -91,7 +91,7 @@ class SceneFitter:
         self.workspace = workspace
         self.seed = seed
         self.num_threads = num_threads(threads)
-        self._each = ThreadPoolExecutor(self.num_threads).map  # what is asked of each view, of all of them at once
+        self._each = ThreadPoolExecutor(self.num_threads).map  # runs a function on all views at once
         self.buffer = SplatBuffer(config.max_splats)
         self.descent = Descent(config, self.buffer, seed, self.num_threads, device)
         self.occupancy = OccupancyMap(workspace, occupancy, self.num_threads)
@@ -99,14 +99,14 @@ class SceneFitter:
         self.window = Window(config)
         self.shell = Shell(config, occupancy, workspace, seed, self.num_threads) if has_shell else None
         self.num_steps = 0
-        self.density: SeedDensity | None = None  # chosen by the first time step that has anything to seed
+        self.density: SeedDensity | None = None  # chosen by the first time step with seeds
         self.posture: RobotPosture | None = None
-        self.mounted: dict[str, Bool] = {}  # by camera, pixels (H, W) that show what it carries
+        self.mounted: dict[str, Bool] = {}  # by camera, pixels (H, W) of what it carries
         self.refined = Refined(num_blocks=0, filled=Filled(), removed=dict.fromkeys(REASONS, 0))
         self._unrepresented: Balls | None = None
-        self.bare: Balls | None = None  # of the last time step, before some were left out
-        self.seen: Seen = ()  # frames of the last time step, as its newest views have them, with their masks
-        self.objects: dict[str, Bool] = {}  # by camera, pixels (H, W) of its newest frame that show objects
+        self.bare: Balls | None = None  # of the last time step, before `confirmed`
+        self.seen: Seen = ()  # frames of the last time step, as in its newest views, with masks
+        self.objects: dict[str, Bool] = {}  # by camera, object pixels (H, W) of its newest frame
 
     def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
         """Take in the frames of one time step: integrate, remove, seed, optimise, label."""
@@ -207,7 +207,7 @@ class SceneFitter:
         self.descent.run(
             self.window.schedule(count, rng), settings, self.config.refine_depth ** (block / (REFINE_BLOCKS - 1))
         )
-        # What one view sees through stays here: its removal costs 0.6 dB where poses are off by millimetres.
+        # Splats that a view sees through stay: removing them costs 0.6 dB if poses are off by millimetres.
         removed = self._remove(nowhere, nowhere, counts_time=False)
         filled = self.refined.filled
         if block < REFINE_BLOCKS - 2:
@@ -414,7 +414,7 @@ class SceneFitter:
         seeds = contact_seeds(
             seen, mappable, robot, splats, self.config, num_threads=self.num_threads, each=self._each
         )
-        least = max((mask.reach for _, mask in seen), default=0.0)  # what noise leaves: nearer, no view tells
+        least = max((mask.reach for _, mask in seen), default=0.0)  # noise of depth: within it, no view sees through
         seeds = seeds.select(self._is_grounded(seeds.centers, views, least=least))
         return self.buffer.fill(seeds, self.config.initial_opacity)
 

@@ -120,7 +120,7 @@ def kept_radii(
         edge = np.ascontiguousarray(edge.reshape(-1, 3))
         floats = points.seen_through(edge, cameras, nearest, tolerance, num_threads).reshape(len(left), -1)
         is_out = floats.any(axis=1)
-        for number, camera in enumerate(cameras):  # of what is before a centre, its own pixel tells
+        for number, camera in enumerate(cameras):  # its own pixel shows what is before a centre
             before = np.ascontiguousarray(centers[left] + kept[left, None] * towards[left, number])
             is_out |= points.seen_through(before, [camera], [depths[number]], tolerance, num_threads)
         left = left[is_out & (kept[left] > least)]

@@ -12,7 +12,7 @@ from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_h
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
 from splatctrl_cli.voxels import MOST_VOXELS, SOLID, SWEPT, Balls, KnownVoxels, LostEdges, OccupancyGrid, Unseen
 
-MAX_STEPS = min(Unseen) - 1  # time steps that `last_seen` tells apart
+MAX_STEPS = min(Unseen) - 1  # distinct time steps in `last_seen`
 
 
 class OccupancyMap:
@@ -282,7 +282,7 @@ class PeopleMemory:
         entity[lost] &= np.uint8(~Label.HUMAN & 0xFF)
         log_odds[lost], num_updates[lost] = 0.0, 0
         if not len(self.voxels) and all(frame.human is None for frame in frames):
-            return  # there was nobody, and nobody came
+            return  # no people before or now
         self.voxels = np.flatnonzero(entity & Label.HUMAN)
         self.stamps_ns = np.full(len(self.voxels), now_ns, np.int64)
         is_still = np.isin(unseen, self.voxels)

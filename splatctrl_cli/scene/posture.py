@@ -56,7 +56,7 @@ class RobotPosture:
 def posture_of(
     robot: RobotModel, q: Float64, at_frames: Mapping[int, Float64], carried: Sequence[tuple[str, Box]] = ()
 ) -> RobotPosture:
-    """The robot at joint positions q (J,), and at those of frame stamps [ns].
+    """The robot at joint positions q (J,), and at each frame stamp [ns].
 
     carried: boxes in link frames, part of its surface.
     """
@@ -76,7 +76,7 @@ def posture_of(
     )
 
 
-POSTURE_NAMES = ("centers", "radii", "T_world_link")  # what the next time step needs to know of the last
+POSTURE_NAMES = ("centers", "radii", "T_world_link")  # kept for the next time step
 
 
 def carried(points: Float32, before: RobotPosture, after: RobotPosture) -> Float32:

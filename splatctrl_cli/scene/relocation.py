@@ -68,7 +68,7 @@ def use_idle(
     if config.when_idle == "leave" or not is_alive.any():
         return Filled(), 0
     found, shown = ([], None) if config.when_idle == "clone" else misfits()
-    if shown is None or not any(misfit.error.any() for misfit in found):  # no depth says where detail would be
+    if shown is None or not any(misfit.error.any() for misfit in found):  # no depth shows where detail would be
         return clone(buffer, int((~is_alive).sum()) - reserve, rng), 0
     weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
     is_weak = np.zeros(len(is_alive), bool)

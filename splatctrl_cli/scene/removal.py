@@ -17,7 +17,7 @@ REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain"
 def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH, is_robot: Bool | None = None) -> Float32:
     """Least valid depth (H, W) [m] within `reach` [m] of each pixel; inf without any.
 
-    `reach` is at the median depth. Robot pixels count only for themselves and neighbours: beside the robot, what is
+    `reach` is at the median depth. Robot pixels count only for themselves and neighbours: near the robot, what is
     before all else floats.
     """
     depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
@@ -97,7 +97,7 @@ def _verdict(value: Float32, is_observed: Bool, config: OccupancyConfig) -> tupl
 def room_for(
     seeds: Seeds, num: int, buffer: SplatBuffer, occupancy: OccupancyMap, shown: Float64, tolerance: float
 ) -> tuple[Bool, Seeds]:
-    """Slots (M,) of at most `num` splats to evict, and the seeds in order of slots.
+    """Slots (M,) of at most `num` splats to evict, and the seeds in order.
 
     Only object splats go: redundant ones that show least, then those far from the robot's path, for seeds near it.
     shown (M,): how much slots show; tolerance [m]: as in `redundant`.

@@ -17,7 +17,7 @@ from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seed_octree import CubeLevel, cube_levels, leaves, tolerance_for
 
-Each = Callable[..., Iterable[Any]]  # `map`, or one that asks all at once
+Each = Callable[..., Iterable[Any]]  # `map`, or a parallel one
 
 NO_SEEDS = Seeds(
     centers=np.zeros((0, 3), np.float32), radii=np.zeros(0, np.float32), colors=np.zeros((0, 3), np.float32)

@@ -35,8 +35,8 @@ from splatctrl_cli.scene.time_steps import AuditRow
 class PixelKind(IntEnum):
     """Kinds of depth pixels.
 
-    MIXED: beside the robot, on no surface. DOUBTED: an object if another frame measured it. CONTRADICTED: behind
-    what another frame measured on its ray.
+    MIXED: near the robot, on no surface. DOUBTED: an object if another frame measured it. CONTRADICTED: behind what
+    another frame measured on its ray.
     """
 
     NOTHING = 0
@@ -99,7 +99,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     reach = pixels_of(config.self_mask_tolerance, frame, shown.depth)
     edge = max(round(frame.intrinsics.width / MASK_EDGE), reach)
     wide = 2 * edge + reach + 1  # pixels, beyond which nothing is explained, doubted or inside
-    part = _grown(box, wide + 1, frame.depth.shape)  # one more, where a surface may go on
+    part = _grown(box, wide + 1, frame.depth.shape)  # one more, where a surface may extend
     depth, rendered, kinds = np.ascontiguousarray(frame.depth[part]), shown.depth[part], kinds[part]
     link, inside = shown.link[part], shown.inside[part]
     has_depth, is_robot = depth > 0, rendered > 0
@@ -138,7 +138,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     offset = depth - rendered
     is_told = is_core & has_depth & (np.abs(offset) <= MASK_FAR_OFF)
     is_told &= link < len(surface.links) - surface.num_carried
-    is_told &= rendered - nearest < MASK_STEP  # beside a nearer part stereo may give it that part's depth
+    is_told &= rendered - nearest < MASK_STEP  # stereo may give it the depth of a nearer part next to it
     is_inside = is_core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
         mask,
@@ -151,7 +151,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
 
 
 def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Float32) -> None:
-    """Mark object pixels beside the robot that are too few to believe, in place.
+    """Mark object pixels near the robot that are too few to believe, in place.
 
     A piece joins neighbours that differ by less than both `steps` [m]. It is an object if it extends away from the
     robot. Otherwise the unexplained `area` [m^2] decides: mixed below `MASK_SPECK`, doubted below `MASK_ALONE`.

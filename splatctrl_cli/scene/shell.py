@@ -59,7 +59,7 @@ class Shell:
         self._depth, self._density, config = depth, density, self.config
         if density is not None:
             config = scaled(config, depth / SCALE_DEPTH).derived(radius_depth=depth)
-            least, most = config.min_radius, config.max_radius  # of which either may have been set
+            least, most = config.min_radius, config.max_radius  # the user may have set either
             widest = max(least, most, config.radius_per_edge * density.edge)  # else far walls have holes
             config = config.derived(max_radius=widest)
             self._see_through = scaled(self.occupancy, depth / SCALE_DEPTH).see_through

@@ -15,10 +15,10 @@ def shadowed(depth: Float32, focal: float) -> Bool:
     without depth.
     """
     is_shadow, fattened = np.zeros(depth.shape, bool), max(depth.shape[1] / MASK_EDGE, 1.0)
-    for turn in (1, -1):  # what is nearer is at the right of its shadow, then at the left
+    for turn in (1, -1):  # the nearer object is right of its shadow, then left
         image = np.ascontiguousarray(depth[:, ::turn])
         column = np.arange(image.shape[1], dtype=np.int32)
-        following = np.where(image > 0, column, np.int32(len(column)))  # the pixel with depth from here on
+        following = np.where(image > 0, column, np.int32(len(column)))  # column of the next pixel with depth
         following = np.minimum.accumulate(following[:, ::-1], axis=1)[:, ::-1]
         baseline = _baseline(image, following, focal)
         if baseline:

@@ -41,7 +41,7 @@ class TimeStep:
 
     @property
     def stamp_ns(self) -> int:
-        """Of the newest frame."""
+        """Stamp of the newest frame."""
         return max(frame.stamp_ns for frame in self.frames)
 
     @property

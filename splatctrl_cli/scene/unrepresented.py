@@ -63,7 +63,7 @@ def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) ->
 def bare_voxels(
     occupancy: OccupancyMap, splats: SplatSet, workspace: Box, config: SceneConfig, half: int | None = None
 ) -> Float32:
-    """Centres (K, 3) [m] of occupied voxels for gap filling, except those surely near a splat.
+    """Centres (K, 3) [m] of occupied voxels for gap filling, not surely near a splat.
 
     `half` 0 or 1 takes every second voxel.
     """
@@ -81,7 +81,7 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
     """
     voxel, shape = occupancy.config.voxel, occupancy.log_odds.shape
     cells = np.floor((splats.centers - occupancy.origin) / voxel + 0.5).astype(np.int64)
-    is_inner = np.all((cells > 0) & (cells < np.array(shape) - 1), axis=1)  # so that no neighbour is outside
+    is_inner = np.all((cells > 0) & (cells < np.array(shape) - 1), axis=1)  # keeps all neighbours inside
     home, radii = np.ravel_multi_index(tuple(cells[is_inner].T), shape), splats.radii[is_inner]
     is_near = np.zeros(shape, bool)
     for step in itertools.product((-1, 0, 1), repeat=3):
@@ -95,8 +95,8 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
 class GridAgreement:
     """Agreement of splats with a grid; NaN without any.
 
-    on_surface: share of object and human splats in or next to a voxel that is not free, of those outside the grid,
-    or in or next to a seen voxel. represented: share of num_voxels occupied voxels with a splat or ball.
+    on_surface: share of object and human splats at a voxel that is not free, among splats outside the grid or at a
+    seen voxel. "At" means in or next to. represented: share of num_voxels occupied voxels with a splat or ball.
     """
 
     on_surface: float
@@ -124,7 +124,7 @@ def agreement_with_grid(
     is_inside = np.all((cell >= 0) & (cell < states.shape), axis=1)
     cells = tuple(cell[is_inside].astype(np.int64).T)
     may_hold = maximum_filter(np.isin(states, (VoxelState.OCCUPIED, VoxelState.UNCERTAIN)), size=3)
-    was_seen = maximum_filter(states != VoxelState.NEVER_SEEN, size=3)  # what is farther than depth counts is not
+    was_seen = maximum_filter(states != VoxelState.NEVER_SEEN, size=3)  # space beyond the depth range is not
     num_told = was_seen[cells].sum() + np.count_nonzero(~is_inside)
     least = max(
         float(np.log(occupancy.occupied_above / (1 - occupancy.occupied_above))), 1.5 * occupancy.log_odds_hit

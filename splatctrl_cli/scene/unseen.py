@@ -13,7 +13,7 @@ from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, pixels_at
 from splatctrl_cli.scene.stereo_shadow import shadowed
 from splatctrl_cli.voxels import Unseen
 
-OUTLINE = np.ones((5, 5), np.uint8)  # beside the robot, its outline loses depth too
+OUTLINE = np.ones((5, 5), np.uint8)  # the robot's outline loses depth, too
 
 
 def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture) -> None:

@@ -12,11 +12,10 @@ from splatctrl_cli.kernels.cuda.driver import Card, usable_card
 from splatctrl_cli.kernels.cuda.memory import FIT, Array, DeviceError, Graph, Launch, OutOfMemory
 from splatctrl_cli.kernels.cuda.program import compiled
 
-MANY = 20  # replays in a graph: to launch one costs the host as much as a small map's iteration takes
+MANY = 20  # replays in a graph: a launch costs the host as much as a small map's iteration
 
 
 def _check(result: tuple[Any, ...]) -> Any:
-    """Values of a driver call; raises its error."""
     status, *values = result
     if status == driver.CUresult.CUDA_SUCCESS:
         return values if len(values) > 1 else values[0] if values else None
@@ -71,7 +70,7 @@ class CudaDevice:
         """Copy an array there, after what is queued."""
         values = np.ascontiguousarray(values)
         _check(driver.cuMemcpyHtoDAsync(address, values.ctypes.data, values.nbytes, self._handle))
-        self.wait()  # the array may go
+        self.wait()  # the array may be freed
 
     def read(self, address: int, out: Array) -> None:
         """Copy from there, after what is queued."""

@@ -12,7 +12,7 @@ from splatctrl_cli.kernels.cuda.memory import DeviceError
 LIBRARY = "libcuda.so.1"
 VERSION_FILE, CARDS = Path("/proc/driver/nvidia/version"), Path("/proc/driver/nvidia/gpus")
 OLDEST = (7, 5)  # compute capability
-OLDEST_CUDA = (13, 0)  # of the driver: an older one does not load what NVRTC 13 compiles
+OLDEST_CUDA = (13, 0)  # of the driver: older ones do not load code of NVRTC 13
 OLDEST_DRIVER = 580  # the first for it
 CAPABILITY = (75, 76)  # attributes of a device: major, minor
 
