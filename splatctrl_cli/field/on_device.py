@@ -32,6 +32,7 @@ class OnDevice:
         return cls(Spheres.of(centers, radii), config, device)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """Distance and gradient, as in `DistanceField.query`."""
         if not len(points):
             return np.zeros(0), np.zeros((0, 3))
         found = self._asked(points, "gradient")

@@ -32,7 +32,7 @@ class GaussianRasteriser:
         native.prepare_gaussians(self.native, camera, parameters, degree, self._colors, self.num_threads)
 
     def forward(self) -> Float32:
-        """Planes (5, H, W): red, green, blue, depth [m], accumulated opacity."""
+        """Planes (5, H, W), as in `kernels.raster`."""
         planes = empty_planes(*self._shape)
         self.native.forward(planes, self.num_threads)
         return planes

@@ -18,10 +18,10 @@ class EdgeRoom:
     """An arm among solids; made by `of`.
 
     chain: its last K spheres are centres of body parts; balls of radius (K,) [m] around them contain the parts'
-    spheres' centres. moving (M,), pairs (P, 2) spheres, ordered by part; taken (R,) [m] off each row; levers (R, J)
+    sphere centres. moving (M,), pairs (P, 2) spheres, ordered by part; taken (R,) [m] off rows; levers (R, J)
     [m/rad]. groups (G, 4): first part, second part (-1: solids), first row, one past the last; group_taken (G,),
-    group_levers (G, J): largest of their rows. balls (., 4): center, radius; boxes (., 15): rotation and shift from
-    world to box, half sizes; rods (., 15): likewise, with radius, half length along z, padding.
+    group_levers (G, J): their rows' largest. balls (., 4): center, radius; boxes (., 15): rotation and shift from
+    world, half sizes; rods (., 15): likewise, with radius, half length along z, padding.
     """
 
     chain: Chain

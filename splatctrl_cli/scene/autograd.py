@@ -22,7 +22,7 @@ def rasterise(
     *,
     threads: int = 0,
 ) -> torch.Tensor:
-    """Planes (5, H, W): red, green, blue, depth [m], accumulated opacity (eq. 1 to 3), differentiable.
+    """Planes (5, H, W), as in `kernels.raster` (eq. 1 to 3), differentiable.
 
     camera (18,): `scene.render.camera_array`; centers (N, 3) [m], world; radii (N,) [m]; opacities (N,); colors (N,
     3); float32 on the CPU. No derivative by the camera.

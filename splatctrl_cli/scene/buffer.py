@@ -23,7 +23,7 @@ class Seeds(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
-    """Numbers of seeds in fresh slots, in reused slots, and without a slot."""
+    """Numbers of seeds in fresh slots, reused slots, and none."""
 
     added: int = 0
     relocated: int = 0

@@ -83,8 +83,8 @@ def contradicted(seen: Seen, *, is_drawn: bool) -> Iterator[Contradicted]:
 
     All rays of a contradicted block and its neighbours cross a surface of another frame. They end more than
     `CONTRADICTED` [m] behind it, or return no depth, in range and outside stereo shadows. No return from the drawn
-    robot counts, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Either frame may be wrong: a
-    surface with `SEEN_THROUGH_PIXELS` crossed blocks proves no free space either.
+    robot counts, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. Either frame may be wrong: rays
+    to `SEEN_THROUGH_PIXELS` crossed blocks prove no free space.
     """
     surfaces = [_surface(*one) for one in seen]
     through = [np.zeros([size // _side(frame) for size in frame.depth.shape], np.float32) for frame, _ in seen]

@@ -92,7 +92,7 @@ class Descent:
         return (self._seed << 32) + self.num_iterations
 
     def planes(self, view: View) -> Float32:
-        """Red, green, blue, depth and opacity (5, H, W) of a view."""
+        """Planes (5, H, W) of a view, as in `kernels.raster`."""
         centers, radii, colors, opacities = unpack_parameters(self._buffer.parameters, self._num_threads)
         self._raster.prepare(view.camera, centers, radii, opacities, colors)
         return self._raster.forward()

@@ -220,6 +220,7 @@ class SceneFitter:
         )
 
     def splats(self) -> SplatSet:
+        """Live splats."""
         return self.buffer.splats(self.num_threads)
 
     def shell_splats(self) -> SplatSet | None:

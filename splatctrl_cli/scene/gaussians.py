@@ -37,7 +37,7 @@ def parameters_of(gaussians: GaussianSet) -> Float32:
 def render_gaussians(
     gaussians: GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, *, threads: int = 0
 ) -> Rendering:
-    """Render `gaussians` from a pinhole camera at T_world_camera (4, 4); black where nothing is."""
+    """Render from a pinhole camera at T_world_camera (4, 4); black where empty."""
     raster = GaussianRasteriser(num_threads(threads))
     raster.prepare(camera_array(intrinsics, T_world_camera), parameters_of(gaussians))
     planes = raster.forward()

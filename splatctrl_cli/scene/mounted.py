@@ -1,7 +1,7 @@
 """Pixels of what is mounted on a moving camera, such as a gripper.
 
-They stay the same while the world moves past: they are neither seeded nor compared. A known robot has a model
-instead (`labels`).
+They stay the same while the world moves: they are neither seeded nor compared. A known robot has a model instead
+(`labels`).
 """
 
 from collections.abc import Sequence

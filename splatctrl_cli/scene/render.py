@@ -26,7 +26,7 @@ class Rendering:
     opacity: Float32
 
     def normalised_depth(self) -> Float32:
-        """Depth / opacity (H, W) [m]; 0 for opacity below one half."""
+        """See `normalised_depth`."""
         return normalised_depth(self.depth, self.opacity)
 
     def before(self, background: Color) -> "Rendering":
@@ -36,7 +36,7 @@ class Rendering:
 
 
 def normalised_depth(depth: Float32, opacity: Float32) -> Float32:
-    """depth / opacity (H, W) [m] for opacity >= 0.5, else 0."""
+    """Depth / opacity (H, W) [m] for opacity of 0.5 or more, else 0."""
     is_opaque = opacity >= OPAQUE_ENOUGH
     return np.where(is_opaque, depth / np.where(is_opaque, opacity, 1.0), 0.0).astype(np.float32)
 
@@ -48,7 +48,7 @@ def camera_array(intrinsics: Intrinsics, T_world_camera: Float64) -> Float64:
 
 
 def render(splats: SplatSet, intrinsics: Intrinsics, T_world_camera: Float64, *, threads: int = 0) -> Rendering:
-    """Render `splats` from a pinhole camera at T_world_camera (4, 4); black where nothing is."""
+    """Render from a pinhole camera at T_world_camera (4, 4); black where empty."""
     raster = Rasteriser(num_threads(threads))
     raster.prepare(
         camera_array(intrinsics, T_world_camera),

@@ -30,7 +30,7 @@ def world_points(frame: RgbdFrame) -> Float64:
 
 
 def world_points_at(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Float64:
-    """Back-projected points (K, 3) [m], world, of the pixels of a mask (H, W)."""
+    """Back-projected points (K, 3) [m], world, of a mask (H, W)."""
     return back_projected(_placed(frame), frame.depth, mask, num_threads)
 
 

@@ -16,7 +16,7 @@ def surface_steps(
     from robot to background in small steps. An object pixel off its plane by more than `tolerance` (H, W) [m] gets
     half that distance, if less.
 
-    The plane fits 1 / depth of object pixels beyond the outline, within each of `MASK_PLANES` widths. It counts if
+    The plane fits 1 / depth of object pixels beyond the outline, within `MASK_PLANES` widths. It counts if
     residuals match the sensor (`depth_error` [m] at 1 m) and its variance is below `MASK_UNSURE`.
     """
     steps = np.full(depth.shape, MASK_STEP, np.float32)

@@ -54,11 +54,11 @@ class TimeStep:
 class AuditRow:
     """Result of one time step.
 
-    Counts are of splats; loss (eq. 4) and PSNR [dB] of the newest frames, at their last iteration, None if none
+    Counts are of splats; loss (eq. 4) and PSNR [dB] of the newest frames at their last iteration, None if none
     shows the workspace. dead: reusable slots. unmet: seeds without a slot. evicted: slots given to bare surface.
-    unrepresented: occupied voxels without a splat. without_depth: frames without any. self_mask: by link, measured
-    minus rendered depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link, unexplained points inside.
-    blind: cameras without depth.
+    unrepresented: occupied voxels without a splat. without_depth: such frames; blind: such cameras. self_mask: by
+    link, measured minus rendered depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link, unexplained
+    points inside.
     """
 
     stamp_ns: int

@@ -183,7 +183,7 @@ class DeviceFit:
                 self.device.copy(self._addresses[name], self._addresses[f"{name}_before"], self._sizes[name])
 
     def planes(self, view: int) -> Float32:
-        """Red, green, blue, depth and opacity (5, H, W) of a view."""
+        """Planes (5, H, W) of a view, as in `kernels.raster`."""
         height, width = self.views[view].height, self.views[view].width
         while True:
             self.rewind([view], None, None, 0)
